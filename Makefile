@@ -1,0 +1,42 @@
+# make demo   the main job end to end, report in demo/report.html
+# make test   the default test suite (under 10 minutes on 2 cores)
+# make check  lint, types, import directions (fast)
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+ROOMS := acquisition calibration generator lab materials pod segmentation spectra
+READY := $(VENV)/.ready
+
+.PHONY: demo test test-slow check format clean
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,develop]'
+	touch $(READY)
+
+demo: $(READY)
+	$(BIN)/raytwin demo -o demo
+
+test: $(READY) check
+	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -q -n 2 -m slow
+
+# mypy sees the rooms as raytwin.<room> through a folder of links, without an install
+check: $(READY)
+	$(BIN)/ruff check src $(ROOMS) tests validation benchmarks
+	$(BIN)/ruff format --check src $(ROOMS) tests validation benchmarks
+	rm -rf build/types && mkdir -p build/types/raytwin
+	ln -s $(CURDIR)/src/raytwin/* build/types/raytwin/
+	for room in $(ROOMS); do ln -s $(CURDIR)/$$room build/types/raytwin/$$room; done
+	MYPYPATH=build/types $(BIN)/mypy --strict -p raytwin
+	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow'
+
+format: $(READY)
+	$(BIN)/ruff check --fix src $(ROOMS) tests validation benchmarks
+	$(BIN)/ruff format src $(ROOMS) tests validation benchmarks
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info demo

@@ -1,0 +1,41 @@
+"""The errors of raytwin: one small family. A message says what was given, what was expected and what to do."""
+
+
+class RaytwinError(Exception):
+    """Base of every error that raytwin raises on purpose."""
+
+
+class InputError(RaytwinError, ValueError):
+    """An argument or a file holds something that cannot be used."""
+
+    def __init__(self, argument: str, *, received: object, expected: str, remedy: str = "") -> None:
+        """
+        Args:
+            argument: name of the argument, option, file or dataset at fault.
+            received: what was given (shown shortened to one line).
+            expected: what would have been right, in lab words with units.
+            remedy: what the user can do about it; empty where `expected` already says it.
+        """
+        given = " ".join(str(received).split())
+        if len(given) > 160:
+            given = given[:157] + "..."
+        message = f"{argument}: got {given}; expected {expected}"
+        if remedy:
+            message += f"; {remedy}"
+        super().__init__(message)
+        self.argument = argument
+        self.received = received
+        self.expected = expected
+        self.remedy = remedy
+
+
+class FileFormatError(InputError):
+    """A file is truncated, of another format, or lacks what its format requires."""
+
+
+class FitError(RaytwinError):
+    """A fit could not be made or did not converge; the message says why."""
+
+
+class MissingDependencyError(RaytwinError, ImportError):
+    """An optional library is needed and absent; the message holds the command that installs it."""

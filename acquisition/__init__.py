@@ -1,1 +1,54 @@
-"""raytwin.acquisition"""
+"""What was measured: settings, the instrument, acquisition and dataset files, and the pairs made of them.
+
+Names that need h5py or scipy are loaded when they are first asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from .instrument import Instrument
+from .setting import Filter, Setting, filter_from_text, filters_from_text, setting_from_text, text_from_filters
+
+if TYPE_CHECKING:
+    from .acquisition_io import (
+        AcquisitionFile,
+        AcquisitionWriter,
+        Scene,
+        Series,
+        SeriesWriter,
+        open_acquisition,
+        write_acquisition,
+    )
+
+_LAZY = {
+    "AcquisitionFile": "acquisition_io",
+    "AcquisitionWriter": "acquisition_io",
+    "Scene": "acquisition_io",
+    "Series": "acquisition_io",
+    "SeriesWriter": "acquisition_io",
+    "open_acquisition": "acquisition_io",
+    "write_acquisition": "acquisition_io",
+}
+
+__all__ = [
+    "AcquisitionFile",
+    "AcquisitionWriter",
+    "Filter",
+    "Instrument",
+    "Scene",
+    "Series",
+    "SeriesWriter",
+    "Setting",
+    "filter_from_text",
+    "filters_from_text",
+    "open_acquisition",
+    "setting_from_text",
+    "text_from_filters",
+    "write_acquisition",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_LAZY[name]}", __name__), name)

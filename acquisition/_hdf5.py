@@ -1,0 +1,171 @@
+"""Reading HDF5 files that others wrote: every fault is one FileFormatError that names the place."""
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..errors import FileFormatError, InputError
+
+
+def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
+    """Open an HDF5 file for reading; `what` says in the message which kind of file was expected."""
+    location = Path(path)
+    if not location.is_file():
+        given = "a folder" if location.is_dir() else "no such file"
+        raise FileFormatError(str(path), received=given, expected=what, remedy="check the path")
+    try:
+        return h5py.File(location, "r")
+    except OSError as error:
+        if h5py.is_hdf5(location):
+            raise FileFormatError(
+                str(path),
+                received=f"an HDF5 file that cannot be opened ({_reason(error)})",
+                expected=f"{what}, complete",
+                remedy="the file looks truncated or is still being written: copy or make it again",
+            ) from None
+        raise FileFormatError(
+            str(path),
+            received=f"a file of {location.stat().st_size} bytes that is not HDF5",
+            expected=what,
+            remedy="other layouts are read by `raytwin import`",
+        ) from None
+
+
+def _reason(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    start, end = text.find("("), text.rfind(")")
+    return text[start + 1 : end] if 0 <= start < end else text
+
+
+def check_format(file: Any, *, path: str, format_name: str, version: int) -> None:
+    """Check the root attributes `format` and `version`."""
+    found = text_attribute(file, "format", where=path)
+    if found != format_name:
+        raise FileFormatError(
+            path,
+            received="an HDF5 file without a `format` attribute" if found is None else f"format {found!r}",
+            expected=f"format {format_name!r}",
+            remedy="other layouts are read by `raytwin import`",
+        )
+    found_version = whole_attribute(file, "version", where=path)
+    if found_version != version:
+        raise FileFormatError(
+            path,
+            received=f"{format_name} version {found_version}",
+            expected=f"version {version}",
+            remedy="use a raytwin that knows this version",
+        )
+
+
+def text_attribute(node: Any, name: str, *, where: str) -> str | None:
+    """A text attribute, or None where it is absent."""
+    value = _attribute(node, name, where=where)
+    if value is None:
+        return None
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if not isinstance(value, str):
+        raise FileFormatError(f"{where}, attribute {name}", received=repr(value), expected="text")
+    return value
+
+
+def number_attribute(
+    node: Any, name: str, *, where: str, lowest: float | None = None, above: float | None = None, unit: str = ""
+) -> float | None:
+    """A finite number, or None where it is absent; `lowest` may be reached, `above` may not."""
+    value = _attribute(node, name, where=where)
+    if value is None:
+        return None
+    expected = "a finite number"
+    if above is not None:
+        expected += f" above {above:g}"
+    if lowest is not None:
+        expected += f" of {lowest:g} or more"
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise FileFormatError(
+            f"{where}, attribute {name}", received=repr(value), expected=f"{expected} {unit}".rstrip()
+        ) from None
+    too_low = (lowest is not None and number < lowest) or (above is not None and number <= above)
+    if not math.isfinite(number) or too_low:
+        raise FileFormatError(
+            f"{where}, attribute {name}", received=f"{number:g} {unit}".rstrip(), expected=f"{expected} {unit}".rstrip()
+        )
+    return number
+
+
+def whole_attribute(node: Any, name: str, *, where: str, lowest: int | None = None) -> int | None:
+    """A whole number, or None where it is absent."""
+    number = number_attribute(node, name, where=where, lowest=lowest)
+    if number is None:
+        return None
+    if number != int(number):
+        raise FileFormatError(f"{where}, attribute {name}", received=f"{number:g}", expected="a whole number")
+    return int(number)
+
+
+def _attribute(node: Any, name: str, *, where: str) -> Any:
+    try:
+        value = node.attrs.get(name)
+    except (OSError, RuntimeError) as error:
+        raise FileFormatError(
+            f"{where}, attribute {name}", received=_reason(error), expected="a readable attribute"
+        ) from None
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, h5py.Empty):
+        return None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def plain_attributes(node: Any, *, where: str) -> Mapping[str, Any]:
+    """All attributes as Python values, in a new dictionary."""
+    return {name: _plain(_attribute(node, name, where=where)) for name in node.attrs}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def child(node: Any, name: str) -> Any:
+    """The object called `name` below `node`, or None where it is absent or its link leads nowhere."""
+    try:
+        return node.get(name)
+    except (KeyError, OSError, RuntimeError):
+        return None
+
+
+@contextmanager
+def reading(where: str) -> Iterator[None]:
+    """Turn the low-level errors of reading array data into one FileFormatError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise FileFormatError(
+            where,
+            received=f"data that cannot be read ({_reason(error)})",
+            expected="a complete dataset",
+            remedy="the file looks truncated or damaged: copy or make it again",
+        ) from None
+
+
+def frames_per_piece(*, chunk_frames: int | None, frame_bytes: int, maximum_bytes: int) -> int:
+    """How many frames to read at once: whole chunks of the file, within the memory allowed where possible."""
+    fitting = max(1, maximum_bytes // max(1, frame_bytes))
+    if not chunk_frames or chunk_frames == 1:
+        return fitting
+    # A chunk is the smallest thing the file can give: reading less decompresses it again for every piece.
+    if chunk_frames * frame_bytes > 4 * maximum_bytes:
+        return fitting
+    return max(chunk_frames, fitting // chunk_frames * chunk_frames)

@@ -1,0 +1,834 @@
+"""The acquisition file: measured series with their settings, read in pieces, written whole or not at all."""
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileFormatError, InputError
+from ..files import whole_file
+from ._hdf5 import (
+    check_format,
+    child,
+    frames_per_piece,
+    number_attribute,
+    open_hdf5,
+    plain_attributes,
+    reading,
+    text_attribute,
+    whole_attribute,
+)
+from .instrument import Instrument
+from .setting import Filter, Setting, filters_from_text, text_from_filters
+
+FORMAT = "raytwin-acquisition"
+VERSION = 1
+KINDS = ("dark", "flat", "object", "afterglow")
+SCENE_KINDS = ("wedge", "slab", "edge", "disc", "product")
+CORRECTIONS = ("offset", "gain", "defects", "log")
+ROLES = ("calibration", "evaluation")
+PIECE_BYTES = 64 * 2**20
+
+_LARGEST_EXACT_FLOAT32 = 2**24
+_CHUNK_BYTES = 2**17
+_LAYERS = ("inherent_filtration", "scintillator", "detector_cover")
+_TEXTS = ("anode", "detector", "belt_axis")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Series:
+    """Frames taken one after the other at one setting of one scene; the frames stay in the file until they are read.
+
+    Fields: name; index (order in time among the series); kind (`dark`, `flat`, `object`, `afterglow`); kV, exposure_ms,
+    current_mA, power_W (None: unknown or beam off); filters; averaged (frames averaged into each one);
+    frame_interval_ms; belt_speed_mm_s; panel_rotation_deg (counter-clockwise as the panel sees the source);
+    source_object_mm and source_detector_mm (None: the instrument's); photons_per_pixel (None: not measured); scene
+    (empty: none); corrected (subset of `offset`, `gain`, `defects`, `log`; empty = raw); role (`calibration`,
+    `evaluation`, or None for either); setting (None where kV or exposure is unknown); n_frames; shape (row, column);
+    time_s (n_frames,) or None.
+    """
+
+    name: str
+    index: int
+    kind: str
+    kV: float | None
+    exposure_ms: float | None
+    current_mA: float | None
+    power_W: float | None
+    filters: tuple[Filter, ...]
+    averaged: int
+    frame_interval_ms: float | None
+    belt_speed_mm_s: float | None
+    panel_rotation_deg: float
+    source_object_mm: float | None
+    source_detector_mm: float | None
+    photons_per_pixel: float | None
+    scene: str
+    corrected: frozenset[str]
+    role: str | None
+    setting: Setting | None
+    n_frames: int
+    shape: tuple[int, int]
+    time_s: NDArray[np.float64] | None
+    _frames: Any
+    _where: str
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of the frames that are handed out: uint16 where the file holds uint8 or uint16, else float32."""
+        return np.dtype(np.uint16 if self._frames.dtype in (np.uint8, np.uint16) else np.float32)
+
+    def iter_frames(self, *, maximum_bytes: int = PIECE_BYTES) -> Iterator[NDArray[Any]]:
+        """Yield the frames (DN) in time order as arrays (m, row, column), each of about `maximum_bytes` at most.
+
+        A piece holds at least one frame, and whole chunks of the file where a chunk is not more than four times
+        `maximum_bytes`.
+
+        Raises:
+            FileFormatError: a frame that cannot be read or holds a value that is not finite; the series is named.
+        """
+        chunks = self._frames.chunks
+        pixels = self.shape[0] * self.shape[1]
+        step = frames_per_piece(
+            chunk_frames=None if chunks is None else int(chunks[0]),
+            frame_bytes=pixels * max(self.dtype.itemsize, self._frames.dtype.itemsize),
+            maximum_bytes=maximum_bytes,
+        )
+        for start in range(0, self.n_frames, step):
+            yield self._read(start, min(start + step, self.n_frames))
+
+    def read_frames(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Frames `start` up to but without `stop` (DN), one array (m, row, column); negative numbers as in a slice."""
+        first, last, _ = slice(start, stop).indices(self.n_frames)
+        return self._read(first, max(first, last))
+
+    def _read(self, start: int, stop: int) -> NDArray[Any]:
+        with reading(self._where):
+            frames: NDArray[Any] = self._frames[start:stop]
+        wide = frames.dtype.kind in "iu" and frames.dtype not in (np.uint8, np.uint16) and frames.size > 0
+        if wide and max(abs(int(frames.min())), abs(int(frames.max()))) > _LARGEST_EXACT_FLOAT32:
+            raise FileFormatError(
+                f"{self._where}/frames",
+                received=f"a value beyond {_LARGEST_EXACT_FLOAT32} DN",
+                expected="detector numbers of at most 24 bits",
+            )
+        frames = np.ascontiguousarray(frames, dtype=self.dtype)
+        if frames.dtype.kind == "f" and not bool(np.isfinite(frames).all()):
+            bad = np.argwhere(~np.isfinite(frames))[0]
+            raise FileFormatError(
+                f"{self._where}/frames",
+                received=f"a value that is not finite in frame {start + int(bad[0])}, row {bad[1]}, column {bad[2]}",
+                expected="finite detector numbers",
+                remedy="remove the frame or mark the pixel as defect with its last good value",
+            )
+        return frames
+
+
+class _ThicknessMaps(Mapping[str, NDArray[np.float32]]):
+    """Material -> path length (mm) for every pixel; each map is read from the file when it is asked for."""
+
+    def __init__(self, group: Any, where: str) -> None:
+        self._group = group
+        self._where = where
+
+    def __getitem__(self, material: str) -> NDArray[np.float32]:
+        dataset = None if self._group is None else child(self._group, material)
+        if dataset is None:
+            raise KeyError(material)
+        with reading(self._where):
+            thickness_mm = np.asarray(dataset[()], dtype=np.float32)
+        if not bool(np.all(np.isfinite(thickness_mm) & (thickness_mm >= 0))):
+            raise FileFormatError(
+                f"{self._where}/{material}",
+                received="a negative or non-finite path length",
+                expected="finite path lengths of 0 mm or more",
+            )
+        return thickness_mm
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(()) if self._group is None else iter(self._group)
+
+    def __len__(self) -> int:
+        return 0 if self._group is None else len(self._group)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """What stood in the beam, as far as it is known.
+
+    Fields: name; kind (`wedge`, `slab`, `edge`, `disc`, `product`); shape (row, column) or None where nothing is known
+    pixel by pixel; thickness_mm (material -> path length along the ray of each pixel, (row, column), read when asked
+    for); product, foreign_object (identifiers, empty = none or unknown); size_mm (of the foreign object, NaN =
+    unknown); attributes (everything else that stands there).
+    """
+
+    name: str
+    kind: str
+    shape: tuple[int, int] | None
+    thickness_mm: Mapping[str, NDArray[np.float32]]
+    product: str
+    foreign_object: str
+    size_mm: float
+    attributes: Mapping[str, Any]
+    _foreign_object_mask: Any
+    _product_mask: Any
+    _where: str
+
+    @property
+    def foreign_object_mask(self) -> NDArray[np.bool_] | None:
+        """Where a ray meets a foreign object, (row, column), or None where it is unknown."""
+        return self._mask(self._foreign_object_mask)
+
+    @property
+    def product_mask(self) -> NDArray[np.bool_] | None:
+        """Where a ray meets the product, foreign objects included, (row, column), or None where it is unknown."""
+        return self._mask(self._product_mask)
+
+    def _mask(self, dataset: Any) -> NDArray[np.bool_] | None:
+        if dataset is None:
+            return None
+        with reading(self._where):
+            values: NDArray[Any] = dataset[()]
+        inside: NDArray[np.bool_] = np.not_equal(values, 0)
+        return inside
+
+
+@dataclass(slots=True, kw_only=True)
+class AcquisitionFile:
+    """An open acquisition file; use it in a `with` block.
+
+    Fields: path; instrument; series (in order of time); scenes (by name); attributes (of the file); missing (what the
+    file does not hold, each with what cannot be done without it).
+    """
+
+    path: str
+    instrument: Instrument
+    series: tuple[Series, ...]
+    scenes: dict[str, Scene]
+    attributes: Mapping[str, Any]
+    missing: tuple[str, ...]
+    _file: Any
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; its series and scenes cannot be read afterwards."""
+        self._file.close()
+
+    def of_kind(self, *kinds: str) -> tuple[Series, ...]:
+        """The series of these kinds, in order of time."""
+        return tuple(series for series in self.series if series.kind in kinds)
+
+
+def open_acquisition(path: str | os.PathLike[str]) -> AcquisitionFile:
+    """Open an acquisition file and check everything but the frames' values; those are checked as they are read.
+
+    Args:
+        path: HDF5 file with root attributes `format = "raytwin-acquisition"`, `version = 1`.
+
+    Returns:
+        The open file, a context manager.
+
+    Raises:
+        FileFormatError: not there, truncated, not HDF5, another format or version, a series without frames, an
+            attribute that is not a number or out of range, masks or maps of another shape than the frames.
+    """
+    file = open_hdf5(path, what="an acquisition file")
+    try:
+        return _acquisition(file, path=str(path))
+    except BaseException:
+        file.close()
+        raise
+
+
+def _acquisition(file: Any, *, path: str) -> AcquisitionFile:
+    check_format(file, path=path, format_name=FORMAT, version=VERSION)
+    group = child(file, "series")
+    if not isinstance(group, h5py.Group) or len(group) == 0:
+        raise FileFormatError(path, received="no series", expected="at least one series of frames below /series")
+    found = [_series(group, name, path=path) for name in group]
+    numbered = sorted((series for series in found if series.index >= 0), key=lambda series: (series.index, series.name))
+    # Series without an index come last, in the order of their names.
+    unnumbered = sorted((series for series in found if series.index < 0), key=lambda series: series.name)
+    scenes = _scenes(file, path=path)
+    for series in found:
+        scene = scenes.get(series.scene)
+        if scene is not None and scene.shape not in (None, series.shape):
+            raise FileFormatError(
+                f"{path}, scene {scene.name}",
+                received=f"masks or maps of {_by(scene.shape)} pixels",
+                expected=f"{_by(series.shape)} pixels as in the frames of series {series.name}",
+                remedy="give masks on the detector's own pixels",
+            )
+    instrument = _instrument(child(file, "instrument"), path=path)
+    ordered = tuple(numbered + unnumbered)
+    return AcquisitionFile(
+        path=path,
+        instrument=instrument,
+        series=ordered,
+        scenes=scenes,
+        attributes=MappingProxyType(dict(plain_attributes(file, where=path))),
+        missing=_missing(ordered, instrument, unnumbered=len(unnumbered)),
+        _file=file,
+    )
+
+
+def _by(shape: Sequence[int] | None) -> str:
+    return "?" if shape is None else " x ".join(str(length) for length in shape)
+
+
+def _series(group: Any, name: str, *, path: str) -> Series:
+    where = f"{path}, series {name}"
+    node = child(group, name)
+    frames = child(node, "frames") if isinstance(node, h5py.Group) else None
+    if not isinstance(frames, h5py.Dataset):
+        raise FileFormatError(where, received="no dataset `frames`", expected="frames (n, row, column)")
+    if frames.ndim != 3 or 0 in frames.shape:
+        raise FileFormatError(
+            f"{where}/frames", received=f"shape ({_by(frames.shape)})", expected="at least one frame, (n, row, column)"
+        )
+    if frames.dtype.kind not in "iuf":
+        raise FileFormatError(
+            f"{where}/frames", received=f"values of type {frames.dtype}", expected="uint16 or float32 detector numbers"
+        )
+    kind = text_attribute(node, "kind", where=where)
+    if kind not in KINDS:
+        raise FileFormatError(
+            f"{where}, attribute kind",
+            received=repr(kind) if kind else "nothing",
+            expected="one of " + ", ".join(KINDS),
+        )
+    dark = kind in ("dark", "afterglow")
+
+    def positive(attribute: str, unit: str) -> float | None:
+        return number_attribute(node, attribute, where=where, above=0, unit=unit)
+
+    def load(attribute: str, unit: str) -> float | None:
+        # With the beam off, 0 kV, 0 mA or 0 W is how some systems write "no beam".
+        if not dark:
+            return positive(attribute, unit)
+        return number_attribute(node, attribute, where=where, lowest=0, unit=unit) or None
+
+    kV, current_mA, power_W = load("kV", "kV"), load("current_mA", "mA"), load("power_W", "W")
+    exposure_ms = (
+        number_attribute(node, "exposure_ms", where=where, lowest=0, unit="ms")
+        if dark
+        else positive("exposure_ms", "ms")
+    )
+    filters = _layers(node, "filter", where=where) or ()
+    averaged = whole_attribute(node, "averaged", where=where, lowest=1) or 1
+    source_detector_mm = positive("source_detector_mm", "mm")
+    setting = None
+    if kV is not None and exposure_ms:
+        with _named(where):
+            setting = Setting(
+                kV=kV,
+                exposure_ms=exposure_ms,
+                current_mA=current_mA,
+                power_W=power_W,
+                filters=filters,
+                averaged=averaged,
+                source_detector_mm=source_detector_mm,
+            )
+    corrected = frozenset(word for word in (text_attribute(node, "corrected", where=where) or "").split("+") if word)
+    if not corrected <= set(CORRECTIONS):
+        raise FileFormatError(
+            f"{where}, attribute corrected",
+            received="+".join(sorted(corrected)),
+            expected="any of " + ", ".join(CORRECTIONS) + ", joined by +",
+        )
+    role = text_attribute(node, "role", where=where) or None
+    if role is not None and role not in ROLES:
+        raise FileFormatError(f"{where}, attribute role", received=repr(role), expected="one of " + ", ".join(ROLES))
+    index = whole_attribute(node, "index", where=where, lowest=0)
+    return Series(
+        name=name,
+        index=-1 if index is None else index,
+        kind=kind,
+        kV=kV,
+        exposure_ms=exposure_ms,
+        current_mA=current_mA,
+        power_W=power_W,
+        filters=filters,
+        averaged=averaged,
+        frame_interval_ms=positive("frame_interval_ms", "ms"),
+        belt_speed_mm_s=number_attribute(node, "belt_speed_mm_s", where=where, unit="mm/s"),
+        panel_rotation_deg=number_attribute(node, "panel_rotation_deg", where=where, unit="degrees") or 0.0,
+        source_object_mm=positive("source_object_mm", "mm"),
+        source_detector_mm=source_detector_mm,
+        photons_per_pixel=number_attribute(node, "photons_per_pixel", where=where, lowest=0),
+        scene=text_attribute(node, "scene", where=where) or "",
+        corrected=corrected,
+        role=role,
+        setting=setting,
+        n_frames=int(frames.shape[0]),
+        shape=(int(frames.shape[1]), int(frames.shape[2])),
+        time_s=_times(node, n_frames=int(frames.shape[0]), where=where),
+        _frames=frames,
+        _where=where,
+    )
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Errors of a setting or filter, told with the series they stand in."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except InputError as error:
+        raise FileFormatError(
+            f"{where}, {error.argument}", received=error.received, expected=error.expected, remedy=error.remedy
+        ) from None
+
+
+def _layers(node: Any, name: str, *, where: str) -> tuple[Filter, ...] | None:
+    text = text_attribute(node, name, where=where)
+    if text is None:
+        return None
+    with _named(where):
+        return filters_from_text(text)
+
+
+def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | None:
+    dataset = child(node, "time_s")
+    if dataset is None:
+        return None
+    with reading(f"{where}/time_s"):
+        time_s = np.asarray(dataset[()], dtype=np.float64)
+    if time_s.shape != (n_frames,) or not bool(np.all(np.isfinite(time_s))) or bool(np.any(np.diff(time_s) < 0)):
+        raise FileFormatError(
+            f"{where}/time_s",
+            received=f"{_by(time_s.shape)} values" if time_s.shape != (n_frames,) else "times that are not in order",
+            expected=f"{n_frames} finite times in s that never fall",
+        )
+    time_s.setflags(write=False)
+    return time_s
+
+
+def _scenes(file: Any, *, path: str) -> dict[str, Scene]:
+    group = child(file, "scenes")
+    return {} if not isinstance(group, h5py.Group) else {name: _scene(group, name, path=path) for name in group}
+
+
+def _scene(group: Any, name: str, *, path: str) -> Scene:
+    where = f"{path}, scene {name}"
+    node = child(group, name)
+    if not isinstance(node, h5py.Group):
+        raise FileFormatError(where, received="no group", expected="a group with masks or thickness maps")
+    maps = child(node, "thickness_mm")
+    if maps is not None and not isinstance(maps, h5py.Group):
+        raise FileFormatError(
+            f"{where}/thickness_mm", received="one dataset", expected="a group with one map a material"
+        )
+    masks = {mask: child(node, mask) for mask in ("foreign_object_mask", "product_mask")}
+    planes = {mask: dataset for mask, dataset in masks.items() if dataset is not None}
+    planes |= {f"thickness_mm/{material}": child(maps, material) for material in (maps or ())}
+    shapes = {}
+    for plane, dataset in planes.items():
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 2 or dataset.dtype.kind not in "iufb":
+            raise FileFormatError(
+                f"{where}/{plane}",
+                received=f"shape ({_by(getattr(dataset, 'shape', None))})",
+                expected="an array of numbers (row, column)",
+            )
+        shapes[plane] = (int(dataset.shape[0]), int(dataset.shape[1]))
+    if len(set(shapes.values())) > 1:
+        told = ", ".join(f"{plane} {_by(shape)}" for plane, shape in shapes.items())
+        raise FileFormatError(where, received=told, expected="masks and maps of one shape")
+    known = {"kind", "product", "foreign_object", "size_mm"}
+    size_mm = node.attrs.get("size_mm")
+    unknown_size = size_mm is None or (isinstance(size_mm, float | np.floating) and math.isnan(size_mm))
+    return Scene(
+        name=name,
+        kind=text_attribute(node, "kind", where=where) or "",
+        shape=next(iter(shapes.values()), None),
+        thickness_mm=_ThicknessMaps(maps, f"{where}/thickness_mm"),
+        product=text_attribute(node, "product", where=where) or "",
+        foreign_object=text_attribute(node, "foreign_object", where=where) or "",
+        size_mm=math.nan
+        if unknown_size
+        else number_attribute(node, "size_mm", where=where, lowest=0, unit="mm") or 0.0,
+        attributes=MappingProxyType(
+            {key: value for key, value in plain_attributes(node, where=where).items() if key not in known}
+        ),
+        _foreign_object_mask=masks["foreign_object_mask"],
+        _product_mask=masks["product_mask"],
+        _where=where,
+    )
+
+
+def _instrument(node: Any, *, path: str) -> Instrument:
+    if node is None:
+        return Instrument()
+    where = f"{path}, instrument"
+    values: dict[str, Any] = {}
+    for field in fields(Instrument):
+        if field.name in _LAYERS:
+            values[field.name] = _layers(node, field.name, where=where)
+        elif field.name in _TEXTS:
+            values[field.name] = text_attribute(node, field.name, where=where) or None
+        elif field.name in ("counting", "bits"):
+            values[field.name] = whole_attribute(node, field.name, where=where)
+        else:
+            values[field.name] = number_attribute(node, field.name, where=where)
+    if values["counting"] is not None:
+        values["counting"] = bool(values["counting"])
+    with _named(path):
+        return Instrument(**values)
+
+
+def _missing(series: tuple[Series, ...], instrument: Instrument, *, unnumbered: int) -> tuple[str, ...]:
+    told = []
+    kinds = {one.kind for one in series}
+    lit = [one for one in series if one.kind in ("flat", "object")]
+    if unnumbered:
+        told.append(f"{unnumbered} series without index: their order in time is taken from their names")
+    if "dark" not in kinds:
+        told.append("no dark series: dark level and read noise cannot be measured")
+    if "flat" not in kinds:
+        told.append("no flat series: gain, flux and blur cannot be calibrated, nor objects be corrected")
+    without_kV = sum(one.kV is None for one in lit)
+    if without_kV:
+        told.append(f"{without_kV} of {len(lit)} exposed series without kV: no spectral part for them")
+    without_load = sum(one.current_mA is None and one.power_W is None for one in lit)
+    if without_load:
+        told.append(f"{without_load} of {len(lit)} exposed series without current or power: no flux scale from them")
+    without_exposure = sum(one.exposure_ms is None for one in series)
+    if without_exposure:
+        told.append(f"{without_exposure} series without exposure time: no pairing with darks by exposure")
+    if instrument.pixel_mm is None:
+        told.append("no pixel size: lengths stay in pixels, photons per area unknown")
+    if instrument.source_detector_mm is None and any(one.source_detector_mm is None for one in lit):
+        told.append("no source-detector distance: the flux of the tube cannot be scaled to the detector")
+    if instrument.scintillator is None:
+        told.append("no scintillator: the default of the twin is assumed")
+    return tuple(told)
+
+
+class SeriesWriter:
+    """Appends frames to one series of the file being written."""
+
+    def __init__(self, group: Any, *, name: str, dataset: Any) -> None:
+        self.name = name
+        self._group = group
+        self._dataset = dataset
+        self._time_s: list[float] = []
+
+    @property
+    def n_frames(self) -> int:
+        """How many frames have been written."""
+        return int(self._dataset.shape[0])
+
+    def append(self, frames: NDArray[Any], *, time_s: float | Sequence[float] | NDArray[Any] | None = None) -> None:
+        """Append one frame (row, column) or several (m, row, column), with their times (s) where they are known.
+
+        Raises:
+            InputError: another shape, a value that is not finite, or one that the series' type cannot hold.
+        """
+        block = np.asarray(frames)
+        if block.ndim == 2:
+            block = block[None]
+        if block.ndim != 3 or block.shape[1:] != self._dataset.shape[1:]:
+            raise InputError(
+                f"frames of series {self.name}",
+                received=f"shape ({_by(block.shape)})",
+                expected=f"frames of {_by(self._dataset.shape[1:])} pixels as before",
+            )
+        block = _storable(block, self._dataset.dtype, name=self.name)
+        times = [] if time_s is None else np.atleast_1d(np.asarray(time_s, dtype=np.float64)).tolist()
+        if time_s is not None and len(times) != len(block):
+            raise InputError(
+                f"time_s of series {self.name}", received=f"{len(times)} times", expected=f"{len(block)}, one a frame"
+            )
+        before = self.n_frames
+        self._dataset.resize(before + len(block), axis=0)
+        self._dataset[before:] = block
+        self._time_s += times
+
+    def _finish(self) -> None:
+        if self._time_s:
+            self._group.create_dataset("time_s", data=np.asarray(self._time_s, dtype=np.float64))
+
+
+class AcquisitionWriter:
+    """An acquisition file being written; made by `write_acquisition`."""
+
+    def __init__(self, file: Any, *, compression: str | None) -> None:
+        self.attributes: Any = file.attrs
+        self._compression = compression
+        self._series = file.create_group("series")
+        self._scenes = file.require_group("scenes")
+        self._writers: list[SeriesWriter] = []
+        self._next_index = 0
+
+    def add_series(
+        self,
+        name: str,
+        *,
+        kind: str,
+        frames: NDArray[Any] | Iterable[NDArray[Any]] | None = None,
+        shape: tuple[int, int] | None = None,
+        dtype: Any = None,
+        chunk_frames: int | None = None,
+        index: int | None = None,
+        setting: Setting | None = None,
+        kV: float | None = None,
+        exposure_ms: float | None = None,
+        current_mA: float | None = None,
+        power_W: float | None = None,
+        filters: Iterable[Filter] | None = None,
+        averaged: int | None = None,
+        frame_interval_ms: float | None = None,
+        belt_speed_mm_s: float | None = None,
+        panel_rotation_deg: float | None = None,
+        source_object_mm: float | None = None,
+        source_detector_mm: float | None = None,
+        photons_per_pixel: float | None = None,
+        scene: str = "",
+        corrected: Iterable[str] = (),
+        role: str | None = None,
+        time_s: NDArray[Any] | Sequence[float] | None = None,
+    ) -> SeriesWriter:
+        """Start a series, with its frames at once or with `append` on what is returned.
+
+        Args:
+            name: unique in the file, without `/`.
+            kind: `dark`, `flat`, `object` or `afterglow`.
+            frames: (n, row, column), one frame (row, column), or an iterable of such arrays; None: append later.
+            shape: (row, column), needed where `frames` is None.
+            dtype: uint16 or float32; by default uint16 for integers and float32 for the rest.
+            chunk_frames: frames a chunk of the file holds; by default 1, more where frames are tiny.
+            index: order in time; by default after the series added before.
+            setting: the setting as one value; or the single attributes instead, each None where unknown.
+            time_s: (n,) times of the frames in s, where they are known.
+
+        Returns:
+            The writer of this series.
+
+        Raises:
+            InputError: a name used twice, an unknown kind, frames of mixed shapes or values the type cannot hold.
+        """
+        _check_name("series name", name, taken=self._series)
+        if kind not in KINDS:
+            raise InputError(f"kind of series {name}", received=repr(kind), expected="one of " + ", ".join(KINDS))
+        words = tuple(corrected)
+        if not set(words) <= set(CORRECTIONS):
+            raise InputError(
+                f"corrected of series {name}", received="+".join(words), expected="any of " + ", ".join(CORRECTIONS)
+            )
+        if role is not None and role not in ROLES:
+            raise InputError(f"role of series {name}", received=repr(role), expected="one of " + ", ".join(ROLES))
+        group = self._series.create_group(name)
+        number = self._next_index if index is None else int(index)
+        self._next_index = max(self._next_index, number + 1)
+        attributes: dict[str, Any] = {
+            "index": number,
+            "kind": kind,
+            "kV": kV,
+            "exposure_ms": exposure_ms,
+            "current_mA": current_mA,
+            "power_W": power_W,
+            "filter": None if filters is None else text_from_filters(filters),
+            "averaged": averaged,
+            "frame_interval_ms": frame_interval_ms,
+            "belt_speed_mm_s": belt_speed_mm_s,
+            "panel_rotation_deg": panel_rotation_deg,
+            "source_object_mm": source_object_mm,
+            "source_detector_mm": source_detector_mm,
+            "photons_per_pixel": photons_per_pixel,
+            "scene": scene or None,
+            "corrected": "+".join(word for word in CORRECTIONS if word in words) or None,
+            "role": role,
+        }
+        if setting is not None:
+            attributes = _attributes_of(setting) | {
+                key: value for key, value in attributes.items() if value is not None
+            }
+        for key, value in attributes.items():
+            if value is not None:
+                group.attrs[key] = value
+        pieces = _pieces(frames)
+        first = next(pieces, None)
+        if shape is None:
+            if first is None:
+                raise InputError(
+                    f"series {name}", received="no frames", expected="frames, or their shape to append later"
+                )
+            shape = (int(first.shape[-2]), int(first.shape[-1])) if first.ndim >= 2 else (0, 0)
+        if min(shape) < 1:
+            raise InputError(f"frames of series {name}", received=f"{_by(shape)} pixels", expected="(row, column)")
+        if dtype is None:
+            dtype = np.uint16 if first is None or first.dtype.kind in "iub" else np.float32
+        if np.dtype(dtype) not in (np.uint16, np.float32):
+            raise InputError(f"dtype of series {name}", received=str(np.dtype(dtype)), expected="uint16 or float32")
+        dataset = group.create_dataset(
+            "frames",
+            shape=(0, *shape),
+            maxshape=(None, *shape),
+            dtype=dtype,
+            chunks=(chunk_frames or _chunk_frames(shape, np.dtype(dtype)), *shape),
+            compression=self._compression,
+            shuffle=self._compression is not None,
+        )
+        writer = SeriesWriter(group, name=name, dataset=dataset)
+        self._writers.append(writer)
+        while first is not None:
+            writer.append(first)
+            first = next(pieces, None)
+        if time_s is not None:
+            writer._time_s = np.asarray(time_s, dtype=np.float64).tolist()
+        return writer
+
+    def add_scene(
+        self,
+        name: str,
+        *,
+        kind: str,
+        thickness_mm: Mapping[str, NDArray[Any]] | None = None,
+        foreign_object_mask: NDArray[Any] | None = None,
+        product_mask: NDArray[Any] | None = None,
+        product: str = "",
+        foreign_object: str = "",
+        size_mm: float | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Add what stood in the beam: path lengths (mm) for every pixel by material, masks, identifiers.
+
+        Args:
+            name: what the series' `scene` says.
+            kind: `wedge`, `slab`, `edge`, `disc` or `product`.
+            thickness_mm: material -> (row, column) path length along the ray that ends in that pixel.
+            foreign_object_mask, product_mask: (row, column), anything but 0 is inside.
+            product, foreign_object: identifiers; empty = none or unknown.
+            size_mm: size of the foreign object; None or NaN = unknown.
+            attributes: further attributes to keep with the scene.
+        """
+        _check_name("scene name", name, taken=self._scenes)
+        if kind not in SCENE_KINDS:
+            raise InputError(f"kind of scene {name}", received=repr(kind), expected="one of " + ", ".join(SCENE_KINDS))
+        group = self._scenes.create_group(name)
+        told = {"kind": kind, "product": product or None, "foreign_object": foreign_object or None, "size_mm": size_mm}
+        for key, value in {**(attributes or {}), **told}.items():
+            if value is not None:
+                group.attrs[key] = value
+        for material, plane in (thickness_mm or {}).items():
+            _check_name(f"material of scene {name}", material, taken=())
+            lengths = np.asarray(plane, dtype=np.float32)
+            if not bool(np.all(np.isfinite(lengths) & (lengths >= 0))):
+                raise InputError(
+                    f"thickness of {material} in scene {name}",
+                    received="a negative or non-finite value",
+                    expected="finite path lengths of 0 mm or more",
+                )
+            # Maps are smooth and mostly empty: compression costs little and saves most of the space.
+            group.create_dataset(f"thickness_mm/{material}", data=lengths, compression="lzf", shuffle=True)
+        for mask_name, mask in (("foreign_object_mask", foreign_object_mask), ("product_mask", product_mask)):
+            if mask is not None:
+                data = (np.asarray(mask) != 0).astype(np.uint8)
+                group.create_dataset(mask_name, data=data, compression="lzf")
+
+    def _finish(self) -> None:
+        for writer in self._writers:
+            writer._finish()
+
+
+@contextmanager
+def write_acquisition(
+    path: str | os.PathLike[str], instrument: Instrument | None = None, *, compression: str | None = None
+) -> Iterator[AcquisitionWriter]:
+    """Write an acquisition file in a `with` block; it appears under its name when the block succeeds, or not at all.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        instrument: what is known about the line.
+        compression: None (fastest), `lzf` or `gzip`, for the frames.
+
+    Raises:
+        InputError: what was written does not make a valid file (no series, a series without frames, masks of
+            another shape, an attribute out of range).
+    """
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["version"] = VERSION
+        _write_instrument(file.create_group("instrument"), instrument or Instrument())
+        writer = AcquisitionWriter(file, compression=compression)
+        yield writer
+        writer._finish()
+        # The reader's own checks, so that nothing is written that could not be read.
+        _acquisition(file, path=str(path))
+
+
+def _write_instrument(group: Any, instrument: Instrument) -> None:
+    for field in fields(Instrument):
+        value = getattr(instrument, field.name)
+        if value is not None:
+            group.attrs[field.name] = text_from_filters(value) if field.name in _LAYERS else value
+
+
+def _attributes_of(setting: Setting) -> dict[str, Any]:
+    attributes = {
+        field.name: getattr(setting, field.name)
+        for field in fields(Setting)
+        if field.name not in ("filters", "averaged")
+    }
+    attributes["filter"] = text_from_filters(setting.filters)
+    if setting.averaged != 1:
+        attributes["averaged"] = int(setting.averaged)
+    return attributes
+
+
+def _chunk_frames(pixels: Sequence[int], dtype: np.dtype[Any]) -> int:
+    return max(1, _CHUNK_BYTES // max(1, math.prod(pixels) * dtype.itemsize))
+
+
+def _pieces(frames: NDArray[Any] | Iterable[NDArray[Any]] | None) -> Iterator[NDArray[Any]]:
+    if frames is None:
+        return
+    if isinstance(frames, np.ndarray):
+        yield frames
+        return
+    for piece in frames:
+        yield np.asarray(piece)
+
+
+def _storable(block: NDArray[Any], dtype: np.dtype[Any], *, name: str) -> NDArray[Any]:
+    if block.dtype.kind not in "iufb":
+        raise InputError(
+            f"frames of series {name}", received=f"values of type {block.dtype}", expected="detector numbers"
+        )
+    if block.dtype.kind == "f" and not bool(np.isfinite(block).all()):
+        raise InputError(
+            f"frames of series {name}", received="a value that is not finite", expected="finite detector numbers"
+        )
+    if dtype == np.uint16 and block.dtype not in (np.uint16, np.uint8) and block.size:
+        lowest, highest = block.min(), block.max()
+        whole = block.dtype.kind != "f" or bool(np.all(block == np.rint(block)))
+        if lowest < 0 or highest > 65535 or not whole:
+            raise InputError(
+                f"frames of series {name}",
+                received=f"values from {lowest:g} to {highest:g}" if whole else "values that are not whole",
+                expected="whole detector numbers from 0 to 65535 in a uint16 series",
+                remedy="write the series as float32",
+            )
+    return block.astype(dtype, copy=False)
+
+
+def _check_name(argument: str, name: str, *, taken: Any) -> None:
+    if not name or "/" in name or name in (".", ".."):
+        raise InputError(argument, received=repr(name), expected="a name without '/'")
+    if name in taken:
+        raise InputError(argument, received=f"{name!r} twice", expected="a name of its own for each")

@@ -1,0 +1,158 @@
+"""Sums over the frames of one series: all that photon transfer needs, from one pass in constant memory.
+
+The sums of two parts of a series, or of two sessions, add up (`merge_frame_sums`); the frame pair across the seam of two
+parts is then missing, nothing else.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameSums:
+    """Per-pixel sums over frames x_1 .. x_n, relative to `reference` (the first frame), and the frames' own means.
+
+    Fields: frames (n); pairs (successive differences summed); reference, deviation_sum, square_sum, pair_square_sum
+    (row, column), DN and DN^2; frame_mean_DN (n,), in time order; maximum_DN (highest value seen) and maximum_count
+    (how many values equal it); integer (all values were whole numbers).
+    """
+
+    frames: int
+    pairs: int
+    reference: NDArray[np.float64]
+    deviation_sum: NDArray[np.float64]
+    square_sum: NDArray[np.float64]
+    pair_square_sum: NDArray[np.float64]
+    frame_mean_DN: NDArray[np.float64]
+    maximum_DN: float
+    maximum_count: int
+    integer: bool
+
+    @property
+    def mean_DN(self) -> NDArray[np.float64]:
+        """Mean frame (row, column), DN."""
+        return np.asarray(self.reference + self.deviation_sum / self.frames)
+
+    @property
+    def stack_variance_DN2(self) -> NDArray[np.float64]:
+        """Variance over the stack, ddof = 1 (row, column), DN^2; NaN for a single frame."""
+        if self.frames < 2:
+            return np.full(self.reference.shape, np.nan)
+        spread = self.square_sum - self.deviation_sum**2 / self.frames
+        return np.asarray(np.clip(spread, 0.0, None) / (self.frames - 1))
+
+    @property
+    def pair_variance_DN2(self) -> NDArray[np.float64]:
+        """Variance from successive differences, sum (x_(i+1) - x_i)^2 / (2 pairs) (row, column), DN^2.
+
+        Slow drift leaves it alone; lag lowers it more than the stack variance. NaN for a single frame.
+        """
+        if self.pairs < 1:
+            return np.full(self.reference.shape, np.nan)
+        return np.asarray(self.pair_square_sum / (2.0 * self.pairs))
+
+
+def effective_frames(frames: int) -> float:
+    """Frames of a stack whose variance is known as well as that from successive differences of `frames` frames.
+
+    Var of the successive-difference estimator for white Gaussian frames is (3 n - 4) / (n - 1)^2 sigma^4 (von Neumann,
+    Ann. Math. Stat. 12, 1941); a mean of N squares has 2 / N.
+    """
+    return 2.0 * (frames - 1) ** 2 / (3.0 * frames - 4.0) if frames > 1 else 0.0
+
+
+def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> FrameSums:
+    """Sums over frames that arrive in pieces (m, row, column) in time order; each piece is read once, DN.
+
+    Args:
+        pieces: arrays (m, row, column), uint16 or float, DN; at least one frame in all.
+        name: what to call the series in errors.
+
+    Raises:
+        InputError: no frame at all, frames of different shapes, NaN or infinite values.
+    """
+    from ._kernels import accumulate
+
+    frames = pairs = maximum_count = 0
+    maximum_DN = -np.inf
+    integer = True
+    sums: list[NDArray[np.float64]] = []
+    frame_means: list[NDArray[np.float64]] = []
+    shape: tuple[int, ...] = ()
+    for piece in pieces:
+        if piece.ndim != 3 or (sums and piece.shape[1:] != shape):
+            raise InputError(name, received=f"shape {piece.shape}", expected="frames (n, row, column) of one shape")
+        if piece.shape[0] == 0:
+            continue
+        flat = np.ascontiguousarray(piece).reshape(piece.shape[0], -1)
+        if flat.dtype.kind == "f":
+            if not np.all(np.isfinite(flat)):
+                raise InputError(
+                    name,
+                    received="NaN or infinite detector numbers",
+                    expected="finite values in every frame",
+                    remedy="mark such pixels as defects or leave the frames out",
+                )
+            integer = integer and bool(np.all(flat == np.rint(flat)))
+        if not sums:
+            shape = piece.shape[1:]
+            sums = [flat[0].astype(np.float64)] + [np.zeros(flat.shape[1]) for _ in range(3)] + [np.zeros(flat.shape[1])]
+        reference, deviation, square, pair, last = sums
+        accumulate(flat, last, frames > 0, reference, deviation, square, pair)
+        pairs += flat.shape[0] - (1 if frames == 0 else 0)
+        frames += flat.shape[0]
+        frame_means.append(flat.mean(axis=1, dtype=np.float64))
+        highest = float(flat.max())
+        if highest > maximum_DN:
+            maximum_DN, maximum_count = highest, 0
+        if highest == maximum_DN:
+            maximum_count += int(np.count_nonzero(flat == highest))
+    if not sums:
+        raise InputError(name, received="no frames", expected="at least one frame")
+    reference, deviation, square, pair, _ = (array.reshape(shape) for array in sums)
+    return FrameSums(
+        frames=frames,
+        pairs=pairs,
+        reference=reference,
+        deviation_sum=deviation,
+        square_sum=square,
+        pair_square_sum=pair,
+        frame_mean_DN=np.concatenate(frame_means),
+        maximum_DN=maximum_DN,
+        maximum_count=maximum_count,
+        integer=integer,
+    )
+
+
+def merge_frame_sums(first: FrameSums, second: FrameSums) -> FrameSums:
+    """The sums over both parts; the pair across their seam is left out.
+
+    Raises:
+        InputError: the parts have different frame shapes.
+    """
+    if first.reference.shape != second.reference.shape:
+        raise InputError(
+            "frame sums",
+            received=f"{first.reference.shape} and {second.reference.shape}",
+            expected="parts with frames of one shape",
+        )
+    shift = second.reference - first.reference
+    highest = max(first.maximum_DN, second.maximum_DN)
+    return FrameSums(
+        frames=first.frames + second.frames,
+        pairs=first.pairs + second.pairs,
+        reference=first.reference,
+        deviation_sum=first.deviation_sum + second.deviation_sum + second.frames * shift,
+        square_sum=first.square_sum + second.square_sum + 2 * shift * second.deviation_sum + second.frames * shift**2,
+        pair_square_sum=first.pair_square_sum + second.pair_square_sum,
+        frame_mean_DN=np.concatenate([first.frame_mean_DN, second.frame_mean_DN]),
+        maximum_DN=highest,
+        maximum_count=sum(part.maximum_count for part in (first, second) if part.maximum_DN == highest),
+        integer=first.integer and second.integer,
+    )

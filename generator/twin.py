@@ -1,0 +1,176 @@
+"""The twin: what calibration knows of one line, and all that prediction and generation need."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.instrument import Instrument
+from ..acquisition.setting import Filter, Setting, text_from_filters
+from ..errors import InputError
+
+# reason codes of bad pixels; a pixel carries the first that applies
+BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """A value with its 95 % interval, in the unit its name says."""
+
+    value: float
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.value) and self.low <= self.value <= self.high):
+            raise InputError(
+                "estimate", received=f"{self.value} ({self.low} to {self.high})", expected="low <= value <= high, finite"
+            )
+
+    def as_dict(self) -> dict[str, float]:
+        """`{value, low, high}`."""
+        return {"value": self.value, "low": self.low, "high": self.high}
+
+
+def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf) -> Estimate:
+    """Gaussian 95 % interval about `value`, cut at `lowest`."""
+    half = 1.959964 * sd
+    return Estimate(value=value, low=min(max(value - half, lowest), value), high=value + half)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Level:
+    """One tube voltage and filter that was measured.
+
+    Fields: kV (None where unknown), filters; gain_DN (variance per signal, the spread's share restored);
+    photon_transfer_slope_DN (variance of one pixel per signal, as measured); rate_DN_per_mAs (detector median above dark
+    at source_detector_mm; None where the tube load is unknown); saturation_DN (None where none was seen); flat_shape
+    (row, column): signal relative to the detector median.
+    """
+
+    kV: float | None
+    filters: tuple[Filter, ...]
+    gain_DN: Estimate
+    photon_transfer_slope_DN: Estimate
+    rate_DN_per_mAs: Estimate | None
+    source_detector_mm: float | None
+    saturation_DN: float | None
+    flat_shape: NDArray[np.float32]
+    series: tuple[str, ...]
+    role: str
+
+    @property
+    def name(self) -> str:
+        """kV and filter in one word for tables."""
+        voltage = "unknown kV" if self.kV is None else f"{self.kV:g} kV"
+        return f"{voltage}, {text_from_filters(self.filters) or 'no filter'}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseModel:
+    """Noise of the detector: see generator.psf for the two descriptions of the optical spread.
+
+    Fields: psf_model, psf_sigma_px; white_fraction: signal-following white variance over the quantum variance before the
+    spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN.
+    """
+
+    psf_model: str
+    psf_sigma_px: Estimate
+    white_fraction: float
+    read_noise_DN: Estimate
+    quantised: bool
+
+    @property
+    def read_variance_DN2(self) -> float:
+        """Electronic noise and rounding (1/12 DN^2), variance of one frame, DN^2."""
+        return self.read_noise_DN.value**2 + (1.0 / 12.0 if self.quantised else 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectorMaps:
+    """Per-pixel maps (row, column): dark at `dark_exposure_ms`, its growth a ms, relative gain, read variance, bad pixels.
+
+    gain_relative is the pixel's gain over the detector median, shrunk towards 1 as far as the data are thin.
+    """
+
+    dark_DN: NDArray[np.float32]
+    dark_exposure_ms: float | None
+    dark_DN_per_ms: NDArray[np.float32]
+    gain_relative: NDArray[np.float32]
+    read_variance_DN2: NDArray[np.float32]
+    bad_pixels: NDArray[np.uint8]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the detector."""
+        return (self.dark_DN.shape[0], self.dark_DN.shape[1])
+
+    def dark_at(self, exposure_ms: float | None) -> NDArray[np.float32]:
+        """Dark frame (row, column) at an exposure time, DN."""
+        if exposure_ms is None or self.dark_exposure_ms is None:
+            return self.dark_DN
+        return np.asarray(self.dark_DN + self.dark_DN_per_ms * np.float32(exposure_ms - self.dark_exposure_ms))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpectralPosterior:
+    """What the flats say of tube and scintillator: equally likely parameter sets.
+
+    Fields: names (parameters, units in the names); samples (draw, parameter); best (parameter,): the most probable set;
+    prior: name -> text; undetermined: directions that the data leave as wide as the prior, in words; anode,
+    anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model.
+    """
+
+    names: tuple[str, ...]
+    samples: NDArray[np.float64]
+    best: NDArray[np.float64]
+    prior: Mapping[str, str]
+    undetermined: tuple[str, ...]
+    anode: str
+    anode_angle_deg: float
+    model: str
+    inherent: tuple[Filter, ...]
+    scintillator: tuple[Filter, ...]
+    cover: tuple[Filter, ...]
+    counting: bool
+    level_discrepancy: float
+    gain_discrepancy: float
+    calibrated_kV: tuple[float, float]
+    calibrated_filters: tuple[str, ...]
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """Draws of one parameter (draw,)."""
+        return np.asarray(self.samples[:, self.names.index(name)])
+
+    def interval(self, name: str) -> Estimate:
+        """Median and 95 % interval of one parameter."""
+        low, middle, high = np.quantile(self.column(name), [0.025, 0.5, 0.975])
+        return Estimate(value=float(middle), low=float(low), high=float(high))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Twin:
+    """A calibrated line."""
+
+    instrument: Instrument
+    maps: DetectorMaps
+    noise: NoiseModel
+    dark_DN: Estimate
+    levels: tuple[Level, ...]
+    spectral: SpectralPosterior | None
+    evidence: Mapping[str, Any]
+    warnings: tuple[str, ...]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def level_at(self, setting: Setting) -> Level | None:
+        """The measured level of this kV and these filters (same layers in any order), or None."""
+        wanted = sorted(str(layer) for layer in setting.filters)
+        for level in self.levels:
+            if level.kV is None or abs(level.kV - setting.kV) > 1e-6 * setting.kV:
+                continue
+            if sorted(str(layer) for layer in level.filters) == wanted:
+                return level
+        return None

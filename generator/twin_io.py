@@ -1,0 +1,222 @@
+"""Twin files: HDF5, `format = "raytwin-twin"`, version 1. Numbers and text only; nothing is ever unpickled."""
+
+import json
+import os
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.instrument import Instrument
+from ..acquisition.setting import filters_from_text, text_from_filters
+from ..errors import FileFormatError
+from ..files import whole_file
+from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
+
+FORMAT = "raytwin-twin"
+VERSION = 1
+_FILTER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover")
+
+
+def _put_estimate(group: Any, name: str, estimate: Estimate | None) -> None:
+    if estimate is not None:
+        group.attrs[name] = np.array([estimate.value, estimate.low, estimate.high])
+
+
+def _get_estimate(group: Any, name: str) -> Estimate | None:
+    if name not in group.attrs:
+        return None
+    value, low, high = (float(item) for item in group.attrs[name])
+    return Estimate(value=value, low=low, high=high)
+
+
+def _required(estimate: Estimate | None, name: str, path: object) -> Estimate:
+    if estimate is None:
+        raise FileFormatError(f"twin {path}", received=f"no {name}", expected="a complete twin file")
+    return estimate
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
+    """Write a twin; the file appears whole or not at all."""
+    import h5py
+
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["version"] = VERSION
+        file.attrs["provenance"] = json.dumps(dict(twin.provenance))
+        file.attrs["evidence"] = json.dumps(dict(twin.evidence))
+        file.attrs["warnings"] = json.dumps(list(twin.warnings))
+        instrument = file.create_group("instrument")
+        for entry in fields(Instrument):
+            value = getattr(twin.instrument, entry.name)
+            if value is not None:
+                instrument.attrs[entry.name] = text_from_filters(value) if entry.name in _FILTER_FIELDS else value
+        maps = file.create_group("maps")
+        for name in ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels"):
+            maps.create_dataset(name, data=getattr(twin.maps, name), compression="gzip", shuffle=True)
+        if twin.maps.dark_exposure_ms is not None:
+            maps.attrs["dark_exposure_ms"] = twin.maps.dark_exposure_ms
+        noise = file.create_group("noise")
+        noise.attrs["psf_model"] = twin.noise.psf_model
+        noise.attrs["white_fraction"] = twin.noise.white_fraction
+        noise.attrs["quantised"] = twin.noise.quantised
+        _put_estimate(noise, "psf_sigma_px", twin.noise.psf_sigma_px)
+        _put_estimate(noise, "read_noise_DN", twin.noise.read_noise_DN)
+        _put_estimate(noise, "dark_DN", twin.dark_DN)
+        levels = file.create_group("levels")
+        for index, level in enumerate(twin.levels):
+            group = levels.create_group(f"{index:04d}")
+            if level.kV is not None:
+                group.attrs["kV"] = level.kV
+            group.attrs["filter"] = text_from_filters(level.filters)
+            group.attrs["series"] = json.dumps(list(level.series))
+            group.attrs["role"] = level.role
+            for name in ("gain_DN", "photon_transfer_slope_DN", "rate_DN_per_mAs"):
+                _put_estimate(group, name, getattr(level, name))
+            for name in ("source_detector_mm", "saturation_DN"):
+                if getattr(level, name) is not None:
+                    group.attrs[name] = getattr(level, name)
+            group.create_dataset("flat_shape", data=level.flat_shape, compression="gzip", shuffle=True)
+        if twin.spectral is not None:
+            spectral = file.create_group("spectral")
+            posterior = twin.spectral
+            spectral.create_dataset("samples", data=posterior.samples, compression="gzip", shuffle=True)
+            spectral.create_dataset("best", data=posterior.best)
+            spectral.attrs["names"] = json.dumps(list(posterior.names))
+            spectral.attrs["prior"] = json.dumps(dict(posterior.prior))
+            spectral.attrs["undetermined"] = json.dumps(list(posterior.undetermined))
+            for name in ("anode", "anode_angle_deg", "model", "counting", "level_discrepancy", "gain_discrepancy"):
+                spectral.attrs[name] = getattr(posterior, name)
+            for name in ("inherent", "scintillator", "cover"):
+                spectral.attrs[name] = text_from_filters(getattr(posterior, name))
+            spectral.attrs["calibrated_kV"] = np.array(posterior.calibrated_kV)
+            spectral.attrs["calibrated_filters"] = json.dumps(list(posterior.calibrated_filters))
+
+
+def _array(group: Any, name: str, dtype: type[Any]) -> NDArray[Any]:
+    return np.asarray(group[name][()], dtype=dtype)
+
+
+def read_twin(path: str | os.PathLike[str]) -> Twin:
+    """Read a twin file.
+
+    Raises:
+        FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing.
+    """
+    import h5py
+
+    if not os.path.isfile(path):
+        raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
+    try:
+        file = h5py.File(path, "r")
+    except OSError:
+        raise FileFormatError(
+            f"twin {path}",
+            received="a file that is not HDF5 or is cut off",
+            expected="a file that `raytwin calibrate` wrote",
+        ) from None
+    with file:
+        found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
+        if found != (FORMAT, VERSION):
+            raise FileFormatError(
+                f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
+            )
+        try:
+            return _twin_from_file(file, path)
+        except (KeyError, OSError, json.JSONDecodeError) as error:
+            raise FileFormatError(
+                f"twin {path}",
+                received=f"a damaged file ({error})",
+                expected="a complete twin file",
+                remedy="calibrate again",
+            ) from None
+
+
+def _twin_from_file(file: Any, path: object) -> Twin:
+    values: dict[str, Any] = {}
+    names = {entry.name for entry in fields(Instrument)}
+    for name, value in file["instrument"].attrs.items():
+        if name not in names:
+            continue
+        if name in _FILTER_FIELDS:
+            values[name] = filters_from_text(_text(value))
+        elif isinstance(value, str | bytes):
+            values[name] = _text(value)
+        else:
+            values[name] = value.item() if isinstance(value, np.generic) else value
+    maps = file["maps"]
+    noise = file["noise"]
+    levels = []
+    for name in sorted(file["levels"]):
+        group = file["levels"][name]
+        levels.append(
+            Level(
+                kV=float(group.attrs["kV"]) if "kV" in group.attrs else None,
+                filters=filters_from_text(_text(group.attrs["filter"])),
+                gain_DN=_required(_get_estimate(group, "gain_DN"), "gain_DN", path),
+                photon_transfer_slope_DN=_required(
+                    _get_estimate(group, "photon_transfer_slope_DN"), "photon_transfer_slope_DN", path
+                ),
+                rate_DN_per_mAs=_get_estimate(group, "rate_DN_per_mAs"),
+                source_detector_mm=_optional_float(group, "source_detector_mm"),
+                saturation_DN=_optional_float(group, "saturation_DN"),
+                flat_shape=_array(group, "flat_shape", np.float32),
+                series=tuple(json.loads(_text(group.attrs["series"]))),
+                role=_text(group.attrs["role"]),
+            )
+        )
+    spectral = None
+    if "spectral" in file:
+        group = file["spectral"]
+        attributes = group.attrs
+        spectral = SpectralPosterior(
+            names=tuple(json.loads(_text(attributes["names"]))),
+            samples=_array(group, "samples", np.float64),
+            best=_array(group, "best", np.float64),
+            prior=json.loads(_text(attributes["prior"])),
+            undetermined=tuple(json.loads(_text(attributes["undetermined"]))),
+            anode=_text(attributes["anode"]),
+            anode_angle_deg=float(attributes["anode_angle_deg"]),
+            model=_text(attributes["model"]),
+            inherent=filters_from_text(_text(attributes["inherent"])),
+            scintillator=filters_from_text(_text(attributes["scintillator"])),
+            cover=filters_from_text(_text(attributes["cover"])),
+            counting=bool(attributes["counting"]),
+            level_discrepancy=float(attributes["level_discrepancy"]),
+            gain_discrepancy=float(attributes["gain_discrepancy"]),
+            calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
+            calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
+        )
+    return Twin(
+        instrument=Instrument(**values),
+        maps=DetectorMaps(
+            dark_DN=_array(maps, "dark_DN", np.float32),
+            dark_exposure_ms=_optional_float(maps, "dark_exposure_ms"),
+            dark_DN_per_ms=_array(maps, "dark_DN_per_ms", np.float32),
+            gain_relative=_array(maps, "gain_relative", np.float32),
+            read_variance_DN2=_array(maps, "read_variance_DN2", np.float32),
+            bad_pixels=_array(maps, "bad_pixels", np.uint8),
+        ),
+        noise=NoiseModel(
+            psf_model=_text(noise.attrs["psf_model"]),
+            psf_sigma_px=_required(_get_estimate(noise, "psf_sigma_px"), "psf_sigma_px", path),
+            white_fraction=float(noise.attrs["white_fraction"]),
+            read_noise_DN=_required(_get_estimate(noise, "read_noise_DN"), "read_noise_DN", path),
+            quantised=bool(noise.attrs["quantised"]),
+        ),
+        dark_DN=_required(_get_estimate(noise, "dark_DN"), "dark_DN", path),
+        levels=tuple(levels),
+        spectral=spectral,
+        evidence=json.loads(_text(file.attrs["evidence"])),
+        warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
+        provenance=json.loads(_text(file.attrs["provenance"])),
+    )
+
+
+def _optional_float(group: Any, name: str) -> float | None:
+    return float(group.attrs[name]) if name in group.attrs else None

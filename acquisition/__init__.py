@@ -19,6 +19,15 @@ if TYPE_CHECKING:
         open_acquisition,
         write_acquisition,
     )
+    from .dataset_io import (
+        Dataset,
+        DatasetRow,
+        DatasetWriter,
+        concatenate_datasets,
+        read_dataset,
+        write_dataset,
+        write_selected,
+    )
 
 _LAZY = {
     "AcquisitionFile": "acquisition_io",
@@ -28,23 +37,37 @@ _LAZY = {
     "SeriesWriter": "acquisition_io",
     "open_acquisition": "acquisition_io",
     "write_acquisition": "acquisition_io",
+    "Dataset": "dataset_io",
+    "DatasetRow": "dataset_io",
+    "DatasetWriter": "dataset_io",
+    "concatenate_datasets": "dataset_io",
+    "read_dataset": "dataset_io",
+    "write_dataset": "dataset_io",
+    "write_selected": "dataset_io",
 }
 
 __all__ = [
     "AcquisitionFile",
     "AcquisitionWriter",
+    "Dataset",
+    "DatasetRow",
+    "DatasetWriter",
     "Filter",
     "Instrument",
     "Scene",
     "Series",
     "SeriesWriter",
     "Setting",
+    "concatenate_datasets",
     "filter_from_text",
     "filters_from_text",
     "open_acquisition",
+    "read_dataset",
     "setting_from_text",
     "text_from_filters",
     "write_acquisition",
+    "write_dataset",
+    "write_selected",
 ]
 
 

@@ -27,7 +27,7 @@ class NoiseCovariance:
 
     Fields: covariance_DN2 (2 R + 1, 2 R + 1), lag 0 in the centre, symmetric; samples: independent frames x pixels that
     carry the same information; signal_DN: mean signal above dark over the same pixels; common_mode: variance of the
-    factor that a whole frame shares, relative to the signal (0 where there is no signal).
+    factor that a whole frame shares, relative to the signal (0 where it does not stand out of the pixels' own noise).
     """
 
     covariance_DN2: NDArray[np.float64]
@@ -104,13 +104,17 @@ def compute_noise_covariance(
     covariance = covariance + covariance.sum() / (1.0 - lags / pixels) / pixels
     covariance = 0.5 * (covariance + covariance[::-1, ::-1])
     signal = float(signal_DN[good].mean()) if has_signal else 0.0
-    quantum = float(covariance.sum()) / max(norm, 1e-300)
-    common = float(np.mean(np.square(factors))) / 2.0 - quantum if has_signal else 0.0
+    common = 0.0
+    if has_signal:
+        # the pixels' own noise moves the factor too; what is left must stand out of that by three standard deviations
+        own = float(covariance.sum()) / norm
+        excess = float(np.mean(np.square(factors))) / 2.0 - own
+        common = excess if excess > 3.0 * own * math.sqrt(2.0 / effective_frames(count + 1)) else 0.0
     return NoiseCovariance(
         covariance_DN2=covariance,
         samples=effective_frames(count + 1) * pixels,
         signal_DN=signal,
-        common_mode=max(common, 0.0),
+        common_mode=common,
     )
 
 

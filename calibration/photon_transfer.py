@@ -1,0 +1,748 @@
+"""Photon transfer of a session: darks and flats -> dark, read noise, optical spread, gain per kV and filter, maps.
+
+Two passes over the frames: one for the per-pixel sums, one over at most `COVARIANCE_FRAMES` frames a series for the
+neighbour covariances, once the bad pixels are known.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.setting import Filter, text_from_filters
+from ..errors import InputError
+from ..generator.twin import BAD_PIXEL_CODES, DetectorMaps, Estimate, Level, NoiseModel, estimate_from_sd
+from .frame_sums import FrameSums, effective_frames, sum_frames
+from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covariance, fit_spread
+
+COVARIANCE_FRAMES = 400
+_COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
+_FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16))
+_DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot or noisy
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesPoint:
+    """One flat series as photon transfer sees it; per frame, detector means over good pixels.
+
+    Fields: series, kV, filters, exposure_ms, load_mAs (None where unknown), frames, averaged, signal_DN (median),
+    mean_signal_DN, pair_variance_DN2, stack_variance_DN2 (of one single frame: averaging undone), used (False: masked,
+    with the reason in `masked`), lag_correlation, drift_percent (change of the frame mean over the series),
+    common_mode_percent (rms output noise from frame to frame).
+    """
+
+    series: str
+    kV: float | None
+    filters: tuple[Filter, ...]
+    exposure_ms: float | None
+    load_mAs: float | None
+    source_detector_mm: float | None
+    photons_per_pixel: float | None
+    frames: int
+    averaged: int
+    signal_DN: float
+    mean_signal_DN: float
+    pair_variance_DN2: float
+    stack_variance_DN2: float
+    used: bool
+    masked: str
+    drift_percent: float
+    common_mode_percent: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        return {
+            "series": self.series,
+            "kV": self.kV,
+            "filter": text_from_filters(self.filters),
+            "exposure_ms": self.exposure_ms,
+            "load_mAs": self.load_mAs,
+            "frames": self.frames,
+            "averaged": self.averaged,
+            "signal_DN": self.signal_DN,
+            "pair_variance_DN2": self.pair_variance_DN2,
+            "stack_variance_DN2": self.stack_variance_DN2,
+            "used": self.used,
+            "masked": self.masked,
+            "drift_percent": self.drift_percent,
+            "common_mode_percent": self.common_mode_percent,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotonTransfer:
+    """Everything that the flats and darks say without a spectrum."""
+
+    maps: DetectorMaps
+    noise: NoiseModel
+    dark_DN: Estimate
+    levels: tuple[Level, ...]
+    points: tuple[SeriesPoint, ...]
+    fit: SpreadFit
+    evidence: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Darks:
+    """Dark frames: the mean at each exposure, growth, and the pairs' variance."""
+
+    by_exposure: dict[float | None, NDArray[np.float64]]
+    sums: list[tuple[Series, FrameSums]]
+    per_ms: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    effective: float
+
+    def at(self, exposure_ms: float | None) -> NDArray[np.float64]:
+        if exposure_ms in self.by_exposure:
+            return self.by_exposure[exposure_ms]
+        known = [key for key in self.by_exposure if key is not None]
+        if exposure_ms is None or not known:
+            return next(iter(self.by_exposure.values()))
+        nearest = min(known, key=lambda key: abs(key - exposure_ms))
+        return np.asarray(self.by_exposure[nearest] + self.per_ms * (exposure_ms - nearest))
+
+
+def usable_series(acquisition: AcquisitionFile, kind: str) -> list[Series]:
+    """Series of a kind that may calibrate: not held back for evaluation, not logged or gain-corrected."""
+    return [
+        series
+        for series in acquisition.of_kind(kind)
+        if series.role != "evaluation" and not series.corrected & {"log", "gain"}
+    ]
+
+
+def _sum_darks(series: Sequence[Series], shape: tuple[int, int]) -> _Darks:
+    sums = [(item, sum_frames(item.iter_frames(), name=f"series {item.name}")) for item in series]
+    grouped: dict[float | None, list[FrameSums]] = {}
+    for item, total in sums:
+        grouped.setdefault(item.exposure_ms, []).append(total)
+    by_exposure = {
+        exposure: np.asarray(
+            sum(total.mean_DN * total.frames for total in totals) / sum(total.frames for total in totals)
+        )
+        for exposure, totals in grouped.items()
+    }
+    known = sorted(key for key in by_exposure if key is not None)
+    per_ms = np.zeros(shape)
+    if len(known) > 1:
+        times = np.array(known)
+        weights = np.array([sum(total.frames for total in grouped[key]) for key in known], dtype=np.float64)
+        centred = times - np.average(times, weights=weights)
+        denominator = float(np.sum(weights * centred**2))
+        for weight, offset, key in zip(weights, centred, known, strict=True):
+            per_ms += weight * offset * by_exposure[key] / denominator
+    variance = np.full(shape, np.nan)
+    pairs = [(item, total) for item, total in sums if total.pairs > 0]
+    effective = sum(effective_frames(total.frames) for _, total in pairs)
+    if pairs:
+        variance = np.asarray(
+            sum(total.pair_variance_DN2 * item.averaged * effective_frames(total.frames) for item, total in pairs)
+            / effective
+        )
+    return _Darks(by_exposure=by_exposure, sums=sums, per_ms=per_ms, variance=variance, effective=effective)
+
+
+def _robust_spread(values: NDArray[np.float64]) -> tuple[float, float]:
+    centre = float(np.median(values))
+    return centre, 1.4826 * float(np.median(np.abs(values - centre)))
+
+
+def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDArray[np.uint8]:
+    """Reason codes (row, column) from the darks' level and noise and from the flats' response."""
+    from scipy.ndimage import median_filter
+
+    code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
+    for mean in darks.by_exposure.values():
+        local = mean - median_filter(mean, size=5, mode="nearest")
+        centre, spread = _robust_spread(local)
+        hot = np.abs(local - centre) > _DARK_NOISE_SIGMAS * max(spread, 0.5)
+        code[hot & (code == 0)] = BAD_PIXEL_CODES["hot"]
+    if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
+        centre = float(np.median(darks.variance))
+        limit = centre * (1.0 + _DARK_NOISE_SIGMAS * math.sqrt(2.0 / darks.effective)) + 1.0
+        code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
+    brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
+    signal = brightest[1].mean_DN - darks.at(brightest[0].exposure_ms)
+    local = median_filter(signal, size=5, mode="nearest")
+    ratio = signal / np.where(local > 0, local, np.nan)
+    code[(~np.isfinite(ratio) | (ratio < 0.5)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
+    centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
+    odd = np.abs(ratio - centre) > max(_DARK_NOISE_SIGMAS * spread, 0.05)
+    code[odd & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    return code
+
+
+def _saturation(total: FrameSums, bits: int | None) -> float | None:
+    """The full scale (DN) if more than 0.1 % of the values stand at it, else None."""
+    full = float(2**bits - 1) if bits else None
+    share = total.maximum_count / (total.frames * total.reference.size)
+    scales = (full,) if full is not None else _FULL_SCALES
+    if total.maximum_DN in scales and share > 1e-3:
+        return total.maximum_DN
+    constant = total.pairs > 0 and float(np.median(total.pair_variance_DN2)) == 0.0
+    return total.maximum_DN if share > 0.5 and constant else None
+
+
+def _covariance(
+    item: Series, total: FrameSums, signal: NDArray[np.float64], good: NDArray[np.bool_], radius: int
+) -> NoiseCovariance:
+    most = int(min(total.frames, COVARIANCE_FRAMES, max(2, _COVARIANCE_SAMPLES // good.size)))
+
+    def pieces() -> Any:
+        left = most
+        for piece in item.iter_frames():
+            yield piece[:left]
+            left -= piece.shape[0]
+            if left <= 0:
+                return
+
+    result = compute_noise_covariance(pieces(), signal_DN=signal, good=good, radius=radius)
+    return NoiseCovariance(
+        covariance_DN2=result.covariance_DN2 * item.averaged,
+        samples=result.samples,
+        signal_DN=result.signal_DN,
+        common_mode=result.common_mode,
+    )
+
+
+def compute_photon_transfer(
+    acquisition: AcquisitionFile, *, radius: int = 5, progress: Progress | None = None
+) -> PhotonTransfer:
+    """Photon transfer of the darks and flats of an acquisition that may calibrate.
+
+    Raises:
+        InputError: no darks, no flats, nothing but saturated or single-frame flats, frames of several shapes.
+    """
+    tell = progress or (lambda stage: None)
+    warnings: list[str] = []
+    flats = usable_series(acquisition, "flat")
+    dark_series = usable_series(acquisition, "dark")
+    if not flats:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="no flat series that may calibrate",
+            expected="at least one series of kind flat, raw or offset-corrected, whose role is not evaluation",
+        )
+    offset_done = all("offset" in item.corrected for item in flats)
+    if not dark_series and not offset_done:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="flats without a dark series",
+            expected="at least one series of kind dark with two or more frames",
+            remedy="measure darks (beam off, same exposure) and add them",
+        )
+    shapes = {item.shape for item in [*flats, *dark_series]}
+    if len(shapes) > 1:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"frames of shapes {sorted(shapes)}",
+            expected="darks and flats of one shape",
+        )
+    shape = shapes.pop()
+
+    tell("darks")
+    if offset_done:
+        zero = np.zeros(shape)
+        darks = _Darks({None: zero}, [], zero, np.full(shape, np.nan), 0.0)
+        if dark_series:
+            measured = _sum_darks(dark_series, shape)
+            darks = _Darks({None: zero}, measured.sums, zero, measured.variance, measured.effective)
+    else:
+        darks = _sum_darks(dark_series, shape)
+
+    tell("flats")
+    bits = acquisition.instrument.bits
+    sums: list[tuple[Series, FrameSums, str]] = []
+    saturation: dict[str, float] = {}
+    for item in flats:
+        total = sum_frames(item.iter_frames(), name=f"series {item.name}")
+        full = _saturation(total, bits)
+        reason = ""
+        if full is not None:
+            saturation[item.name] = full
+            reason = f"saturated at {full:g} DN"
+        elif total.frames < 2:
+            reason = "a single frame has no noise"
+        else:
+            spread = math.sqrt(max(float(np.median(total.pair_variance_DN2)), 0.0))
+            top = float(2**bits - 1) if bits else max(_next_full_scale(total.maximum_DN), total.maximum_DN)
+            if float(np.median(total.mean_DN)) + 4 * spread > top:
+                saturation[item.name] = top
+                reason = f"within 4 standard deviations of the full scale of {top:g} DN"
+        sums.append((item, total, reason))
+    masked = [(item.name, reason) for item, _, reason in sums if reason]
+    if len(masked) == len(sums):
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"no usable flat ({masked[0][0]}: {masked[0][1]})",
+            expected="at least one unsaturated flat series of two or more frames",
+            remedy="lower the current or the exposure, or take more frames",
+        )
+    if masked:
+        warnings.append("left out of the fit: " + "; ".join(f"{name} ({reason})" for name, reason in masked))
+
+    good_sums = [(item, total) for item, total, reason in sums if not reason]
+    bad = _bad_pixels(darks, good_sums)
+    good = bad == 0
+    if good.mean() < 0.5:
+        warnings.append(f"{100 * (1 - good.mean()):.0f} % of the pixels look bad; the maps may not be trusted")
+
+    tell("noise covariances")
+    radius = max(1, min(radius, (min(shape) - 1) // 4))
+    keys = sorted(
+        {_group_key(item) for item, _ in good_sums}, key=lambda key: (key[0] is None, key[0] or 0.0, str(key[1]))
+    )
+    index_of = {key: index for index, key in enumerate(keys)}
+    dark_pairs = [(item, total) for item, total in darks.sums if total.pairs > 0]
+
+    def collect(reach: int) -> tuple[list[NoiseCovariance], list[int]]:
+        covariances, groups = [], []
+        for item, total in good_sums:
+            signal = total.mean_DN - darks.at(item.exposure_ms)
+            covariances.append(_covariance(item, total, signal, good, reach))
+            groups.append(index_of[_group_key(item)])
+        for item, total in dark_pairs:
+            covariances.append(_covariance(item, total, np.zeros(shape), good, reach))
+            groups.append(-1)
+        return covariances, groups
+
+    covariances, groups = collect(radius)
+    usable = [c.signal_DN > 0 or g < 0 for c, g in zip(covariances, groups, strict=True)]
+    for (item, _), keep in zip(good_sums, usable, strict=False):
+        if not keep:
+            warnings.append(f"left out of the fit: {item.name} (no signal above dark)")
+    if not any(keep for keep, g in zip(usable, groups, strict=True) if g >= 0):
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="flats no brighter than the darks",
+            expected="flats with signal above dark",
+            remedy="check that the series' kinds are not swapped",
+        )
+    tell("spread and gain")
+    fit = _fit(covariances, groups, usable, radius)
+    wider = min(math.ceil(4 * math.sqrt(2) * fit.sigma_px), (min(shape) - 1) // 4)
+    if wider > radius:
+        radius = wider
+        covariances, groups = collect(radius)
+        fit = _fit(covariances, groups, usable, radius)
+
+    # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
+    dropped = set()
+    while True:
+        worst = _bent(covariances, groups, usable, fit)
+        if worst is None:
+            break
+        usable[worst] = False
+        dropped.add(worst)
+        name = good_sums[worst][0].name
+        warnings.append(f"left out of the fit: {name} (its variance bends away from the photon-transfer line)")
+        fit = _fit(covariances, groups, usable, radius)
+
+    tell("maps")
+    quantised = all(total.integer for _, total in [*dark_pairs, *good_sums])
+    rounding = 1.0 / 12.0 if quantised else 0.0
+    read_variance = fit.read_variance_DN2 - rounding
+    if not dark_pairs:
+        warnings.append("no dark series of two or more frames: the read noise is the intercept of the photon-transfer line")
+    if read_variance <= 0:
+        warnings.append("read noise not seen above the ADC's rounding; set to 0 with its interval")
+    read_sd = fit.read_sd_DN2
+    read_noise = _root_estimate(read_variance, read_sd)
+    points = _points(sums, darks, good, covariances, groups, good_sums, usable, dropped)
+    read_map = _read_variance_map(darks, good, fit.read_variance_DN2)
+    gain_map = _gain_map(good_sums, usable, darks, good, fit, [groups[i] for i in range(len(good_sums))], read_map)
+    levels = _levels(acquisition, keys, good_sums, usable, darks, good, fit, groups, points, saturation)
+    dark_estimate, reference_exposure = _dark_estimate(darks, good, [item.exposure_ms for item, _ in good_sums])
+    evidence = _evidence(points, fit, darks, covariances, groups, good, warnings)
+    for point in points:
+        if point.used and point.common_mode_percent > 0.3:
+            warnings.append(
+                f"tube output varies by {point.common_mode_percent:.2g} % rms from frame to frame in {point.series}"
+            )
+            break
+    reference_dark = darks.at(reference_exposure)
+    return PhotonTransfer(
+        maps=DetectorMaps(
+            dark_DN=reference_dark.astype(np.float32),
+            dark_exposure_ms=reference_exposure,
+            dark_DN_per_ms=darks.per_ms.astype(np.float32),
+            gain_relative=gain_map.astype(np.float32),
+            read_variance_DN2=read_map.astype(np.float32),
+            bad_pixels=bad,
+        ),
+        noise=NoiseModel(
+            psf_model=fit.model,
+            psf_sigma_px=estimate_from_sd(fit.sigma_px, fit.sigma_sd_px, lowest=0.0),
+            white_fraction=float(np.clip(np.nanmean(fit.white_fraction), 0.0, None)),
+            read_noise_DN=read_noise,
+            quantised=quantised,
+        ),
+        dark_DN=dark_estimate,
+        levels=levels,
+        points=points,
+        fit=fit,
+        evidence=evidence,
+        warnings=tuple(warnings),
+    )
+
+
+def _next_full_scale(value: float) -> float:
+    """The smallest usual full scale at or above a value, DN."""
+    return next((scale for scale in _FULL_SCALES if scale >= value), math.inf)
+
+
+def _group_key(item: Series) -> tuple[float | None, tuple[str, ...]]:
+    return (item.kV, tuple(sorted(str(layer) for layer in item.filters)))
+
+
+def _fit(covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], radius: int) -> SpreadFit:
+    kept = [index for index, keep in enumerate(usable) if keep]
+    present = sorted({groups[index] for index in kept if groups[index] >= 0})
+    renumbered = {old: new for new, old in enumerate(present)} | {-1: -1}
+    return fit_spread(
+        [covariances[index] for index in kept], group=[renumbered[groups[index]] for index in kept], radius=radius
+    )
+
+
+def _bent(
+    covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], fit: SpreadFit
+) -> int | None:
+    """Index of the brightest flat of a group if its variance lies 6 sigma and 5 % below the line through the others."""
+    present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
+    for group in present:
+        members = [i for i, g in enumerate(groups) if g == group and usable[i]]
+        if len(members) < 3:
+            continue
+        brightest = max(members, key=lambda i: covariances[i].signal_DN)
+        others = [i for i in members if i != brightest]
+
+        def zero_lag(i: int) -> float:
+            centre = covariances[i].radius
+            return float(covariances[i].covariance_DN2[centre, centre]) - fit.read_variance_DN2
+
+        signal = np.array([covariances[i].signal_DN for i in others])
+        variance = np.array([zero_lag(i) for i in others])
+        sd = np.array([math.sqrt(2.0 / covariances[i].samples) * (zero_lag(i) + fit.read_variance_DN2) for i in others])
+        weight = signal**2 / sd**2
+        ratio = variance / signal
+        slope = float(np.sum(weight * ratio) / np.sum(weight))
+        scatter = float(np.sum(weight * (ratio - slope) ** 2)) / max(len(others) - 1, 1)
+        slope_sd = math.sqrt(max(scatter, 1.0) / float(np.sum(weight)))
+        item = covariances[brightest]
+        measured = zero_lag(brightest) / item.signal_DN
+        measured_sd = math.sqrt(2.0 / item.samples) * (measured + fit.read_variance_DN2 / item.signal_DN)
+        if measured - slope < -6.0 * math.hypot(slope_sd, measured_sd) and measured < 0.95 * slope:
+            return brightest
+    return None
+
+
+def _root_estimate(variance: float, sd: float) -> Estimate:
+    """Standard deviation with its interval from a variance with its own."""
+    half = 1.959964 * sd
+    value, low, high = (math.sqrt(max(v, 0.0)) for v in (variance, variance - half, variance + half))
+    return Estimate(value=value, low=low, high=high)
+
+
+def _dark_estimate(
+    darks: _Darks, good: NDArray[np.bool_], exposures: Sequence[float | None]
+) -> tuple[Estimate, float | None]:
+    """Median dark (DN) at the shortest exposure of the flats that was measured dark; spread of repeats included."""
+    known = sorted(key for key in darks.by_exposure if key is not None)
+    shared = [key for key in known if key in exposures]
+    exposure = (shared or known or [None])[0]
+    mean = darks.at(exposure)
+    level = float(np.median(mean[good]))
+    repeats = [float(np.median(total.mean_DN[good])) for item, total in darks.sums if item.exposure_ms == exposure]
+    frames = sum(total.frames for item, total in darks.sums if item.exposure_ms == exposure)
+    pixels = int(good.sum())
+    noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
+    sd = 1.2533 * math.sqrt(noise / max(frames, 1) / pixels)
+    # frame noise moves each pixel's mean, the median of a map of fixed spread moves far less than one pixel's share
+    if len(repeats) > 1:
+        sd = math.hypot(sd, float(np.std(repeats, ddof=1)) / math.sqrt(len(repeats)))
+    return estimate_from_sd(level, max(sd, 1e-9)), exposure
+
+
+def _read_variance_map(darks: _Darks, good: NDArray[np.bool_], pooled: float) -> NDArray[np.float64]:
+    """Electronic and rounding variance per pixel (row, column), shrunk towards the pooled value, DN^2."""
+    if darks.effective < 1 or not np.all(np.isfinite(darks.variance)):
+        return np.full(darks.per_ms.shape, max(pooled, 0.0))
+    ratio = darks.variance / max(float(np.mean(darks.variance[good])), 1e-12)
+    noise = 2.0 / darks.effective
+    keep = _shrinkage(ratio[good], noise)
+    result = max(pooled, 0.0) * (1.0 + keep * (ratio - 1.0))
+    return np.asarray(np.where(good, result, pooled * ratio))
+
+
+def _shrinkage(ratio: NDArray[np.float64], noise: float) -> float:
+    """Share of a map's spread about 1 that is real rather than sampling noise of variance `noise`."""
+    low, high = np.quantile(ratio, [0.1587, 0.8413])
+    total = (0.5 * float(high - low)) ** 2
+    return max(0.0, 1.0 - noise / total) if total > 0 else 0.0
+
+
+def _gain_map(
+    sums: Sequence[tuple[Series, FrameSums]],
+    usable: Sequence[bool],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+    fit: SpreadFit,
+    groups: Sequence[int],
+    read_map: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Gain of each pixel over the detector median (row, column), shrunk towards 1 as far as its own slope is noise."""
+    present = sorted({g for g, keep in zip(groups, usable, strict=False) if keep})
+    renumbered = {old: new for new, old in enumerate(present)}
+    numerator = np.zeros(good.shape)
+    weight_sum = 0.0
+    for (item, total), keep, group in zip(sums, usable, groups, strict=False):
+        if not keep or total.pairs < 1:
+            continue
+        slope = float(fit.slope_DN[renumbered[group]])
+        signal = total.mean_DN - darks.at(item.exposure_ms)
+        typical = float(np.median(signal[good]))
+        if slope <= 0 or typical <= 0:
+            continue
+        variance = slope * typical + fit.read_variance_DN2
+        weight = effective_frames(total.frames) * (slope * typical / variance) ** 2 / 2.0
+        ratio = (total.pair_variance_DN2 * item.averaged - read_map) / (slope * np.where(signal > 0, signal, np.nan))
+        numerator += weight * np.where(np.isfinite(ratio), ratio, 1.0)
+        weight_sum += weight
+    if weight_sum <= 0:
+        return np.ones(good.shape)
+    ratio = numerator / weight_sum
+    ratio = ratio / float(np.median(ratio[good]))
+    keep = _shrinkage(ratio[good], 1.0 / weight_sum)
+    return np.asarray(np.where(good, np.clip(1.0 + keep * (ratio - 1.0), 0.1, 10.0), 1.0))
+
+
+def _points(
+    sums: Sequence[tuple[Series, FrameSums, str]],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+    covariances: Sequence[NoiseCovariance],
+    groups: Sequence[int],
+    good_sums: Sequence[tuple[Series, FrameSums]],
+    usable: Sequence[bool],
+    dropped: set[int],
+) -> tuple[SeriesPoint, ...]:
+    order = {item.name: index for index, (item, _) in enumerate(good_sums)}
+    points = []
+    for item, total, reason in sums:
+        signal = total.mean_DN - darks.at(item.exposure_ms)
+        index = order.get(item.name)
+        covariance = covariances[index] if index is not None else None
+        means = total.frame_mean_DN
+        drift = 0.0
+        typical = float(np.mean(signal[good]))
+        if total.frames > 2 and typical > 0:
+            position = np.linspace(-0.5, 0.5, total.frames)
+            drift = 100.0 * float(np.polyfit(position, means, 1)[0]) / typical
+        why = reason
+        if index is not None and not usable[index]:
+            why = "bends away from the photon-transfer line" if index in dropped else "no signal above dark"
+        points.append(
+            SeriesPoint(
+                series=item.name,
+                kV=item.kV,
+                filters=item.filters,
+                exposure_ms=item.exposure_ms,
+                load_mAs=_load(item),
+                source_detector_mm=item.source_detector_mm,
+                photons_per_pixel=item.photons_per_pixel,
+                frames=total.frames,
+                averaged=item.averaged,
+                signal_DN=float(np.median(signal[good])),
+                mean_signal_DN=typical,
+                pair_variance_DN2=float(np.mean(total.pair_variance_DN2[good])) * item.averaged,
+                stack_variance_DN2=float(np.mean(total.stack_variance_DN2[good])) * item.averaged,
+                used=not why,
+                masked=why,
+                drift_percent=drift,
+                common_mode_percent=100.0 * math.sqrt(covariance.common_mode) if covariance else 0.0,
+            )
+        )
+    return tuple(points)
+
+
+def _load(item: Series) -> float | None:
+    if item.kV is None or item.exposure_ms is None:
+        return None
+    current = item.current_mA if item.current_mA is not None else (
+        item.power_W / item.kV if item.power_W is not None else None
+    )
+    return None if current is None else current * item.exposure_ms / 1000.0
+
+
+def _levels(
+    acquisition: AcquisitionFile,
+    keys: Sequence[tuple[float | None, tuple[str, ...]]],
+    sums: Sequence[tuple[Series, FrameSums]],
+    usable: Sequence[bool],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+    fit: SpreadFit,
+    groups: Sequence[int],
+    points: Sequence[SeriesPoint],
+    saturation: dict[str, float],
+) -> tuple[Level, ...]:
+    point_of = {point.series: point for point in points}
+    present = sorted({groups[i] for i in range(len(sums)) if usable[i]})
+    levels = []
+    for fitted, group in enumerate(present):
+        members = [i for i in range(len(sums)) if groups[i] == group and usable[i]]
+        shape_sum = np.zeros(good.shape)
+        for i in members:
+            item, total = sums[i]
+            shape_sum += (total.mean_DN - darks.at(item.exposure_ms)) * total.frames
+        centre = float(np.median(shape_sum[good]))
+        flat_shape = shape_sum / centre if centre > 0 else np.ones(good.shape)
+        first = sums[members[0]][0]
+        distance = first.source_detector_mm or acquisition.instrument.source_detector_mm
+        same = [i for i in members if (sums[i][0].source_detector_mm or distance) == distance]
+        saturated = [
+            value
+            for name, value in saturation.items()
+            if _group_key(next(s for s in acquisition.series if s.name == name)) == keys[group]
+        ]
+        levels.append(
+            Level(
+                kV=keys[group][0],
+                filters=first.filters,
+                gain_DN=estimate_from_sd(float(fit.gain_DN[fitted]), float(fit.gain_sd_DN[fitted])),
+                photon_transfer_slope_DN=estimate_from_sd(float(fit.slope_DN[fitted]), float(fit.slope_sd_DN[fitted])),
+                rate_DN_per_mAs=_rate([point_of[sums[i][0].name] for i in same], darks, good),
+                source_detector_mm=distance,
+                saturation_DN=min(saturated) if saturated else None,
+                flat_shape=flat_shape.astype(np.float32),
+                series=tuple(sums[i][0].name for i in members),
+                role="calibration",
+            )
+        )
+    return tuple(levels)
+
+
+def _rate(points: Sequence[SeriesPoint], darks: _Darks, good: NDArray[np.bool_]) -> Estimate | None:
+    """Signal per mAs (DN) by weighted mean over the series; the scatter between them is part of the interval."""
+    known = [point for point in points if point.load_mAs]
+    if not known:
+        return None
+    load = np.array([point.load_mAs for point in known], dtype=np.float64)
+    signal = np.array([point.signal_DN for point in known])
+    noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
+    frames = np.array([point.frames for point in known], dtype=np.float64)
+    # median over pixels: quantum and read noise average out, the dark's own noise and 0.1 % of reproducibility stay
+    variance = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames / good.sum() * 2.0 + (1e-3 * signal) ** 2
+    weight = load**2 / variance
+    rate = float(np.sum(weight * signal / load) / np.sum(weight))
+    scatter = float(np.sum(weight * (signal / load - rate) ** 2)) / max(len(known) - 1, 1)
+    sd = math.sqrt(max(scatter, 1.0) / float(np.sum(weight)))
+    return estimate_from_sd(rate, sd)
+
+
+def _evidence(
+    points: Sequence[SeriesPoint],
+    fit: SpreadFit,
+    darks: _Darks,
+    covariances: Sequence[NoiseCovariance],
+    groups: Sequence[int],
+    good: NDArray[np.bool_],
+    warnings: list[str],
+) -> dict[str, Any]:
+    """What the series say about drift, lag, linearity and the shape of the noise, beside the fit."""
+    used = [point for point in points if point.used]
+    lit = [p for p in used if p.pair_variance_DN2 > 0 and math.isfinite(p.stack_variance_DN2) and p.frames > 2]
+    weights = np.array([p.frames for p in lit], dtype=np.float64)
+    ratio = (
+        float(np.average([p.stack_variance_DN2 / p.pair_variance_DN2 for p in lit], weights=weights)) if lit else None
+    )
+    if ratio is not None and ratio > 1.02:
+        warnings.append(
+            f"stack variances are {100 * (ratio - 1):.1f} % above pair variances: the level drifts or frames are"
+            " correlated; gains come from pairs"
+        )
+    linearity = _linearity(used)
+    if linearity is not None and linearity["largest_departure_percent"] > 1.0:
+        warnings.append(
+            f"signal departs from a line in tube load or exposure by up to {linearity['largest_departure_percent']:.2g} %"
+        )
+    if fit.degrees > 0 and fit.chi_square / fit.degrees > 2.0:
+        warnings.append(
+            f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f} per"
+            " degree of freedom); intervals are widened by its root"
+        )
+    dark_levels = [
+        {
+            "series": item.name,
+            "index": item.index,
+            "exposure_ms": item.exposure_ms,
+            "median_DN": float(np.median(total.mean_DN[good])),
+            "frames": total.frames,
+        }
+        for item, total in darks.sums
+    ]
+    neighbour = [c for c, g in zip(covariances, groups, strict=True) if g < 0]
+    dark_correlation = None
+    if neighbour:
+        centre = neighbour[0].radius
+        zero = sum(c.covariance_DN2[centre, centre] for c in neighbour)
+        dark_correlation = {
+            "row_direction": float(sum(c.covariance_DN2[centre + 1, centre] for c in neighbour) / zero) if zero else 0.0,
+            "column_direction": float(sum(c.covariance_DN2[centre, centre + 1] for c in neighbour) / zero)
+            if zero
+            else 0.0,
+        }
+    return {
+        "stack_over_pair_variance": ratio,
+        "drift_percent_per_series": {p.series: p.drift_percent for p in used},
+        "output_rms_percent": max((p.common_mode_percent for p in used), default=0.0),
+        "linearity": linearity,
+        "dark": dark_levels,
+        "dark_neighbour_correlation": dark_correlation,
+        "spread_fit": {
+            "model": fit.model,
+            "chi_square_per_degree": fit.chi_square / max(fit.degrees, 1),
+            "degrees": fit.degrees,
+            "other_model_chi_square_excess": fit.chi_square_other - fit.chi_square,
+            "other_model_sigma_px": fit.sigma_other_px,
+            "white_fraction": [float(value) for value in fit.white_fraction],
+        },
+        "photon_transfer": [point.as_dict() for point in points],
+    }
+
+
+def _linearity(points: Sequence[SeriesPoint]) -> dict[str, Any] | None:
+    """Departure of the signal from a line through zero in mAs (or photons, or ms) within each kV and filter, %."""
+    groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
+    for point in points:
+        groups.setdefault((point.kV, point.filters, point.source_detector_mm), []).append(point)
+    rows = []
+    for members in groups.values():
+        for quantity in ("load_mAs", "photons_per_pixel", "exposure_ms"):
+            values = [getattr(point, quantity) for point in members]
+            if all(value for value in values) and len(set(values)) > 1:
+                load = np.array(values, dtype=np.float64)
+                signal = np.array([point.signal_DN for point in members])
+                slope = float(np.sum(signal) / np.sum(load))
+                departure = 100.0 * (signal - slope * load) / np.max(signal)
+                rows.append(
+                    {
+                        "kV": members[0].kV,
+                        "filter": text_from_filters(members[0].filters),
+                        "against": quantity,
+                        "DN_per_unit": slope,
+                        "departure_percent_of_full": [float(value) for value in departure],
+                    }
+                )
+                break
+    if not rows:
+        return None
+    largest = max(max(abs(value) for value in row["departure_percent_of_full"]) for row in rows)  # type: ignore[attr-defined]
+    return {"largest_departure_percent": largest, "groups": rows}

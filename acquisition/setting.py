@@ -7,6 +7,11 @@ from dataclasses import dataclass, fields
 from ..errors import InputError
 
 
+def _number(value: float) -> str:
+    """The shortest text that reads back as the same number, without the '+' that joins filters."""
+    return repr(float(value)).removesuffix(".0").replace("e+", "e")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
     """A flat layer in the beam: a material by name and its thickness in mm."""
@@ -30,7 +35,7 @@ class Filter:
             )
 
     def __str__(self) -> str:
-        return f"{self.material}:{self.thickness_mm:g}"
+        return f"{self.material}:{_number(self.thickness_mm)}"
 
 
 def filter_from_text(text: str) -> Filter:
@@ -110,18 +115,18 @@ class Setting:
         return None if current is None else current * self.exposure_ms / 1000.0
 
     def __str__(self) -> str:
-        words = [f"kv={self.kV:g}"]
+        words = [f"kv={_number(self.kV)}"]
         if self.power_W is not None:
-            words.append(f"power_w={self.power_W:g}")
+            words.append(f"power_w={_number(self.power_W)}")
         elif self.current_mA is not None:
-            words.append(f"current_ma={self.current_mA:g}")
-        words.append(f"exposure_ms={self.exposure_ms:g}")
+            words.append(f"current_ma={_number(self.current_mA)}")
+        words.append(f"exposure_ms={_number(self.exposure_ms)}")
         if self.filters:
             words.append(f"filter={text_from_filters(self.filters)}")
         if self.averaged != 1:
             words.append(f"averaged={self.averaged}")
         if self.source_detector_mm is not None:
-            words.append(f"source_detector_mm={self.source_detector_mm:g}")
+            words.append(f"source_detector_mm={_number(self.source_detector_mm)}")
         return ",".join(words)
 
 

@@ -1,0 +1,99 @@
+"""Model choice, shown: every link on size and on log size, by deviance, AIC and goodness of fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FitError
+from .hit_miss import PodFit, fit_pooled
+from .links import LINKS, Link
+from .solver import fit_batch
+from .trials import Trials
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alternative:
+    """One link and scale on the same trials. deviance, aic: smaller fits better; a90 in the data's unit or None.
+
+    p_link: p-value of Pregibon's link test (small: the curve has another shape than this link gives it).
+    p_fit: p-value of a chi-square test of hits over up to ten groups of size (Hosmer & Lemeshow), None with few trials.
+    """
+
+    link: str
+    log_size: bool
+    deviance: float | None
+    aic: float | None
+    a90: float | None
+    p_link: float | None
+    p_fit: float | None
+
+
+def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) -> tuple[Alternative, ...]:
+    """All links on size and, where every size is above 0, on log size; best AIC first.
+
+    The trials are taken as independent: with repeats the differences of deviance are too large, their order stands.
+    Source: Pregibon, Appl. Stat. 29 (1980) 15; Hosmer & Lemeshow, Commun. Stat. A 9 (1980) 1043.
+    """
+    scales = log_sizes if log_sizes is not None else ((False, True) if np.all(table.size > 0) else (False,))
+    found = []
+    for name, link in LINKS.items():
+        for log_size in scales:
+            try:
+                fit = fit_pooled(table, link=link, log_size=log_size, method="ml")
+            except FitError:
+                continue
+            p_link, p_fit = (None, None) if fit.curve is None else goodness_of_fit(fit, link=link)
+            found.append(
+                Alternative(
+                    link=name,
+                    log_size=log_size,
+                    deviance=fit.deviance,
+                    aic=fit.aic,
+                    a90=fit.a90,
+                    p_link=p_link,
+                    p_fit=p_fit,
+                )
+            )
+    return tuple(sorted(found, key=lambda one: np.inf if one.aic is None else one.aic))
+
+
+def goodness_of_fit(fit: PodFit, *, link: Link) -> tuple[float | None, float | None]:
+    """p-values of the link test and of the grouped chi-square test of a fit; None where it cannot be made."""
+    from scipy.special import gammaincc
+
+    curve = fit.curve
+    if curve is None:
+        return None, None
+    eta = curve.coefficients[0] + curve.coefficients[1] * curve.x
+    centred = (eta - eta.mean()) / (eta.std() or 1.0)
+    p_link = None
+    if len(curve.x) > 3:
+        design = np.stack((np.ones_like(eta), centred, centred**2), axis=1)
+        batch = fit_batch(design, curve.hits[None], curve.misses[None], link=link)
+        if batch.converged[0]:
+            gain = 2 * (float(batch.log_likelihood[0]) - curve.supremum) / curve.divisor
+            p_link = float(gammaincc(0.5, max(gain, 0.0) / 2))
+    return p_link, _grouped_test(curve.hits, curve.misses, link.pod_from_eta(eta))
+
+
+def _grouped_test(hits: Array, misses: Array, pod: Array) -> float | None:
+    from scipy.special import gammaincc
+
+    total = hits + misses
+    groups = int(min(10, total.sum() // 8))
+    if groups < 4:
+        return None
+    order = np.argsort(pod)
+    rank = np.cumsum(total[order]) - 0.5 * total[order]
+    where = np.minimum((rank / total.sum() * groups).astype(int), groups - 1)
+    observed = np.bincount(where, weights=hits[order], minlength=groups)
+    expected = np.bincount(where, weights=(total * pod)[order], minlength=groups)
+    variance = np.bincount(where, weights=(total * pod * (1 - pod))[order], minlength=groups)
+    used = variance > 1e-9
+    if used.sum() < 4:
+        return None
+    statistic = float((((observed - expected) ** 2)[used] / variance[used]).sum())
+    return float(gammaincc((used.sum() - 2) / 2, statistic / 2))

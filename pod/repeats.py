@@ -1,0 +1,92 @@
+"""Repeated looks: many networks at the same images are not independent trials. One explicit table of what to do."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from ..errors import InputError
+from .crossed import fit_crossed
+from .hit_miss import PodFit, fit_pooled, sizes_from_curve
+from .links import Link
+from .robust import clustered_covariance
+from .trials import Trials
+
+__all__ = ["REPEATS", "fit_cluster", "fit_scaled"]
+
+
+def fit_scaled(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
+    """The handbook's treatment: the log-likelihood is divided by the number of inspections of a site.
+
+    The curve is the pooled one; its intervals are those of as many trials as there are sites.
+    Source: MIL-HDBK-1823A (2009) G.3, example 5.
+
+    Raises:
+        InputError: no site (or image) is known.
+    """
+    site = table.site if table.site is not None else table.image
+    if site is None:
+        raise InputError(
+            "repeats scaled",
+            received="no column of sites",
+            expected="the site (or image) of each trial",
+            remedy="name its column with --site",
+        )
+    sites = int(site.max()) + 1
+    inspections = table.n / sites
+    naive = fit_pooled(table, link=link, log_size=log_size, method=method)
+    fit = fit_pooled(table, link=link, log_size=log_size, method=method, divisor=inspections)
+    notes = fit.warnings
+    if inspections <= 1:
+        notes = (*notes, "each site was inspected once: scaling changes nothing")
+    return replace(fit, repeats="scaled", naive=naive, warnings=notes)
+
+
+def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
+    """The pooled curve with intervals robust to repeats: two-way clustered by network and by image (or site).
+
+    Wald bounds take the sandwich covariance, likelihood-ratio bounds divide the likelihood by the inflation of the
+    variance of eta at a90. The curve is a population-averaged one. With few clusters the intervals are too short.
+    Source: Cameron, Gelbach & Miller, J. Bus. Econ. Stat. 29 (2011) 238; Chandler & Bate, Biometrika 94 (2007) 167.
+
+    Raises:
+        InputError: neither network, image nor site is known.
+    """
+    image = table.image if table.image is not None else table.site
+    groups = [codes for codes in (table.network, image) if codes is not None and codes.max() > 0]
+    if table.network is None and image is None:
+        raise InputError(
+            "repeats cluster",
+            received="no column of networks, images or sites",
+            expected="at least one of them",
+            remedy="name the site's column with --site, or use --repeats pooled",
+        )
+    naive = fit_pooled(table, link=link, log_size=log_size, method=method)
+    if naive.curve is None:
+        return replace(naive, repeats="cluster", naive=naive)
+    notes = [note for note in naive.warnings if "bound" not in note]
+    if not groups:
+        return replace(naive, repeats="cluster", naive=naive)
+    covariance = clustered_covariance(table, naive.curve, groups=groups, log_size=log_size)
+    sizes = sizes_from_curve(naive.curve, table=table, log_size=log_size, robust=covariance)
+    fewest = min(int(codes.max()) + 1 for codes in groups)
+    if fewest < 20:
+        notes.append(f"only {fewest} clusters: cluster-robust intervals are too short below some 20")
+    return replace(
+        naive,
+        repeats="cluster",
+        se0=math.sqrt(covariance[0, 0]),
+        se1=math.sqrt(covariance[1, 1]),
+        a90_95=sizes.one_sided,
+        a90_95_two_sided=sizes.two_sided,
+        a90_low_two_sided=sizes.low,
+        warnings=tuple(dict.fromkeys((*notes, *sizes.warnings))),
+        naive=naive,
+    )
+
+
+REPEATS: dict[str, Callable[..., PodFit]] = {
+    "pooled": fit_pooled,
+    "crossed": fit_crossed,
+    "scaled": fit_scaled,
+    "cluster": fit_cluster,
+}

@@ -1,0 +1,212 @@
+"""Thousands of hit/miss fits at once: Newton's method on arrays (fit, row), maximum likelihood or mean-bias reduced.
+
+log-likelihood  l = sum_k hits_k ln POD(eta_k) + misses_k ln(1 - POD(eta_k)),  eta_k = sum_j design_kj c_j
+
+All rows share one design; each fit has its own hits and misses, which may be fractional weights (a bootstrap's counts).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .links import Link
+
+Array = NDArray[np.float64]
+_CHUNK = 1_000_000  # elements of (fit, row) in memory at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchFit:
+    """Coefficients (fit, coefficient), expected information (fit, coefficient, coefficient), log-likelihood and
+    convergence (fit,). Coefficients are per unit of the design's columns. A fit that did not converge holds NaN.
+    """
+
+    coefficients: Array
+    information: Array
+    log_likelihood: Array
+    converged: NDArray[np.bool_]
+
+
+def fit_batch(
+    design: Array,
+    hits: Array,
+    misses: Array,
+    *,
+    link: Link,
+    bias_reduced: bool = False,
+    start: Array | None = None,
+    iterations: int = 100,
+) -> BatchFit:
+    """Fit many hit/miss regressions on one design; coefficients per unit of the design's columns.
+
+    Newton's method with the observed information and step halving; with `bias_reduced`, Fisher scoring on the adjusted
+    score U_j + 1/2 sum_k h_k (d2POD/deta2 / dPOD/deta)_k design_kj, h the leverages (AS_mean: Firth 1993, Kosmidis &
+    Firth 2009, any link).
+
+    Args:
+        design: (row, coefficient), finite; the first column is the intercept's ones.
+        hits, misses: (fit, row), 0 or more.
+        link: the link function.
+        bias_reduced: Firth's mean-bias reduction instead of maximum likelihood.
+        start: coefficients to start from, (coefficient,) or (fit, coefficient).
+        iterations: the most steps of one fit.
+
+    Returns:
+        The fits. Separated data have no maximum: such fits hold NaN under maximum likelihood.
+
+    Source: Kosmidis, Kenne Pagui & Sartori, Stat. Comput. 30 (2020) 43, doi:10.1007/s11222-019-09860-6.
+    """
+    fits, rows = hits.shape
+    width = design.shape[1]
+    centre = np.zeros(width)
+    scale = np.ones(width)
+    if width > 1:
+        centre[1:] = design[:, 1:].mean(axis=0)
+        spread = design[:, 1:].std(axis=0)
+        scale[1:] = np.where(spread > 0, spread, 1.0)
+    columns = (design - centre) / scale
+    if start is None:
+        share = (hits.sum(axis=1) + 0.5) / (hits.sum(axis=1) + misses.sum(axis=1) + 1.0)
+        begin = np.zeros((fits, width))
+        begin[:, 0] = [link.eta_from_pod(float(value)) for value in share]
+        begin[:, 1:2] = 0.5
+    else:
+        begin = np.broadcast_to(np.asarray(start, float), (fits, width)) * scale
+        begin[:, 0] += np.broadcast_to(np.asarray(start, float), (fits, width))[:, 1:] @ centre[1:]
+    coefficients = np.full((fits, width), np.nan)
+    information = np.full((fits, width, width), np.nan)
+    log_likelihood = np.full(fits, np.nan)
+    converged = np.zeros(fits, bool)
+    step = max(1, _CHUNK // max(rows, 1))
+    solve = _adjusted if bias_reduced else _newton
+    for first in range(0, fits, step):
+        part = slice(first, first + step)
+        result = solve(columns, hits[part], misses[part], link, begin[part].copy(), iterations)
+        coefficients[part], information[part], log_likelihood[part], converged[part] = result
+    # back to the units of the caller's columns: eta = sum_j b_j (x_j - centre_j) / scale_j
+    back = np.diag(1.0 / scale)
+    back[0, 1:] = -centre[1:] / scale[1:]
+    forward = np.diag(scale)
+    forward[0, 1:] = centre[1:]
+    return BatchFit(
+        coefficients=coefficients @ back.T,
+        information=forward.T @ information @ forward,
+        log_likelihood=log_likelihood,
+        converged=converged,
+    )
+
+
+def _solve(matrices: Array, vectors: Array) -> Array:
+    """Solve many small symmetric systems; a singular one gives NaN instead of an exception."""
+    if vectors.shape[1] == 2:
+        a, b, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+        determinant = a * d - b * b
+        determinant = np.where(determinant > 1e-14 * a * d, determinant, np.nan)
+        u, v = vectors[:, 0], vectors[:, 1]
+        return np.stack(((d * u - b * v) / determinant, (a * v - b * u) / determinant), axis=1)
+    try:
+        return np.asarray(np.linalg.solve(matrices, vectors[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        return np.stack([_solve_one(m, v) for m, v in zip(matrices, vectors, strict=True)])
+
+
+def _solve_one(matrix: Array, vector: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.solve(matrix, vector))
+    except np.linalg.LinAlgError:
+        return np.full_like(vector, np.nan)
+
+
+def _newton(
+    columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    fits, width = begin.shape
+    products = np.einsum("ki,kj->kij", columns, columns).reshape(len(columns), width * width)
+    current = begin
+    last_step = np.zeros_like(current)
+    best = np.full(fits, -np.inf)
+    gradient = np.zeros_like(current)
+    hessian = np.zeros((fits, width, width))
+    information = np.full((fits, width, width), np.nan)
+    converged = np.zeros(fits, bool)
+    running = np.arange(fits)
+    for _ in range(iterations):
+        trial = current[running] + last_step[running]
+        eta = trial @ columns.T
+        parts = link.log_parts(eta)
+        h, m = hits[running], misses[running]
+        value = np.einsum("fk,fk->f", h, parts.log_hit) + np.einsum("fk,fk->f", m, parts.log_miss)
+        floor = best[running]
+        worse = ~(value >= floor - 1e-10 * (1 + np.abs(floor)))
+        last_step[running[worse]] *= 0.5
+        better = ~worse
+        moved = running[better]
+        if moved.size:
+            slope = h[better] * parts.log_hit_1[better] + m[better] * parts.log_miss_1[better]
+            weight = -(h[better] * parts.log_hit_2[better] + m[better] * parts.log_miss_2[better])
+            fisher = -(h[better] + m[better]) * parts.log_hit_1[better] * parts.log_miss_1[better]
+            current[moved] = trial[better]
+            best[moved] = value[better]
+            gradient[moved] = slope @ columns
+            hessian[moved] = (weight @ products).reshape(-1, width, width)
+            last_step[moved] = _solve(hessian[moved], gradient[moved])
+            information[moved] = (fisher @ products).reshape(-1, width, width)
+            decrement = np.einsum("fj,fj->f", gradient[moved], last_step[moved])
+            # half the decrement is what is left to gain; a last full step makes the error its square
+            done = decrement < 1e-13 * (1 + np.abs(best[moved]))
+            converged[moved[done]] = True
+        lost = ~np.isfinite(last_step[running]).all(axis=1) | (np.abs(last_step[running]).max(axis=1) < 1e-300)
+        running = running[~converged[running] & ~lost]
+        if not running.size:
+            break
+    # a fit whose curve became a step has run off to infinity: no maximum exists
+    converged &= np.abs(current).max(axis=1) < 200.0
+    current[~converged] = np.nan
+    return current, information, np.where(converged, best, np.nan), converged
+
+
+def _adjusted(
+    columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    fits, width = begin.shape
+    products = np.einsum("ki,kj->kij", columns, columns).reshape(len(columns), width * width)
+    current = begin
+    information = np.full((fits, width, width), np.nan)
+    value = np.full(fits, np.nan)
+    last = np.full(fits, np.inf)
+    last_step = np.zeros_like(current)
+    converged = np.zeros(fits, bool)
+    running = np.arange(fits)
+    for _ in range(5 * iterations):
+        eta = current[running] @ columns.T
+        parts = link.log_parts(eta)
+        h, m = hits[running], misses[running]
+        fisher = -(h + m) * parts.log_hit_1 * parts.log_miss_1
+        matrix = (fisher @ products).reshape(-1, width, width)
+        inverse = np.stack([_solve(matrix, np.tile(row, (len(running), 1))) for row in np.eye(width)], axis=1)
+        leverage = fisher * np.einsum("fij,kij->fk", inverse, products.reshape(-1, width, width))
+        adjusted = h * parts.log_hit_1 + m * parts.log_miss_1 + 0.5 * leverage * link.pod_curvature(eta)
+        gradient = adjusted @ columns
+        step = np.einsum("fij,fj->fi", inverse, gradient)
+        size = np.einsum("fj,fj->f", gradient, step)
+        size = np.where(np.isfinite(size), size, np.inf)
+        worse = (size > 4 * last[running]) & (size > 1e-12)
+        back = running[worse]
+        last_step[back] *= 0.5
+        current[back] -= last_step[back]
+        moved = running[~worse]
+        last[moved] = size[~worse]
+        information[moved] = matrix[~worse]
+        value[moved] = (h * parts.log_hit + m * parts.log_miss).sum(axis=1)[~worse]
+        length = np.abs(step[~worse]).max(axis=1)
+        # a step longer than 2 standard deviations of x is a start that was too far off, not information
+        last_step[moved] = step[~worse] * np.minimum(1.0, 2.0 / np.maximum(length, 1e-300))[:, None]
+        done = size[~worse] < 1e-20
+        converged[moved[done]] = True
+        current[moved] += last_step[moved]
+        running = running[~converged[running]]
+        if not running.size:
+            break
+    current[~converged] = np.nan
+    return current, information, np.where(converged, value, np.nan), converged

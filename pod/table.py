@@ -1,0 +1,356 @@
+"""Read hit/miss and response tables: HITS.csv of `raytwin detect`, mh1823 files, spreadsheets' exports.
+
+Comma, semicolon or tab; decimal comma where the separator is not a comma; lines that begin with # are comments. One
+trial a row, counts of trials a row, or one column of hits per inspection (as mh1823 writes them). An empty size is a
+product without foreign object: it is left out of the curve, and its false alarm is counted.
+"""
+
+import csv
+import difflib
+import io
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileFormatError, InputError
+
+Array = NDArray[np.float64]
+
+SIZE_NAMES = ("contrast", "size", "size_mm", "a", "flaw_size", "flawsize", "depth", "length", "diameter")
+HIT_NAMES = ("hit", "hits", "hit_miss", "hitmiss", "hit/miss", "detected", "detection")
+SITE_NAMES = ("site", "target", "target_id", "id")
+_HIT_WORDS = {
+    "0": 0.0,
+    "1": 1.0,
+    "miss": 0.0,
+    "hit": 1.0,
+    "false": 0.0,
+    "true": 1.0,
+    "no": 0.0,
+    "yes": 1.0,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PodTable:
+    """Rows with a foreign object, and the count of those without. Labels are text, None where there is no such column.
+
+    size (row,) in the column's own unit, or None; hits (row,), trials (row,) or None; response (row,) or None;
+    other: every remaining column as text, for the rows with an object. false_alarm (product,): 1 where a product
+    without object was marked; its labels beside it. notes: what was read in another way than one might think.
+    """
+
+    size_name: str
+    size: Array
+    hits: Array | None = None
+    trials: Array | None = None
+    response: Array | None = None
+    network: tuple[str, ...] | None = None
+    image: tuple[str, ...] | None = None
+    site: tuple[str, ...] | None = None
+    other: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    false_alarm: Array = field(default_factory=lambda: np.zeros(0))
+    false_alarm_network: tuple[str, ...] | None = None
+    false_alarm_image: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
+
+    def numbers(self, name: str) -> Array:
+        """A column of the table as numbers (row,).
+
+        Raises:
+            InputError: there is no such column, or it holds something else than finite numbers.
+        """
+        if name == self.size_name:
+            return self.size
+        column = _chosen(name, list(self.other), "column")
+        values = np.empty(len(self.size))
+        for row, text in enumerate(self.other[column]):
+            values[row] = _number(text, column, f"row {row + 1}")
+        return values
+
+
+def read_pod_table(
+    path: str | os.PathLike[str],
+    *,
+    size: str | None = None,
+    hit: str | Sequence[str] | None = None,
+    trials: str | None = None,
+    response: str | None = None,
+    site: str | None = None,
+    network: str | None = None,
+    image: str | None = None,
+    where: Mapping[str, str] | None = None,
+) -> PodTable:
+    """Read a table of trials; sizes in the unit of their column.
+
+    Args:
+        path: the file, text with a header line.
+        size: the size's column; None = the first of contrast, size, size_mm, ...
+        hit: the column of hits; several (or comma-separated) = one inspection each; None = `hit` or the like, else all
+            columns after the size that hold nothing but 0 and 1 (mh1823).
+        trials: the column of the number of trials of a row.
+        response: the column of a continuous response; then no hits are read.
+        site, network, image: columns of labels; None = `site` (or target), `network`, `image` where they exist.
+        where: column -> value; other rows are left out.
+
+    Raises:
+        FileFormatError: no such file, not text, no header, a row with another number of columns.
+        InputError: a column is missing or holds something that cannot be used; the message gives the line.
+    """
+    header, rows, lines = _read_rows(Path(path))
+    if where:
+        rows, lines = _filtered(header, rows, lines, where)
+    notes: list[str] = []
+    size_name = _chosen(size, header, "--size") if size else _default(header, SIZE_NAMES, "size")
+    at_size = header.index(size_name)
+    named: dict[str, str | None] = {}
+    for role, name, usual in (
+        ("network", network, ("network",)),
+        ("image", image, ("image",)),
+        ("site", site, SITE_NAMES),
+    ):
+        named[role] = _chosen(name, header, f"--{role}") if name else _present(header, usual)
+    trials_name = _chosen(trials, header, "--trials") if trials else None
+    response_name = _chosen(response, header, "--response") if response else None
+    hit_names: list[str] = []
+    if response_name is None:
+        hit_names = _hit_columns(hit, header, rows, at_size, [n for n in (*named.values(), trials_name) if n])
+        if len(hit_names) > 1:
+            if trials_name:
+                raise InputError(
+                    "--trials", received=f"with {len(hit_names)} columns of hits", expected="one column of hits"
+                )
+            rows, lines, header = _melted(header, rows, lines, hit_names)
+            if named["image"] is None:
+                named["image"] = named["site"] or "raytwin_row"
+            named["network"] = "raytwin_inspection"
+            notes.append(f"columns {', '.join(hit_names)} read as {len(hit_names)} inspections of each row")
+            hit_names = ["raytwin_hit"]
+            at_size = header.index(size_name)
+    alarm_name = _present(header, ("false_alarm",))
+    with_object, without, unknown = [], [], 0
+    object_name = _present(header, ("foreign_object",))
+    for number, row in enumerate(rows):
+        if row[at_size].strip():
+            with_object.append(number)
+        elif object_name and row[header.index(object_name)].strip():
+            unknown += 1
+        else:
+            without.append(number)
+    if unknown:
+        notes.append(f"{unknown} rows with a foreign object but no {size_name} are left out")
+    if not with_object:
+        raise InputError(size_name, received="no row with a size", expected="sizes of foreign objects in this column")
+
+    def column(name: str, chosen: list[int]) -> tuple[str, ...]:
+        at = header.index(name)
+        return tuple(rows[number][at].strip() for number in chosen)
+
+    def numbers(name: str, chosen: list[int]) -> Array:
+        texts = column(name, chosen)
+        return np.array([_number(t, name, f"line {lines[i]}") for t, i in zip(texts, chosen, strict=True)])
+
+    hits = None
+    if hit_names:
+        if trials_name:
+            hits = numbers(hit_names[0], with_object)
+        else:
+            texts = column(hit_names[0], with_object)
+            shown = hit_names[0].replace("raytwin_hit", "hit")
+            hits = np.array([_hit(t, shown, f"line {lines[i]}") for t, i in zip(texts, with_object, strict=True)])
+    alarms = np.zeros(0)
+    if without:
+        source = alarm_name or (hit_names[0] if hit_names else None)
+        if source is not None:
+            texts = column(source, without)
+            alarms = np.array(
+                [_hit(t, source, f"line {lines[i]}") for t, i in zip(texts, without, strict=True) if t != ""]
+            )
+            if len(alarms) < len(without):
+                notes.append(f"{len(without) - len(alarms)} rows without foreign object say nothing of a false alarm")
+                without = [i for t, i in zip(texts, without, strict=True) if t != ""]
+    own = {size_name, *hit_names, *(n for n in (trials_name, response_name) if n)}
+    return PodTable(
+        size_name=size_name,
+        size=numbers(size_name, with_object),
+        hits=hits,
+        trials=numbers(trials_name, with_object) if trials_name else None,
+        response=numbers(response_name, with_object) if response_name else None,
+        **{role: column(name, with_object) if name else None for role, name in named.items()},
+        other={name: column(name, with_object) for name in header if name not in own},
+        false_alarm=alarms,
+        false_alarm_network=column(named["network"], without) if named["network"] and len(alarms) else None,
+        false_alarm_image=column(named["image"], without) if named["image"] and len(alarms) else None,
+        notes=tuple(notes),
+    )
+
+
+def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise FileFormatError("table", received=path, expected="a file that exists") from None
+    except (UnicodeDecodeError, IsADirectoryError, PermissionError):
+        raise FileFormatError(
+            "table", received=path, expected="a readable text file of comma-separated values"
+        ) from None
+    kept = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    if len(kept) < 2:
+        raise FileFormatError(
+            "table", received=f"{path} with {len(kept)} lines", expected="a header and rows of trials"
+        )
+    first = kept[0][1]
+    separator = max(",;\t", key=first.count)
+    reader = csv.reader(io.StringIO("\n".join(line for _, line in kept)), delimiter=separator, skipinitialspace=True)
+    try:
+        cells = [list(row) for row in reader]
+    except csv.Error as error:
+        raise FileFormatError("table", received=f"{path} ({error})", expected="comma-separated values") from None
+    header = [name.strip() for name in cells[0]]
+    numbers = [n for n, _ in kept][1:]
+    if len(set(header)) != len(header) or "" in header:
+        raise FileFormatError("table header", received=", ".join(header), expected="distinct, non-empty column names")
+    if all(_is_number(name) for name in header):
+        raise FileFormatError(
+            "table header",
+            received=first,
+            expected="column names in the first line",
+            remedy="add a line such as size,hit",
+        )
+    for number, row in zip(numbers, cells[1:], strict=False):
+        if len(row) != len(header):
+            raise FileFormatError(
+                f"table line {number}", received=f"{len(row)} columns", expected=f"{len(header)} as in the header"
+            )
+    body = cells[1:]
+    if separator != ",":
+        body = [[_decimal_point(cell) for cell in row] for row in body]
+    return header, body, numbers
+
+
+def _decimal_point(cell: str) -> str:
+    changed = cell.replace(",", ".")
+    return changed if cell.count(",") == 1 and _is_number(changed) else cell
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _filtered(
+    header: list[str], rows: list[list[str]], lines: list[int], where: Mapping[str, str]
+) -> tuple[list[list[str]], list[int]]:
+    kept = list(range(len(rows)))
+    for name, value in where.items():
+        at = header.index(_chosen(name, header, "--where"))
+        known = sorted({rows[i][at].strip() for i in kept})
+        kept = [i for i in kept if rows[i][at].strip() == value]
+        if not kept:
+            raise InputError("--where", received=f"{name}={value}", expected=f"one of {', '.join(known[:12])}")
+    return [rows[i] for i in kept], [lines[i] for i in kept]
+
+
+def _chosen(name: str, header: list[str], option: str) -> str:
+    if name in header:
+        return name
+    same = [known for known in header if known.lower() == name.lower()]
+    if len(same) == 1:
+        return same[0]
+    near = difflib.get_close_matches(name.lower(), [known.lower() for known in header], n=1, cutoff=0.5)
+    hint = next((known for known in header if near and known.lower() == near[0]), None)
+    raise InputError(
+        option,
+        received=repr(name),
+        expected="a column of the table: " + ", ".join(header),
+        remedy=f"did you mean {hint}?" if hint else "",
+    )
+
+
+def _present(header: list[str], names: Sequence[str]) -> str | None:
+    lower = {known.lower(): known for known in header}
+    return next((lower[name] for name in names if name in lower), None)
+
+
+def _default(header: list[str], names: Sequence[str], option: str) -> str:
+    found = _present(header, names)
+    if found is None:
+        raise InputError(
+            option,
+            received="columns " + ", ".join(header),
+            expected="one of " + ", ".join(names),
+            remedy=f"name the column with --{option}",
+        )
+    return found
+
+
+def _hit_columns(
+    hit: str | Sequence[str] | None, header: list[str], rows: list[list[str]], at_size: int, taken: list[str]
+) -> list[str]:
+    if hit is not None:
+        asked = [hit] if isinstance(hit, str) else list(hit)
+        names = [part.strip() for name in asked for part in (name.split(",") if name not in header else [name])]
+        return [_chosen(name, header, "--hit") for name in names]
+    found = _present(header, HIT_NAMES)
+    if found is not None:
+        return [found]
+    binary = [
+        name
+        for at, name in enumerate(header)
+        if at > at_size and name not in taken and all(row[at].strip() in ("0", "1") for row in rows)
+    ]
+    if not binary:
+        return [_default(header, HIT_NAMES, "hit")]
+    return binary
+
+
+def _melted(
+    header: list[str], rows: list[list[str]], lines: list[int], hits: list[str]
+) -> tuple[list[list[str]], list[int], list[str]]:
+    keep = [at for at, name in enumerate(header) if name not in hits]
+    place = [(name, header.index(name)) for name in hits]
+    melted: list[list[str]] = []
+    numbers: list[int] = []
+    for order, (row, line) in enumerate(zip(rows, lines, strict=True)):
+        for name, at in place:
+            if row[at].strip() == "":
+                continue  # this inspector did not look at this site
+            melted.append([*(row[k] for k in keep), str(order), name, row[at]])
+            numbers.append(line)
+    return melted, numbers, [*(header[k] for k in keep), "raytwin_row", "raytwin_inspection", "raytwin_hit"]
+
+
+def _number(text: str, name: str, place: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"column {name}, {place}", received=repr(text), expected="a finite number")
+    return value
+
+
+def _hit(text: str, name: str, place: str) -> float:
+    word = text.strip().lower()
+    if word in _HIT_WORDS:
+        return _HIT_WORDS[word]
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if value not in (0.0, 1.0):
+        raise InputError(
+            f"column {name}, {place}",
+            received=repr(text),
+            expected="0 (miss) or 1 (hit)",
+            remedy="counts of hits need --trials, a continuous response --response" if math.isfinite(value) else "",
+        )
+    return value

@@ -22,22 +22,27 @@ MAXIMUM_ENERGY_KEV = 500.0
 _KEPT_ENERGIES = 4096
 
 
+def _row(values: ArrayLike) -> FloatArray:
+    # xraylib_np answers (element, energy)
+    return np.asarray(values, dtype=float).reshape(-1)
+
+
 def _xraylib_total(number: int, energies_keV: FloatArray) -> FloatArray:
     import xraylib_np
 
-    return np.asarray(xraylib_np.CS_Total(np.array([number]), energies_keV), dtype=float)[0]
+    return _row(xraylib_np.CS_Total(np.array([number]), energies_keV))
 
 
 def _xraylib_photoelectric(number: int, energies_keV: FloatArray) -> FloatArray:
     import xraylib_np
 
-    return np.asarray(xraylib_np.CS_Photo(np.array([number]), energies_keV), dtype=float)[0]
+    return _row(xraylib_np.CS_Photo(np.array([number]), energies_keV))
 
 
 def _xraylib_energy(number: int, energies_keV: FloatArray) -> FloatArray:
     import xraylib_np
 
-    return np.asarray(xraylib_np.CS_Energy(np.array([number]), energies_keV), dtype=float)[0]
+    return _row(xraylib_np.CS_Energy(np.array([number]), energies_keV))
 
 
 def _chantler_total(number: int, energies_keV: FloatArray) -> FloatArray:

@@ -108,7 +108,7 @@ def _material_from_entry(name: str, entry: Mapping[str, Any], *, where: Path, kn
             if given[0] == "formula"
             else {str(symbol): float(fraction) for symbol, fraction in entry["mass_fractions"].items()}
         )
-        return Material(name=name, density_g_cm3=float(density), mass_fractions=fractions, source=source)
+        return Material(name=name, density_g_cm3=float(entry["density_g_cm3"]), mass_fractions=fractions, source=source)
     except InputError as error:
         raise FileFormatError(at, received=str(error), expected="a material that can be made") from None
     except (TypeError, ValueError, AttributeError) as error:
@@ -146,7 +146,7 @@ def library_from_files(paths: Iterable[str | os.PathLike[str]] = ()) -> Library:
     """
     named = [path for path in os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep) if path]
     stamped = []
-    for path in [*named, *map(os.fspath, paths)]:
+    for path in [*named, *(os.fspath(path) for path in paths)]:
         try:
             stamped.append((path, os.stat(path).st_mtime_ns))
         except OSError as error:

@@ -1,1 +1,52 @@
-"""raytwin.spectra"""
+"""Spectra of X-ray tubes and the response of detectors: from kV and filters to what is detected."""
+
+from .detector import DEFAULT_SCINTILLATOR, Response, detector_response, k_escape_fractions
+from .effective import effective_mu_per_mm, signal_weights
+from .grid import BIN_WIDTH_KEV, FIRST_CENTRE_KEV, MAXIMUM_KV, energy_grid_keV
+from .measured import spectrum_from_file
+from .spectrum import (
+    Spectrum,
+    air_kerma_uGy_per_mAs,
+    filtered_spectrum,
+    fluence_per_cm2_mAs,
+    half_value_layer_mm,
+    mean_energy_keV,
+)
+from .tube import (
+    DEFAULT_ANGLE_DEG,
+    DEFAULT_ANODE,
+    DEFAULT_MODEL,
+    MAXIMUM_KV_OF_ANODE,
+    MINIMUM_KV,
+    MODELS,
+    tube_fluence_interpolated,
+    tube_spectrum,
+)
+
+__all__ = [
+    "BIN_WIDTH_KEV",
+    "DEFAULT_ANGLE_DEG",
+    "DEFAULT_ANODE",
+    "DEFAULT_MODEL",
+    "DEFAULT_SCINTILLATOR",
+    "FIRST_CENTRE_KEV",
+    "MAXIMUM_KV",
+    "MAXIMUM_KV_OF_ANODE",
+    "MINIMUM_KV",
+    "MODELS",
+    "Response",
+    "Spectrum",
+    "air_kerma_uGy_per_mAs",
+    "detector_response",
+    "effective_mu_per_mm",
+    "energy_grid_keV",
+    "filtered_spectrum",
+    "fluence_per_cm2_mAs",
+    "half_value_layer_mm",
+    "k_escape_fractions",
+    "mean_energy_keV",
+    "signal_weights",
+    "spectrum_from_file",
+    "tube_fluence_interpolated",
+    "tube_spectrum",
+]

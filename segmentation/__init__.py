@@ -1,1 +1,103 @@
-"""raytwin.segmentation"""
+"""Segmentation: networks that mark foreign objects, how they are trained, and when an object counts as detected.
+
+Nothing here needs torch before a network is built: without the extra `segmentation` the rules of detection still work.
+Names are loaded when they are first asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .detection import (
+        DETECTION_RECALL,
+        MARK_THRESHOLD,
+        Detection,
+        Rate,
+        detect_in_image,
+        rate_of_crossed_trials,
+        recall_in_mask,
+        summarise_detections,
+        write_detections,
+    )
+    from .examples import Examples, examples_from_arrays, examples_from_dataset
+    from .losses import LOSSES, cross_entropy_and_dice, dice_as_published
+    from .network import build_network, choose_device, predict_probabilities
+    from .recipe import RECIPES, Recipe, recipe_for_fine_tuning
+    from .runs import detect_with_networks, split_for_training, train_networks
+    from .runs_io import NetworkResult, Runs, finished_networks, open_runs, read_result, read_weights
+    from .scaling import SCALINGS, crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
+    from .training import EpochResult, TrainingState, count_epochs, iterate_training, learning_rate_at
+
+_LAZY = {
+    "detection": (
+        "DETECTION_RECALL",
+        "MARK_THRESHOLD",
+        "Detection",
+        "Rate",
+        "detect_in_image",
+        "rate_of_crossed_trials",
+        "recall_in_mask",
+        "summarise_detections",
+        "write_detections",
+    ),
+    "examples": ("Examples", "examples_from_arrays", "examples_from_dataset"),
+    "losses": ("LOSSES", "cross_entropy_and_dice", "dice_as_published"),
+    "network": ("build_network", "choose_device", "predict_probabilities"),
+    "recipe": ("RECIPES", "Recipe", "recipe_for_fine_tuning"),
+    "runs": ("detect_with_networks", "split_for_training", "train_networks"),
+    "runs_io": ("NetworkResult", "Runs", "finished_networks", "open_runs", "read_result", "read_weights"),
+    "scaling": ("SCALINGS", "crop_to_shape", "pad_to_multiple", "scale_min_max", "scale_residual"),
+    "training": ("EpochResult", "TrainingState", "count_epochs", "iterate_training", "learning_rate_at"),
+}
+_MODULE_OF_NAME = {name: module for module, names in _LAZY.items() for name in names}
+
+__all__ = [
+    "DETECTION_RECALL",
+    "LOSSES",
+    "MARK_THRESHOLD",
+    "RECIPES",
+    "SCALINGS",
+    "Detection",
+    "EpochResult",
+    "Examples",
+    "NetworkResult",
+    "Rate",
+    "Recipe",
+    "Runs",
+    "TrainingState",
+    "build_network",
+    "choose_device",
+    "count_epochs",
+    "crop_to_shape",
+    "cross_entropy_and_dice",
+    "detect_in_image",
+    "detect_with_networks",
+    "dice_as_published",
+    "examples_from_arrays",
+    "examples_from_dataset",
+    "finished_networks",
+    "iterate_training",
+    "learning_rate_at",
+    "open_runs",
+    "pad_to_multiple",
+    "predict_probabilities",
+    "rate_of_crossed_trials",
+    "read_result",
+    "read_weights",
+    "recall_in_mask",
+    "recipe_for_fine_tuning",
+    "scale_min_max",
+    "scale_residual",
+    "split_for_training",
+    "summarise_detections",
+    "train_networks",
+    "write_detections",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF_NAME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_MODULE_OF_NAME[name]}", __name__), name)
+    globals()[name] = value
+    return value

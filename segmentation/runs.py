@@ -1,0 +1,296 @@
+"""Networks on a dataset file: train a folder of them, and try every one of them on every image."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileFormatError, InputError
+from ..files import sha256_of_file
+from ._torch import load_torch
+from .detection import MARK_THRESHOLD, Detection, detect_in_image
+from .examples import examples_from_dataset
+from .network import build_network, probabilities_from_scaled
+from .recipe import Recipe
+from .runs_io import (
+    NetworkResult,
+    Runs,
+    create_or_resume_runs,
+    finished_networks,
+    make_configuration,
+    network_folder,
+    read_result,
+    read_state,
+    read_weights,
+    starting_weights_files,
+    write_finished,
+    write_state,
+)
+from .training import EpochResult, TrainingState, iterate_training
+
+if TYPE_CHECKING:
+    import os
+
+    from ..acquisition.dataset_io import Dataset
+
+_HELD_BACK_SHARE = 0.2
+_DETECTION_BATCH = 8
+
+# network number, epochs done, epochs wanted, the last epoch (None: nothing new, only where it stands)
+Progress = Callable[[int, int, int, EpochResult | None], None]
+
+
+def split_for_training(dataset: "Dataset", *, seed: int) -> tuple[NDArray[np.intp], NDArray[np.intp], str]:
+    """Numbers of the training and validation images of a dataset, and a note where the split had to be made up.
+
+    Without validation images a fifth of the training products (drawn from the seed, whole products, so that no product
+    is in both) is held back; where all images are of one product, a fifth of the images.
+
+    Raises:
+        InputError: no training images, or a single one and none for validation.
+    """
+    train, validation = dataset.indices(split="train"), dataset.indices(split="val")
+    if not len(train):
+        raise InputError(
+            dataset.path,
+            received=f"no images of split train among {len(dataset)}",
+            expected="training images",
+            remedy="make a dataset with split train (and val)",
+        )
+    if len(validation):
+        return train, validation, ""
+    if len(train) < 2:
+        raise InputError(
+            dataset.path,
+            received="one training image and no validation image",
+            expected="at least two images to train and validate with",
+        )
+    products = dataset.column("product")[train]
+    by_product = len(np.unique(products)) > 1
+    groups = products if by_product else np.arange(len(train))
+    names = np.random.default_rng([seed, len(train)]).permutation(np.unique(groups))
+    held_back = np.isin(groups, names[: max(1, round(_HELD_BACK_SHARE * len(names)))])
+    note = (
+        f"{dataset.path} has no validation images: {int(held_back.sum())} training images"
+        + (" (whole products)" if by_product else " of the only product")
+        + " are held back for validation"
+    )
+    return train[~held_back], train[held_back], note
+
+
+def train_networks(
+    dataset: "Dataset",
+    runs_path: "str | os.PathLike[str]",
+    *,
+    recipe: Recipe,
+    networks: int = 1,
+    seed: int = 0,
+    device: str = "cpu",
+    start_from: "str | os.PathLike[str] | None" = None,
+    progress: Progress | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> list[NetworkResult]:
+    """Train networks 0 .. networks - 1 on a dataset; finished ones are kept, an unfinished one goes on.
+
+    Args:
+        dataset: open dataset file with training images.
+        runs_path: RUNS folder, new or of the same configuration.
+        recipe: how to train.
+        networks: how many the folder holds afterwards, at least.
+        seed: of the randomness.
+        device: torch device (see `choose_device`).
+        start_from: weights.pt or RUNS folder whose network(s) to start from instead of random weights.
+        progress: called after every epoch.
+        warn: called with what the user should know (a made-up split, an unreadable state).
+
+    Returns:
+        Records of networks 0 .. networks - 1.
+
+    Raises:
+        InputError: a folder of another configuration, unusable data or weights.
+    """
+    if networks < 1:
+        raise InputError("networks", received=networks, expected="a whole number, 1 or more")
+    if seed < 0:
+        raise InputError("seed", received=seed, expected="a whole number, 0 or more")
+    say = warn or (lambda line: None)
+    torch = load_torch()
+    train, validation, note = split_for_training(dataset, seed=seed)
+    if note:
+        say(note)
+    started_from = starting_weights_files(start_from, range(networks)) if start_from is not None else {}
+    starts = {number: _starting_weights(path, recipe) for number, path in started_from.items()}
+    hashes = {number: sha256_of_file(path) for number, path in started_from.items()}
+    configuration = make_configuration(
+        recipe, seed=seed, dataset_sha256=sha256_of_file(dataset.path), started_from=hashes
+    )
+    train_examples = examples_from_dataset(dataset, train, recipe=recipe)
+    validation_examples = examples_from_dataset(dataset, validation, recipe=recipe)
+    if all(train_examples[number][1][-1].any() for number in range(len(train_examples))):
+        say("no training image is without a foreign object: expect false alarms on clean products")
+    runs = create_or_resume_runs(runs_path, configuration)
+    done = set(finished_networks(runs))
+    results = []
+    for number in range(networks):
+        if number in done:
+            result = read_result(runs, number)
+            if progress is not None:
+                progress(number, len(result.history), len(result.history), None)
+            results.append(result)
+            continue
+        resume = _state_or_none(runs, number, say)
+        if resume is not None and progress is not None:
+            progress(number, resume.epochs_done, resume.epochs_wanted, None)
+        state = resume
+        for state in iterate_training(
+            train_examples,
+            validation_examples,
+            recipe=recipe,
+            seed=seed,
+            network_number=number,
+            device=device,
+            start_from=starts.get(number, starts.get(-1)),
+            resume=resume,
+        ):
+            write_state(runs, number, state)
+            if progress is not None:
+                progress(number, state.epochs_done, state.epochs_wanted, state.history[-1])
+        if state is None or not state.best_weights:
+            raise InputError(
+                "validation images",
+                received="a validation loss that is never finite",
+                expected="images on which the network can be judged",
+            )
+        notes = {
+            "device": device,
+            "torch": str(torch.__version__),
+            "threads": torch.get_num_threads(),
+            "n_train": len(train),
+            "n_validation": len(validation),
+        }
+        results.append(write_finished(runs, number, state, notes=notes))
+    return results
+
+
+def detect_with_networks(
+    runs: Runs,
+    dataset: "Dataset",
+    numbers: Sequence[int] | NDArray[np.intp],
+    *,
+    networks: Sequence[int] | None = None,
+    threshold: float = MARK_THRESHOLD,
+    device: str = "cpu",
+    progress: Callable[[int], None] | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> Iterator[Detection]:
+    """Try networks on images of a dataset and say of each what it found.
+
+    Args:
+        runs: open RUNS folder.
+        dataset: open dataset file; images of any size.
+        numbers: of the images to try.
+        networks: numbers of networks, None = all finished ones.
+        threshold: probability above which a pixel is marked, 0..1.
+        device: torch device.
+        progress: called with the number of images done, after every batch.
+        warn: called with what the user should know.
+
+    Returns:
+        Iterator, network by network.
+
+    Raises:
+        InputError: no finished network, an unknown one, no images, a threshold outside 0..1.
+    """
+    if not 0 <= threshold < 1:
+        raise InputError("threshold", received=threshold, expected="a probability, 0 or more and below 1")
+    if not len(numbers):
+        raise InputError(dataset.path, received="no images to try the networks on", expected="at least one")
+    finished = finished_networks(runs)
+    chosen = finished if networks is None else list(networks)
+    if not chosen or not set(chosen) <= set(finished):
+        raise InputError(
+            str(runs.path),
+            received=f"finished networks {finished or 'none'}",
+            expected="at least one" if networks is None else f"networks {chosen}",
+            remedy="run the same `raytwin train` again: it goes on where it stopped",
+        )
+    usable, skipped = _with_pixels(dataset, numbers)
+    if skipped and warn is not None:
+        warn(f"{len(skipped)} images are left out: their foreign object has no pixel in its mask ({skipped[0]} ...)")
+    recipe = runs.recipe
+    examples = examples_from_dataset(dataset, usable, recipe=recipe)
+    for number in chosen:
+        network = build_network(recipe, seed=0, pretrained=False)
+        path = network_folder(runs, number) / "weights.pt"
+        held_recipe, weights = read_weights(path)
+        if held_recipe != recipe:
+            raise FileFormatError(
+                str(path), received="weights of another recipe", expected="weights of this folder's run.json"
+            )
+        network.load_state_dict(weights)
+        network = network.to(device)
+        for first in range(0, len(usable), _DETECTION_BATCH):
+            places = range(first, min(first + _DETECTION_BATCH, len(usable)))
+            pairs = [examples[place] for place in places]
+            probabilities = probabilities_from_scaled(
+                network, np.stack([image for image, _ in pairs]), recipe=recipe, device=device, batch=_DETECTION_BATCH
+            )
+            for place, (_, masks), found in zip(places, pairs, probabilities, strict=True):
+                row = dataset.rows[usable[place]]
+                hit, false_alarm, recall, response = detect_in_image(found, masks[-1], threshold=threshold)
+                yield Detection(
+                    contrast=_known(row.contrast) if recall is not None else None,
+                    size_mm=_known(row.size_mm) if recall is not None else None,
+                    hit=hit,
+                    network=number,
+                    image=row.image,
+                    foreign_object=row.foreign_object,
+                    setting=row.setting,
+                    false_alarm=false_alarm,
+                    recall=recall,
+                    response=response,
+                    product=row.product,
+                )
+            if progress is not None:
+                progress(len(pairs))
+
+
+def _with_pixels(dataset: "Dataset", numbers: Sequence[int] | NDArray[np.intp]) -> tuple[list[int], list[str]]:
+    usable: list[int] = []
+    skipped: list[str] = []
+    for number in map(int, numbers):
+        row = dataset.rows[number]
+        if row.foreign_object and not dataset.foreign_object_masks(number).any():
+            skipped.append(row.image)
+        else:
+            usable.append(number)
+    if not usable:
+        raise InputError(
+            dataset.path, received="foreign objects without a pixel in their masks", expected="masks that mark them"
+        )
+    return usable, skipped
+
+
+def _state_or_none(runs: Runs, number: int, say: Callable[[str], None]) -> TrainingState | None:
+    try:
+        return read_state(runs, number)
+    except FileFormatError as error:
+        say(f"network {number} starts again: {error}")
+        return None
+
+
+def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
+    held, weights = read_weights(path)
+    if (held.scaling, held.classes) != (recipe.scaling, recipe.classes):
+        raise InputError(
+            "start from",
+            received=f"{path}, trained with scaling {held.scaling} and classes {', '.join(held.classes)}",
+            expected=f"scaling {recipe.scaling} and classes {', '.join(recipe.classes)}",
+            remedy="start from a network of the same recipe",
+        )
+    return weights
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value

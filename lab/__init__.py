@@ -1,1 +1,30 @@
-"""raytwin.lab"""
+"""raytwin.lab: a virtual X-ray line whose truth is known. It shares no physics with the twin."""
+
+from importlib import import_module
+from typing import Any
+
+_PLACES = {
+    "Bench": "bench",
+    "Bone": "objects",
+    "Fillet": "objects",
+    "LabSystem": "system",
+    "PROTOCOLS": "protocols",
+    "Product": "objects",
+    "Slab": "objects",
+    "aperture_share": "response",
+    "compute_incidence": "response",
+    "compute_level": "response",
+    "compute_truth": "truth",
+    "detector_maps": "system",
+    "run_protocol": "protocols",
+    "sample_system": "system",
+    "system_of_seed": "protocols",
+}
+
+__all__ = sorted(_PLACES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_PLACES[name]}", __name__), name)

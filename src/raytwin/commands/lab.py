@@ -1,0 +1,105 @@
+"""Measure a session in the virtual lab: an acquisition file, and the truth about it in a separate file.
+
+The lab stands in for a real X-ray line whose truth is known: photons are sampled one energy class at a time, their light
+spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden system
+(tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
+`--protocol calibration` can be judged on `--protocol set2` of the same seed.
+"""
+
+import argparse
+import re
+from typing import Any
+
+from ..errors import InputError
+from ._answer import answer
+
+EXAMPLE = """example:
+  raytwin lab -o calibration.h5 --protocol calibration --seed 1
+  raytwin lab -o products.h5 --protocol set1 --seed 1 --products 40 --size 128x160
+
+The truth goes to calibration.truth.json. Frames are 128 x 160 pixels of 0.45 mm unless --size and --pixel-mm say
+otherwise; 760x956 pixels of 0.15 mm is the paper's detector. The distances scale with the pixel, so that a power and an
+exposure time mean the same photons per pixel at every size."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", required=True, metavar="ACQ", help="acquisition file to write")
+    parser.add_argument("--protocol", required=True, metavar="NAME", help="calibration, set1 or set2")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="draws system, products and noise (default 0)")
+    parser.add_argument("--size", default="128x160", metavar="N", help="pixels: ROWSxCOLUMNS, or N for N x N")
+    parser.add_argument("--pixel-mm", type=float, default=0.45, metavar="MM", help="pitch (default 0.45 mm)")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        metavar="N",
+        help="frames per series (default 20; product sets: frames per object and exposure, default 1)",
+    )
+    parser.add_argument("--products", type=int, metavar="N", help="products in a set (default 254 in set1, 84 in set2)")
+    parser.add_argument("--product-mm", type=float, metavar="MM", help="length of a product (default: fills the field)")
+    parser.add_argument(
+        "--session", type=int, default=0, metavar="K", help="another day with the same system (default 0)"
+    )
+    parser.add_argument(
+        "--effect",
+        action="append",
+        default=[],
+        metavar="ID=STRENGTH",
+        help="an effect to plant; none is available in this version",
+    )
+    parser.add_argument("--json", action="store_true", help="print the truth as JSON")
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)(?:[xX](\d+))?", text.strip())
+    size = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
+    if not all(8 <= pixels <= 8192 for pixels in size):
+        raise InputError("--size", received=repr(text), expected="N or ROWSxCOLUMNS from 8 to 8192 pixels")
+    return size
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ..lab.protocols import run_protocol, truth_path
+
+    if arguments.effect:
+        raise InputError(
+            "--effect",
+            received=", ".join(arguments.effect),
+            expected="no effect: none is available in this version",
+            remedy="leave --effect out",
+        )
+    rows, columns = _size(arguments.size)
+    bar: Any = None
+
+    def begin(frames: int) -> None:
+        from tqdm import tqdm
+
+        nonlocal bar
+        bar = tqdm(total=frames, unit="frame", disable=None, desc=arguments.protocol)
+
+    def advance() -> None:
+        bar.update()
+
+    try:
+        truth = run_protocol(
+            arguments.output,
+            protocol=arguments.protocol,
+            seed=arguments.seed,
+            rows=rows,
+            columns=columns,
+            pixel_mm=arguments.pixel_mm,
+            frames=arguments.frames,
+            products=arguments.products,
+            product_mm=arguments.product_mm,
+            session=arguments.session,
+            begin=begin,
+            advance=advance,
+        )
+    finally:
+        if bar is not None:
+            bar.close()
+    lines = [
+        f"{arguments.output}: {len(truth['series'])} series of {rows} x {columns} pixels ({arguments.protocol})",
+        f"{truth_path(arguments.output)}: the truth",
+    ]
+    answer(truth, as_json=arguments.json, text="\n".join(lines))
+    return 0

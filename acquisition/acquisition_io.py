@@ -575,6 +575,11 @@ class AcquisitionWriter:
         self._writers: list[SeriesWriter] = []
         self._next_index = 0
 
+    @property
+    def scene_names(self) -> tuple[str, ...]:
+        """The scenes that have been added."""
+        return tuple(self._scenes)
+
     def add_series(
         self,
         name: str,

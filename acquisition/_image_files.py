@@ -1,0 +1,193 @@
+"""Images out of TIFF, PNG and raw files, one at a time; every fault names the file."""
+
+import math
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileFormatError, InputError
+
+TIFF_ENDINGS = (".tif", ".tiff")
+RAW_ENDINGS = (".raw", ".bin", ".img")
+IMAGE_ENDINGS = (*TIFF_ENDINGS, ".png", ".bmp", *RAW_ENDINGS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawLayout:
+    """How the numbers lie in a raw file: (row, column) images one after the other behind a header of `header_bytes`."""
+
+    rows: int
+    columns: int
+    dtype: str = "uint16"
+    byte_order: str = "little"
+    header_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        if self.byte_order not in ("little", "big"):
+            raise InputError("raw byte_order", received=repr(self.byte_order), expected="little or big")
+        if self.dtype not in ("uint8", "uint16", "int16", "uint32", "int32", "float32", "float64"):
+            raise InputError(
+                "raw dtype",
+                received=repr(self.dtype),
+                expected="uint8, uint16, int16, uint32, int32, float32 or float64",
+            )
+        if self.rows < 1 or self.columns < 1 or self.header_bytes < 0:
+            raise InputError(
+                "raw layout",
+                received=f"{self.rows} rows, {self.columns} columns, {self.header_bytes} header bytes",
+                expected="at least one row and column and no negative header",
+            )
+
+    @property
+    def numpy_dtype(self) -> np.dtype[Any]:
+        """The type as numpy reads it."""
+        return np.dtype(self.dtype).newbyteorder("<" if self.byte_order == "little" else ">")
+
+
+def natural_key(path: Path) -> tuple[Any, ...]:
+    """Sorts `img_2` before `img_10`, as people count."""
+    parts = re.split(r"(\d+)", path.as_posix())
+    return tuple((1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts)
+
+
+def iter_images(path: Path, *, raw: RawLayout | None = None) -> Iterator[NDArray[Any]]:
+    """Yield the images (row, column) of one file, a multi-page TIFF or a raw stack page by page.
+
+    Raises:
+        FileFormatError: not there, damaged, of a kind that is not read, or in colour.
+    """
+    if not path.is_file():
+        raise FileFormatError(str(path), received="no such file", expected="an image", remedy="check the path")
+    ending = path.suffix.lower()
+    if ending in TIFF_ENDINGS:
+        yield from _tiff_pages(path)
+    elif ending in RAW_ENDINGS:
+        yield from _raw_images(path, raw)
+    elif ending in (".png", ".bmp"):
+        yield _one_channel(path, _decoded(path))
+    else:
+        raise FileFormatError(str(path), received=f"a file {ending or 'without ending'}", expected="TIFF, PNG or raw")
+
+
+def read_image(path: Path, *, raw: RawLayout | None = None) -> NDArray[Any]:
+    """The only image (row, column) of a file.
+
+    Raises:
+        FileFormatError: as `iter_images`, or more than one image.
+    """
+    images = list(iter_images(path, raw=raw))
+    if len(images) != 1:
+        raise FileFormatError(str(path), received=f"{len(images)} images", expected="one image")
+    return images[0]
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """A mask (row, column): True where the first channel is not 0, so that painted colour masks are read too."""
+    if not path.is_file():
+        raise FileFormatError(str(path), received="no such file", expected="a mask image", remedy="check the path")
+    values = read_image(path) if path.suffix.lower() in TIFF_ENDINGS else _decoded(path)
+    inside: NDArray[np.bool_] = np.not_equal(values[..., 0] if values.ndim == 3 else values, 0)
+    return inside
+
+
+def _decoded(path: Path) -> NDArray[Any]:
+    import imageio.v3 as imageio
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return np.asarray(imageio.imread(path))
+    except Exception as error:  # the decoders behind imageio raise whatever they like at damaged files
+        raise _damaged(path, error) from None
+
+
+def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            if not file.series:
+                raise ValueError("no image in it")
+            series = file.series[0]
+            if series.ndim > 2 and len(series.pages) == series.shape[0]:
+                pages: Iterator[Any] = (page.asarray() for page in series.pages)
+            else:
+                whole = np.asarray(series.asarray())
+                pages = iter([whole] if whole.ndim == 2 or _is_colour(whole) else whole)
+            for page in pages:
+                yield _one_channel(path, np.asarray(page))
+    except (InputError, GeneratorExit):
+        raise
+    except Exception as error:  # tifffile raises struct, value, index and codec errors at damaged files
+        raise _damaged(path, error) from None
+
+
+def _is_colour(values: NDArray[Any]) -> bool:
+    return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
+
+
+def _one_channel(path: Path, values: NDArray[Any]) -> NDArray[Any]:
+    if values.ndim == 3 and values.shape[-1] in (3, 4) and bool(np.all(values[..., :3] == values[..., :1])):
+        values = values[..., 0]  # grey, stored as colour
+    if values.ndim != 2:
+        raise FileFormatError(
+            str(path),
+            received=f"an image of shape {values.shape}",
+            expected="one grey value a pixel",
+            remedy="export the detector's own numbers, not a colour picture",
+        )
+    if values.dtype.kind not in "iufb":
+        raise FileFormatError(str(path), received=f"values of type {values.dtype}", expected="numbers")
+    return values
+
+
+def _raw_images(path: Path, raw: RawLayout | None) -> Iterator[NDArray[Any]]:
+    if raw is None:
+        raise FileFormatError(
+            str(path),
+            received="a raw file without layout",
+            expected="rows, columns, dtype, byte_order and header_bytes in the table [raw] of the sidecar",
+        )
+    dtype = raw.numpy_dtype
+    image_bytes = raw.rows * raw.columns * dtype.itemsize
+    size = path.stat().st_size - raw.header_bytes
+    if size <= 0 or size % image_bytes:
+        raise FileFormatError(
+            str(path),
+            received=f"{path.stat().st_size} bytes",
+            expected=f"{raw.header_bytes} + n x {image_bytes} bytes ({raw.rows} x {raw.columns} {raw.dtype})",
+            remedy="check [raw] in the sidecar; the file may be truncated",
+        )
+    with path.open("rb") as stream:
+        stream.seek(raw.header_bytes)
+        for _ in range(size // image_bytes):
+            values = np.frombuffer(stream.read(image_bytes), dtype=dtype).reshape(raw.rows, raw.columns)
+            yield values.astype(dtype.newbyteorder("="))
+
+
+def _damaged(path: Path, error: Exception) -> FileFormatError:
+    return FileFormatError(
+        str(path),
+        received=f"{path.stat().st_size} bytes that cannot be decoded ({error or type(error).__name__})",
+        expected="a complete image file",
+        remedy="the file looks truncated or damaged: copy or export it again",
+    )
+
+
+def frame_dtype(image: NDArray[Any]) -> type[Any]:
+    """The type in which frames like this one are kept: uint16 where that is exact for certain, else float32."""
+    return np.uint16 if image.dtype in (np.uint8, np.uint16, np.bool_) else np.float32
+
+
+def number_or_nan(text: str | None) -> float:
+    """A number out of a table's cell; empty or unreadable cells are NaN."""
+    try:
+        return float(text) if text not in (None, "") else math.nan
+    except ValueError:
+        return math.nan

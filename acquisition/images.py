@@ -1,0 +1,272 @@
+"""Import of a folder of images (TIFF, PNG, raw) that a sidecar describes.
+
+The sidecar is `raytwin.toml` in the folder:
+
+    [instrument]                      # every word optional: unknown where absent
+    anode = "W"
+    pixel_mm = 0.15
+    source_object_mm = 990
+    source_detector_mm = 1059
+    scintillator = "CsI:0.6"
+    bits = 16
+
+    [raw]                             # only where there are .raw, .bin or .img files
+    rows = 760
+    columns = 956
+    dtype = "uint16"                  # uint8, uint16, int16, uint32, int32, float32, float64
+    byte_order = "little"
+    header_bytes = 0
+
+    [[series]]                        # in the order of time; one setting and one scene each
+    kind = "dark"                     # dark, flat, object, afterglow
+    files = "dark/*.tif"              # below the folder; a list of patterns is taken too
+    exposure_ms = 20
+
+    [[series]]
+    kind = "flat"
+    files = "flat_40kV/*.tif"
+    setting = "kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05"
+    role = "calibration"
+
+    [[series]]                        # one series for every folder that matches
+    kind = "object"
+    for_each = "products/*"           # its name becomes the scene
+    files = "40kV*.tif"               # below that folder
+    setting = "kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05"
+
+    [[scene]]
+    kind = "product"                  # wedge, slab, edge, disc, product
+    for_each = "products/*"
+    foreign_object_mask = "bone.png"
+    product_mask = "product.png"      # optional, as are the words below
+    thickness_mm = { pmma = "thickness_pmma.tif" }
+    product = "fillet"
+    foreign_object = "rib bone"
+    size_mm = 3.5
+
+Further words of a series: name, index, kV, current_mA, power_W, exposure_ms, filter, averaged, frame_interval_ms,
+belt_speed_mm_s, panel_rotation_deg, source_object_mm, source_detector_mm, photons_per_pixel, scene, corrected
+(`offset+gain`), dtype. A scene that is not `for_each` has a `name`.
+"""
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import FileFormatError, InputError
+from ._image_files import IMAGE_ENDINGS, RawLayout, frame_dtype, iter_images, read_image, read_mask
+from ._sidecar import (
+    NAME,
+    check_words,
+    files_matching,
+    folders_matching,
+    instrument_of,
+    number_of,
+    raw_layout_of,
+    read_sidecar,
+    tables_of,
+    text_of,
+)
+from .acquisition_io import AcquisitionWriter, SeriesWriter, write_acquisition
+from .import_report import ImportReport, Skipped
+from .setting import filters_from_text, setting_from_text
+
+MINIMAL = "[[series]] kind='flat' files='*.tif' setting='kv=40,power_w=40,exposure_ms=20'"
+
+_NUMBERS = (
+    "kV",
+    "current_mA",
+    "power_W",
+    "exposure_ms",
+    "frame_interval_ms",
+    "belt_speed_mm_s",
+    "panel_rotation_deg",
+    "source_object_mm",
+    "source_detector_mm",
+    "photons_per_pixel",
+)
+_WHOLE = ("index", "averaged")
+_SERIES_WORDS = (
+    *("name", "kind", "files", "for_each", "setting", "filter", "scene", "corrected", "role", "dtype"),
+    *_NUMBERS,
+    *_WHOLE,
+)
+_MASKS = ("foreign_object_mask", "product_mask")
+_SCENE_WORDS = ("name", "kind", "for_each", *_MASKS, "thickness_mm", "product", "foreign_object", "size_mm", "split")
+
+
+def import_images(
+    source: str | os.PathLike[str], out: str | os.PathLike[str], *, sidecar: str | os.PathLike[str] | None = None
+) -> ImportReport:
+    """Turn a folder of images into an acquisition file, as its sidecar says (see the module's text for its words).
+
+    Args:
+        source: the folder.
+        out: acquisition file to write.
+        sidecar: TOML file; None = `raytwin.toml` in the folder.
+
+    Raises:
+        InputError: no sidecar, a word that means nothing, a pattern without files, images of mixed shapes, damaged.
+    """
+    folder = Path(source)
+    tables = read_sidecar(
+        folder,
+        None if sidecar is None else Path(sidecar),
+        known=("instrument", "raw", "series", "scene"),
+        minimal=MINIMAL,
+    )
+    used: set[Path] = set()
+    with write_acquisition(out, instrument_of(tables, where=NAME)) as writer:
+        read, notes = _write(writer, folder, tables, used)
+    skipped = [
+        Skipped(what=path.relative_to(folder).as_posix(), reason="no series or scene of the sidecar names it")
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS and path not in used
+    ]
+    return ImportReport(
+        layout="images",
+        source=str(source),
+        written=str(out),
+        format="acquisition",
+        read=tuple(read),
+        frames=sum(int(entry["frames"]) for entry in read),
+        skipped=tuple(skipped),
+        notes=tuple(notes),
+    )
+
+
+def _write(
+    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], used: set[Path]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    raw = raw_layout_of(tables, where=NAME)
+    series = tables_of(tables, "series", where=NAME)
+    if not series:
+        raise InputError(NAME, received="no [[series]]", expected="at least one series", remedy=f"at least: {MINIMAL}")
+    read: list[dict[str, Any]] = []
+    for number, table in enumerate(series, start=1):
+        where = f"{NAME}, series {table.get('name', number)}"
+        check_words(table, _SERIES_WORDS, where=where)
+        for place, scene, name in _places(folder, table, number, where=where):
+            read.append(_write_series(writer, place, table, raw, used, scene=scene, name=name, where=where))
+    for number, table in enumerate(tables_of(tables, "scene", where=NAME), start=1):
+        where = f"{NAME}, scene {table.get('name', number)}"
+        check_words(table, _SCENE_WORDS, where=where)
+        for place, scene, _ in _places(folder, table, number, where=where):
+            if not scene:
+                raise InputError(where, received="no name", expected="name or for_each")
+            _write_scene(writer, place, table, used, name=scene, where=where)
+    named = {entry["scene"] for entry in read if entry["scene"]}
+    return read, [f"scene {scene}: nothing is said about it" for scene in sorted(named - set(writer.scene_names))]
+
+
+def _places(folder: Path, table: Mapping[str, Any], number: int, *, where: str) -> Iterator[tuple[Path, str, str]]:
+    """(folder to look in, scene, name of the series) for each thing that one table describes."""
+    kind = text_of(table, "kind", where=where) or ""
+    each = text_of(table, "for_each", where=where)
+    if each is None:
+        scene = text_of(table, "scene", where=where) if "scene" in table or "files" in table else table.get("name")
+        yield folder, scene or "", text_of(table, "name", where=where) or f"{number:03d}_{kind}"
+        return
+    if "scene" in table:
+        raise InputError(where, received="scene and for_each", expected="one of the two: for_each names the scenes")
+    for place in folders_matching(folder, each, where=f"{where}, for_each"):
+        suffix = text_of(table, "name", where=where) or f"{number:03d}_{kind}"
+        yield place, place.name, f"{place.name}_{suffix}"
+
+
+def _write_series(
+    writer: AcquisitionWriter,
+    place: Path,
+    table: Mapping[str, Any],
+    raw: RawLayout | None,
+    used: set[Path],
+    *,
+    scene: str,
+    name: str,
+    where: str,
+) -> dict[str, Any]:
+    patterns = table.get("files")
+    if not isinstance(patterns, str | list) or not patterns:
+        raise InputError(
+            f"{where}, files", received=repr(patterns), expected="a pattern such as 'flats/*.tif', or a list"
+        )
+    setting_text = text_of(table, "setting", where=where)
+    attributes: dict[str, Any] = {word: number_of(table, word, where=where) for word in (*_NUMBERS, *_WHOLE)}
+    for word in _WHOLE:
+        if isinstance(attributes[word], float):
+            raise InputError(f"{where}, {word}", received=attributes[word], expected="a whole number")
+    filter_text = text_of(table, "filter", where=where)
+    if filter_text is not None:
+        attributes["filters"] = filters_from_text(filter_text)
+    files = files_matching(place, patterns, where=f"{where}, files")
+    series: SeriesWriter | None = None
+    shape: tuple[int, int] | None = None
+    for path in files:
+        used.add(path)
+        for image in iter_images(path, raw=raw):
+            if series is None:
+                shape = (image.shape[0], image.shape[1])
+                series = writer.add_series(
+                    name,
+                    kind=text_of(table, "kind", where=where) or "",
+                    shape=shape,
+                    dtype=text_of(table, "dtype", where=where) or frame_dtype(image),
+                    setting=None if setting_text is None else setting_from_text(setting_text),
+                    scene=scene,
+                    role=text_of(table, "role", where=where),
+                    corrected=[word for word in (text_of(table, "corrected", where=where) or "").split("+") if word],
+                    **attributes,
+                )
+            if image.shape != shape:
+                raise FileFormatError(
+                    str(path),
+                    received=f"{image.shape[0]} x {image.shape[1]} pixels",
+                    expected=f"{shape[0]} x {shape[1]} as in {files[0].name}" if shape else "one shape",
+                    remedy="a series holds frames of one shape: split it in two",
+                )
+            try:
+                series.append(image)
+            except InputError as error:
+                raise FileFormatError(
+                    str(path), received=error.received, expected=error.expected, remedy=error.remedy
+                ) from None
+    entry: dict[str, Any] = {
+        "name": name,
+        "kind": table.get("kind"),
+        "frames": 0 if series is None else series.n_frames,
+    }
+    return entry | {"files": len(files), "scene": scene}
+
+
+def _write_scene(
+    writer: AcquisitionWriter, place: Path, table: Mapping[str, Any], used: set[Path], *, name: str, where: str
+) -> None:
+    def file_of(pattern: object, word: str) -> Path:
+        found = files_matching(place, [pattern] if isinstance(pattern, str) else [], where=f"{where}, {word}")
+        if len(found) != 1:
+            raise InputError(f"{where}, {word}", received=f"{len(found)} files", expected="one file")
+        used.add(found[0])
+        return found[0]
+
+    masks = {word: read_mask(file_of(table[word], word)) for word in _MASKS if word in table}
+    maps = table.get("thickness_mm", {})
+    if not isinstance(maps, dict):
+        raise InputError(
+            f"{where}, thickness_mm", received=repr(maps), expected='a table such as { pmma = "pmma.tif" }'
+        )
+    thickness_mm = {
+        material: read_image(file_of(pattern, f"thickness_mm of {material}")) for material, pattern in maps.items()
+    }
+    split = text_of(table, "split", where=where)
+    writer.add_scene(
+        name,
+        kind=text_of(table, "kind", where=where) or "product",
+        thickness_mm=thickness_mm,
+        product=text_of(table, "product", where=where) or "",
+        foreign_object=text_of(table, "foreign_object", where=where) or "",
+        size_mm=number_of(table, "size_mm", where=where),
+        attributes=None if split is None else {"split": split},
+        foreign_object_mask=masks.get("foreign_object_mask"),
+        product_mask=masks.get("product_mask"),
+    )

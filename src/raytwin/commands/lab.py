@@ -1,7 +1,7 @@
 """Measure a session in the virtual lab: an acquisition file, and the truth about it in a separate file.
 
-The lab stands in for a real X-ray line whose truth is known: photons are sampled one energy class at a time, their light
-spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden system
+The lab stands in for a real X-ray line whose truth is known: photons are sampled one energy class at a time, their
+light spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden system
 (tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
 `--protocol calibration` can be judged on `--protocol set2` of the same seed.
 """

@@ -1,0 +1,150 @@
+"""Measured flats and darks -> a calibrated twin."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.setting import text_from_filters
+from ..errors import FitError
+from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
+from .photon_transfer import PhotonTransfer, compute_photon_transfer
+from .spectral_fit import fit_spectrum
+
+
+def calibrate_twin(
+    acquisition: AcquisitionFile,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> Twin:
+    """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
+
+    Args:
+        acquisition: open acquisition file; series held back for evaluation are not looked at.
+        rng: source of randomness of the posterior's draws.
+        progress: called with the name of each stage.
+        provenance: kept in the twin.
+
+    Raises:
+        InputError: the session cannot calibrate anything; the message says what is missing.
+    """
+    tell = progress or (lambda stage: None)
+    transfer = compute_photon_transfer(acquisition, progress=tell)
+    warnings = list(transfer.warnings)
+    evidence = dict(transfer.evidence)
+    spectral = None
+    if any(level.kV is not None for level in transfer.levels):
+        tell("spectrum")
+        if not any(level.rate_DN_per_mAs for level in transfer.levels if level.kV is not None):
+            warnings.append("no tube current or power in the flats: levels cannot be predicted, only gains")
+        if acquisition.instrument.pixel_mm is None or acquisition.instrument.source_detector_mm is None:
+            warnings.append(
+                "pixel pitch or source-detector distance unknown: the flux scale is not absolute (1 mm and 1 m assumed)"
+            )
+        voltages = {level.kV for level in transfer.levels if level.kV is not None}
+        beams = {(level.kV, level.filters) for level in transfer.levels if level.kV is not None}
+        if len(beams) == 1:
+            warnings.append(
+                "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or the"
+                " same kV with a known filter"
+            )
+        elif len(voltages) == 1:
+            warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
+        try:
+            fit = fit_spectrum(transfer.levels, acquisition.instrument, rng=rng)
+        except FitError as error:
+            warnings.append(f"no spectral part: {error}")
+        else:
+            spectral = fit.posterior
+            evidence["spectrum"] = {
+                "chi_square": fit.chi_square,
+                "data": fit.data,
+                "effective_draws": fit.effective_draws,
+                "undetermined": list(spectral.undetermined),
+                "prior": dict(spectral.prior),
+            }
+            if fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data):
+                warnings.append(
+                    f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data} data):"
+                    " check kV, filter and power of the series"
+                )
+    else:
+        warnings.append("no series states its kV: no spectral part, no prediction at other settings")
+    evidence["bad_pixels"] = bad_pixel_counts(transfer)
+    return Twin(
+        instrument=acquisition.instrument,
+        maps=transfer.maps,
+        noise=transfer.noise,
+        dark_DN=transfer.dark_DN,
+        levels=transfer.levels,
+        spectral=spectral,
+        evidence=evidence,
+        warnings=tuple(warnings),
+        provenance=provenance or {},
+    )
+
+
+def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
+    """Number of bad pixels by reason."""
+    return {
+        reason: int(np.count_nonzero(transfer.maps.bad_pixels == code))
+        for reason, code in BAD_PIXEL_CODES.items()
+        if code != 0
+    }
+
+
+def calibration_answer(twin: Twin) -> dict[str, Any]:
+    """The answer of `raytwin calibrate --json`."""
+
+    def plain(estimate: Estimate | None) -> dict[str, float] | None:
+        return None if estimate is None else estimate.as_dict()
+
+    spectral = twin.spectral
+    filtration = flux = None
+    warnings = list(twin.warnings)
+    if spectral is not None:
+        filtration = spectral.interval("inherent_filtration_mm_Al")
+        if any(level.rate_DN_per_mAs for level in twin.levels):
+            draws = np.exp(spectral.column("log_output"))
+            low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
+            flux = Estimate(value=float(middle), low=float(low), high=float(high))
+    if filtration is None:
+        warnings.append("inherent_filtration_mm_Al is null: the twin has no spectral part")
+    if flux is None:
+        warnings.append("flux_scale is null: it needs kV and tube load")
+    return {
+        "psf_sigma_px": plain(twin.noise.psf_sigma_px),
+        "psf_model": twin.noise.psf_model,
+        "read_noise_DN": plain(twin.noise.read_noise_DN),
+        "dark_DN": plain(twin.dark_DN),
+        "inherent_filtration_mm_Al": plain(filtration),
+        "flux_scale": plain(flux),
+        "levels": [
+            {
+                "kV": level.kV,
+                "filter": text_from_filters(level.filters),
+                "gain_DN": level.gain_DN.value,
+                "gain_DN_low": level.gain_DN.low,
+                "gain_DN_high": level.gain_DN.high,
+                "photon_transfer_slope_DN": level.photon_transfer_slope_DN.value,
+                "photon_transfer_slope_DN_low": level.photon_transfer_slope_DN.low,
+                "photon_transfer_slope_DN_high": level.photon_transfer_slope_DN.high,
+                "rate_DN_per_mAs": plain(level.rate_DN_per_mAs),
+                "saturation_DN": level.saturation_DN,
+                "series": list(level.series),
+            }
+            for level in twin.levels
+        ],
+        "bad_pixels": {
+            "count": int(np.count_nonzero(twin.maps.bad_pixels)),
+            "share_percent": 100.0 * float(np.mean(twin.maps.bad_pixels > 0)),
+            "reasons": twin.evidence.get("bad_pixels", {}),
+        },
+        "undetermined": list(spectral.undetermined) if spectral is not None else [],
+        "evidence": dict(twin.evidence),
+        "warnings": warnings,
+    }

@@ -1,0 +1,52 @@
+"""The paper's recipe for a noisy image, kept as the baseline that everything else is compared with.
+
+Its order and constants: one gain for both tube voltages, full noise on top of the reference's own, the Gaussian blur last
+and over signal, quantum noise and electronic noise alike, with the width of the noise autocovariance read as that of the
+blur.
+
+Source: Andriiashen et al., X-ray Image Generation as a Method of Performance Prediction for Real-Time Inspection, Eq. 5-6
+and the calibration section.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .psf import convolve_separable, sampled_gaussian_1d
+from .twin import Twin
+
+
+def published_parameters(twin: Twin) -> dict[str, float]:
+    """Gain (DN), read noise (DN) and blur (px) as the paper's calibration would have read them from the same flats.
+
+    The gain is the photon-transfer slope of the first level, for every level; the blur is the width of the
+    autocovariance, sqrt(2) times that of the optical spread.
+    """
+    return {
+        "gain_DN": twin.levels[0].photon_transfer_slope_DN.value,
+        "read_noise_DN": math.sqrt(twin.noise.read_variance_DN2),
+        "blur_px": math.sqrt(2.0) * twin.noise.psf_sigma_px.value,
+    }
+
+
+def sample_as_published(
+    signal_DN: NDArray[np.floating],
+    *,
+    gain_DN: float,
+    read_noise_DN: float,
+    blur_px: float,
+    dark_DN: NDArray[np.floating],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Counts (row, column) with dark, DN: (Poisson(I / g) g + N(dark, sigma_e)) convolved with a Gaussian.
+
+    Args:
+        signal_DN: mean above dark from the reference (row, column), DN.
+        gain_DN, read_noise_DN, blur_px: see `published_parameters`.
+        dark_DN: dark frame (row, column), DN.
+        rng: source of randomness.
+    """
+    quanta = rng.poisson(np.clip(signal_DN, 0.0, None) / gain_DN) * gain_DN
+    noisy = quanta + dark_DN + read_noise_DN * rng.standard_normal(signal_DN.shape)
+    return convolve_separable(noisy.astype(np.float32), sampled_gaussian_1d(blur_px, max(1, math.ceil(4 * blur_px))))

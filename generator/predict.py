@@ -1,0 +1,275 @@
+"""Flatfield of a twin at a setting, measured or not: mean, noise, gain, photons and dose, with 95 % intervals."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.setting import Setting
+from ..errors import InputError
+from .psf import blur_variance_share
+from .spectral_signal import OpenBeam, SpectralModel
+from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
+
+_MEASURED_REPRODUCIBILITY = 0.002  # of a level measured at this kV and filter: what a repeat would show
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """A flatfield, detector median, of the mean of `setting.averaged` frames.
+
+    Fields: mean_DN (above dark), sd_DN (temporal, one pixel), gain_DN (single frame), photons_absorbed (a pixel and
+    frame), air_kerma_uGy (a frame, at the object or, where its distance is unknown, at the detector); intervals are of
+    the quantity itself, without the sampling noise of a later measurement. None where the twin cannot say; extrapolated:
+    outside the calibrated range; warnings say why and what else to know.
+    """
+
+    setting: Setting
+    mean_DN: Estimate
+    sd_DN: Estimate
+    gain_DN: Estimate
+    photons_absorbed: Estimate | None
+    air_kerma_uGy: Estimate | None
+    extrapolated: bool
+    measured_level: bool
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The answer of `raytwin predict --json`."""
+
+        def plain(estimate: Estimate | None) -> dict[str, float] | None:
+            return None if estimate is None else estimate.as_dict()
+
+        return {
+            "setting": str(self.setting),
+            "mean_DN": plain(self.mean_DN),
+            "sd_DN": plain(self.sd_DN),
+            "gain_DN": plain(self.gain_DN),
+            "photons_absorbed": plain(self.photons_absorbed),
+            "air_kerma_uGy": plain(self.air_kerma_uGy),
+            "extrapolated": self.extrapolated,
+            "measured_level": self.measured_level,
+            "warnings": list(self.warnings),
+        }
+
+
+@lru_cache(maxsize=8)
+def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
+    anode, angle, model, inherent, scintillator, cover, counting, materials = key
+    return SpectralModel(
+        anode=anode,
+        anode_angle_deg=angle,
+        model=model,
+        inherent=inherent,
+        scintillator=scintillator,
+        cover=cover,
+        counting=counting,
+        filter_materials=materials,
+        highest_kV=highest_kV,
+    )
+
+
+def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel:
+    """The twin's spectral model; its tables are kept for the next call.
+
+    Raises:
+        InputError: the twin has no spectral part.
+    """
+    posterior = twin.spectral
+    if posterior is None:
+        raise InputError(
+            "twin",
+            received="a twin without spectral part",
+            expected="a twin calibrated from flats that state kV and tube load",
+            remedy="calibrate from series with kV, current_mA or power_W, and exposure_ms",
+        )
+    prefix = "log_mu_"
+    key = (
+        posterior.anode,
+        posterior.anode_angle_deg,
+        posterior.model,
+        posterior.inherent,
+        posterior.scintillator,
+        posterior.cover,
+        posterior.counting,
+        tuple(name.removeprefix(prefix) for name in posterior.names if name.startswith(prefix)),
+    )
+    return _cached_model(key, max(160.0, 20.0 * math.ceil(highest_kV / 20.0)))
+
+
+def slope_share(twin: Twin) -> float:
+    """Photon-transfer slope over gain: the share of the noise that the spread leaves in one pixel; no unit."""
+    share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    white = twin.noise.white_fraction
+    return (share + white) / (1.0 + white)
+
+
+def _slope_share_sd(twin: Twin) -> float:
+    sigma = twin.noise.psf_sigma_px
+    ends = [blur_variance_share(twin.noise.psf_model, value) for value in (sigma.low, sigma.high)]
+    return abs(ends[0] - ends[1]) / (2 * 1.959964)
+
+
+def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float, centre: float | None = None) -> Estimate:
+    """Median and 95 % interval of draws times a lognormal of `relative_sd`, by moments of the logarithm."""
+    logarithm = np.log(draws)
+    middle = float(np.median(logarithm)) if centre is None else math.log(centre)
+    low, high = np.quantile(logarithm, [0.025, 0.975])
+    below = math.hypot(middle - min(low, middle), 1.959964 * relative_sd)
+    above = math.hypot(max(high, middle) - middle, 1.959964 * relative_sd)
+    return Estimate(value=math.exp(middle), low=math.exp(middle - below), high=math.exp(middle + above))
+
+
+def _is_extrapolated(posterior: SpectralPosterior, setting: Setting) -> bool:
+    from ..acquisition.setting import filters_from_text
+
+    lowest, highest = posterior.calibrated_kV
+    if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
+        return True
+    stacks: list[dict[str, float]] = []
+    for text in posterior.calibrated_filters:
+        stack: dict[str, float] = {}
+        for layer in filters_from_text(text):
+            stack[layer.material] = stack.get(layer.material, 0.0) + layer.thickness_mm
+        stacks.append(stack)
+    wanted: dict[str, float] = {}
+    for layer in setting.filters:
+        wanted[layer.material] = wanted.get(layer.material, 0.0) + layer.thickness_mm
+    for material in {*wanted, *(name for stack in stacks for name in stack)}:
+        thicknesses = [stack.get(material, 0.0) for stack in stacks]
+        if not min(thicknesses) - 1e-9 <= wanted.get(material, 0.0) <= max(thicknesses) + 1e-9:
+            return True
+    return False
+
+
+def check_limits(twin: Twin, setting: Setting) -> None:
+    """Raise where the declared instrument cannot be set so.
+
+    Raises:
+        InputError: more power than the tube takes.
+    """
+    instrument = twin.instrument
+    current = setting.tube_current_mA
+    power = None if current is None else current * setting.kV
+    if power is not None and instrument.maximum_power_w is not None and power > 1.001 * instrument.maximum_power_w:
+        raise InputError(
+            "setting",
+            received=f"{power:.4g} W",
+            expected=f"at most the tube's {instrument.maximum_power_w:g} W",
+            remedy="lower the current or the tube voltage",
+        )
+
+
+def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
+    """Flatfield at a setting, with 95 % intervals.
+
+    At a kV and filter that was measured the measured level is scaled to the load; elsewhere the posterior of the spectral
+    parameters is projected and the calibration's discrepancies are added (doubled where it extrapolates).
+
+    Raises:
+        InputError: no tube load given, power above the tube's, or a twin that has neither this level nor a spectrum.
+    """
+    check_limits(twin, setting)
+    load = setting.tube_load_mAs
+    if load is None:
+        raise InputError(
+            "setting", received=str(setting), expected="a tube load", remedy="give --current-ma or --power-w"
+        )
+    warnings: list[str] = []
+    level = twin.level_at(setting)
+    posterior = twin.spectral
+    instrument = twin.instrument
+    if posterior is None and (level is None or level.rate_DN_per_mAs is None):
+        known = ", ".join(item.name for item in twin.levels)
+        raise InputError(
+            "setting",
+            received=str(setting),
+            expected=f"one of the measured levels with a known tube load ({known}), because this twin has no spectral part",
+            remedy="calibrate from flats that state kV and current or power",
+        )
+    distance = setting.source_detector_mm or instrument.source_detector_mm
+    if distance is None:
+        distance = level.source_detector_mm if level is not None and level.source_detector_mm else 1000.0
+        if posterior is not None:
+            warnings.append("source-detector distance unknown: 1 m assumed on both sides, so only ratios are meaningful")
+    pitch = instrument.pixel_mm
+    if pitch is None:
+        warnings.append("pixel pitch unknown: photon numbers are not absolute")
+    factor = (1000.0 / distance) ** 2 * (pitch or 1.0) ** 2
+
+    photons = kerma = None
+    extrapolated = False
+    if posterior is not None:
+        model = spectral_model_of(twin, highest_kV=setting.kV)
+        signal = model.signal(posterior.samples, OpenBeam(kV=setting.kV, filters=setting.filters))
+        extrapolated = _is_extrapolated(posterior, setting)
+        widen = 2.0 if extrapolated else 1.0
+        level_sd = widen * posterior.level_discrepancy
+        gain_sd = widen * posterior.gain_discrepancy
+        mean_frame = _estimate_from_draws(signal.rate_DN_per_mAs * load * factor, level_sd)
+        gain = _estimate_from_draws(signal.gain_DN, gain_sd)
+        photons = _estimate_from_draws(signal.absorbed_per_mAs * load * factor, level_sd)
+        at_object = instrument.source_object_mm
+        if setting.source_detector_mm is not None or at_object is None:
+            warnings.append("air kerma is given at the detector: the object's distance at this setting is unknown")
+            at_object = distance
+        kerma = _estimate_from_draws(signal.kerma_uGy_per_mAs * load * (1000.0 / at_object) ** 2, level_sd)
+    if level is not None and level.rate_DN_per_mAs is not None:
+        rate = level.rate_DN_per_mAs
+        relative = math.hypot((rate.high - rate.low) / (2 * 1.959964) / rate.value, _MEASURED_REPRODUCIBILITY)
+        there = level.source_detector_mm or distance
+        value = rate.value * load * (there / distance) ** 2
+        mean_frame = estimate_from_sd(value, relative * value)
+        gain = level.gain_DN
+    share = slope_share(twin)
+    share_relative_sd = _slope_share_sd(twin) / share
+    read = twin.noise.read_noise_DN
+    frames = setting.averaged
+    quantum = gain.value * share * mean_frame.value
+    variance = quantum + twin.noise.read_variance_DN2
+    sd = math.sqrt(variance / frames)
+    # ends of mean, gain, share and read noise added in quadrature; a measured level knows its slope directly
+    if level is not None:
+        slope = level.photon_transfer_slope_DN
+        quantum = slope.value * mean_frame.value
+        variance = quantum + twin.noise.read_variance_DN2
+        sd = math.sqrt(variance / frames)
+        noise_relative = [(slope.high - slope.low) / (2 * 1.959964) / slope.value]
+    else:
+        noise_relative = [_log_sd(gain), share_relative_sd]
+    quantum_relative = math.sqrt(sum(value**2 for value in [*noise_relative, _log_sd(mean_frame)]))
+    read_part = 2.0 * twin.noise.read_noise_DN.value * (read.high - read.low) / (2 * 1.959964)
+    variance_sd = math.hypot(quantum * quantum_relative, read_part)
+    sd_estimate = estimate_from_sd(sd, 0.5 * sd * variance_sd / variance if variance > 0 else 0.0, lowest=0.0)
+    if instrument.bits is not None:
+        room = 2.0**instrument.bits - 1 - twin.dark_DN.value
+        if mean_frame.value > room:
+            warnings.append(f"the detector saturates: {mean_frame.value:.4g} DN above dark, room for {room:.4g} DN")
+    if extrapolated:
+        warnings.append("outside the calibrated range of kV or filters: the interval rests on the spectral model")
+    return Prediction(
+        setting=setting,
+        mean_DN=mean_frame,
+        sd_DN=sd_estimate,
+        gain_DN=gain,
+        photons_absorbed=photons,
+        air_kerma_uGy=kerma,
+        extrapolated=extrapolated,
+        measured_level=level is not None,
+        warnings=tuple(warnings),
+    )
+
+
+def _log_sd(estimate: Estimate) -> float:
+    if estimate.low <= 0:
+        return (estimate.high - estimate.low) / (2 * 1.959964) / max(abs(estimate.value), 1e-300)
+    return math.log(estimate.high / estimate.low) / (2 * 1.959964)
+
+
+def predict_flatfields(twin: Twin, settings: Sequence[Setting]) -> tuple[Prediction, ...]:
+    """`predict_flatfield` for many settings."""
+    return tuple(predict_flatfield(twin, setting) for setting in settings)

@@ -1,0 +1,84 @@
+"""Calibrate a twin from measured flat and dark series.
+
+Works from any subset: without kV or instrument the twin has gain, noise and blur but no spectral part, and says so.
+Series whose role is `evaluation` are not looked at; `raytwin validate` compares with them.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from ._answer import answer, say
+
+EXAMPLE = """example:
+  raytwin lab -o session.h5 --protocol calibration --seed 1
+  raytwin calibrate session.h5 -o twin.h5
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `raytwin calibrate`."""
+    parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats and darks")
+    parser.add_argument("-o", "--output", metavar="TWIN", type=Path, required=True, help="twin file to write")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the posterior's draws (default 0)")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run `raytwin calibrate`."""
+    import numpy as np
+
+    from .. import __version__
+    from ..acquisition import open_acquisition
+    from ..calibration.calibrate import calibrate_twin, calibration_answer
+    from ..files import sha256_of_file
+    from ..generator.twin_io import write_twin
+
+    with open_acquisition(arguments.acquisition) as acquisition:
+        twin = calibrate_twin(
+            acquisition,
+            rng=np.random.default_rng(arguments.seed),
+            progress=_stage if sys.stderr.isatty() else None,
+            provenance={
+                "acquisition_sha256": sha256_of_file(arguments.acquisition),
+                "raytwin_version": __version__,
+                "seed": arguments.seed,
+            },
+        )
+    write_twin(arguments.output, twin)
+    result = calibration_answer(twin)
+    for warning in result["warnings"]:
+        say(f"warning: {warning}")
+    answer(result, as_json=arguments.json, text=_text(result, arguments.output))
+    return 0
+
+
+def _stage(name: str) -> None:
+    say(f"calibrating: {name}")
+
+
+def _interval(value: dict[str, float] | None, unit: str) -> str:
+    if value is None:
+        return "not known"
+    return f"{value['value']:.4g} ({value['low']:.4g} to {value['high']:.4g}){unit}"
+
+
+def _text(result: dict[str, Any], path: Path) -> str:
+    lines = [
+        f"dark                {_interval(result['dark_DN'], ' DN')}",
+        f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
+        f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['psf_model']})",
+        f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
+        f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
+        f"bad pixels          {result['bad_pixels']['count']} ({result['bad_pixels']['share_percent']:.3g} %)",
+    ]
+    for level in result["levels"]:
+        voltage = "unknown kV" if level["kV"] is None else f"{level['kV']:g} kV"
+        name = f"{voltage} {level['filter']}".strip()
+        lines.append(
+            f"gain, {name:<18} {level['gain_DN']:.4g} ({level['gain_DN_low']:.4g} to {level['gain_DN_high']:.4g}) DN,"
+            f" slope as measured {level['photon_transfer_slope_DN']:.4g} DN"
+        )
+    lines.append(f"twin written to {path}")
+    return "\n".join(lines)

@@ -1,0 +1,67 @@
+"""Predict the flatfield of a twin at a setting, measured or not, with 95 % intervals."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ._answer import answer, say
+
+EXAMPLE = """example:
+  raytwin predict twin.h5 --kv 60 --filter Cu:0.1 --power-w 30 --exposure-ms 20
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `raytwin predict`."""
+    parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
+    parser.add_argument("--kv", type=float, required=True, help="tube voltage, kV")
+    parser.add_argument("--filter", metavar="MATERIAL:mm", action="append", default=[], help="filter, repeatable")
+    load = parser.add_mutually_exclusive_group(required=True)
+    load.add_argument("--current-ma", type=float, help="tube current, mA")
+    load.add_argument("--power-w", type=float, help="tube power, W")
+    parser.add_argument("--exposure-ms", type=float, required=True, help="exposure of one frame, ms")
+    parser.add_argument("--averaged", type=int, default=1, help="frames averaged (default 1)")
+    parser.add_argument("--source-detector-mm", type=float, help="distance, where it differs from the calibration's")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run `raytwin predict`."""
+    from ..acquisition import Setting, filter_from_text
+    from ..generator.predict import predict_flatfield
+    from ..generator.twin_io import read_twin
+    from ..materials import material_from_name
+
+    setting = Setting(
+        kV=arguments.kv,
+        exposure_ms=arguments.exposure_ms,
+        current_mA=arguments.current_ma,
+        power_W=arguments.power_w,
+        filters=tuple(filter_from_text(text) for text in arguments.filter),
+        averaged=arguments.averaged,
+        source_detector_mm=arguments.source_detector_mm,
+    )
+    for layer in setting.filters:
+        material_from_name(layer.material)
+    result = predict_flatfield(read_twin(arguments.twin), setting).as_dict()
+    for warning in result["warnings"]:
+        say(f"warning: {warning}")
+    answer(result, as_json=arguments.json, text=_text(result))
+    return 0
+
+
+def _text(result: dict[str, Any]) -> str:
+    units = {
+        "mean_DN": "DN above dark",
+        "sd_DN": "DN",
+        "gain_DN": "DN",
+        "photons_absorbed": "photons a pixel and frame",
+        "air_kerma_uGy": "uGy a frame",
+    }
+    lines = [result["setting"]]
+    for name, unit in units.items():
+        value = result[name]
+        text = "not known" if value is None else f"{value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g}) {unit}"
+        lines.append(f"{name:<17} {text}")
+    lines.append(f"extrapolated      {'yes' if result['extrapolated'] else 'no'}")
+    return "\n".join(lines)

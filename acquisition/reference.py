@@ -1,0 +1,325 @@
+"""Import of a user's own reference images with masks -> a dataset file.
+
+Either an acquisition file whose object series pair up by scene, or a folder with a sidecar `raytwin.toml`. The sidecar
+describes raw series as for `images` ([[series]], [[scene]]), or images that are corrected already:
+
+    [pairs]
+    low = "low/*.tif"                     # the one * stands for the image; the same in all four
+    high = "high/*.tif"
+    foreign_object_mask = "bone/*.png"
+    product_mask = "product/*.png"        # optional: else where M_low > 0.1
+    values = "log"                        # log: -log(I/I0); transmission: I/I0
+    low_setting = "kv=40,power_w=40,exposure_ms=100,averaged=10,filter=Cu:0.05"
+    high_setting = "kv=90,power_w=45,exposure_ms=100,averaged=10,filter=Cu:0.05"
+    without_mask = "skip"                 # or "clean": an image without mask holds no foreign object
+    rows = "rows.csv"                     # optional; columns image, product, foreign_object, size_mm, contrast, split
+"""
+
+import csv
+import math
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileFormatError, InputError
+from ._image_files import number_or_nan, read_image, read_mask
+from ._sidecar import NAME, check_words, instrument_of, raw_layout_of, read_sidecar, starred, text_of
+from .acquisition_io import open_acquisition
+from .contrast import DILATIONS, PRODUCT_THRESHOLD, delta_r, dilations_for_pixel
+from .dataset_io import SPLITS, DatasetRow, write_dataset
+from .images import import_images
+from .import_report import ImportReport, Skipped
+from .pairs import dataset_from_acquisition, object_pairs, split_by_product
+from .setting import Setting, setting_from_text
+
+MINIMAL = "[pairs] low='low/*.tif' high='high/*.tif' foreign_object_mask='bone/*.png' low_setting=... high_setting=..."
+SMALLEST_TRANSMISSION = 1e-5
+
+_PAIR_WORDS = (
+    *("low", "high", "foreign_object_mask", "product_mask"),
+    *("values", "low_setting", "high_setting", "without_mask", "rows"),
+)
+
+
+def import_reference(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    sidecar: str | os.PathLike[str] | None = None,
+    low: Setting | None = None,
+    high: Setting | None = None,
+    each_frame: bool = False,
+    dilations: int | None = None,
+    validation: float | None = None,
+    test: float | None = None,
+    rng: np.random.Generator | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ImportReport:
+    """Turn reference images with masks into a dataset file.
+
+    Args:
+        source: an acquisition file, or a folder with a sidecar (see the module's text).
+        out: dataset file to write.
+        sidecar: TOML file; None = `raytwin.toml` in the folder.
+        low, high: settings of the pair, where an acquisition holds several.
+        each_frame: every frame of an acquisition makes an image; otherwise the frames of a series are averaged.
+        dilations: width of the ring (pixels) that contrasts are measured against; None = as wide as 21 pixels of
+            0.15 mm where the pixel size is known, else 21.
+        validation, test: shares of the products to put into these splits; None keeps the splits that are given.
+        rng: deals the products out to the splits; needed with `validation` or `test`.
+        progress: called with (pairs done, pairs in all).
+
+    Raises:
+        InputError: no sidecar, no pair, settings that do not fit, masks of another shape.
+    """
+    path = Path(source)
+    shares = None
+    if validation is not None or test is not None:
+        if rng is None:
+            raise InputError("rng", received="none", expected="a random generator to deal products out to splits")
+        shares = (validation or 0.0, test or 0.0, rng)
+    if path.is_file():
+        return _from_acquisition(
+            path, path, out, low, high, each_frame, dilations, shares, progress, skipped=(), notes=()
+        )
+    tables = read_sidecar(
+        path,
+        None if sidecar is None else Path(sidecar),
+        known=("instrument", "raw", "series", "scene", "pairs"),
+        minimal=MINIMAL,
+    )
+    if "pairs" in tables:
+        return _from_images(path, out, tables, dilations, shares, progress)
+    with tempfile.TemporaryDirectory(prefix="raytwin-") as folder:
+        # The frames take the way of every raw series; the acquisition is not needed afterwards.
+        step = Path(folder) / "acquisition.h5"
+        report = import_images(path, step, sidecar=sidecar)
+        return _from_acquisition(
+            path, step, out, low, high, each_frame, dilations, shares, progress, report.skipped, report.notes
+        )
+
+
+_Shares = tuple[float, float, np.random.Generator]
+
+
+def _from_acquisition(
+    source: Path,
+    path: Path,
+    out: str | os.PathLike[str],
+    low: Setting | None,
+    high: Setting | None,
+    each_frame: bool,
+    dilations: int | None,
+    shares: _Shares | None,
+    progress: Callable[[int, int], None] | None,
+    skipped: tuple[Skipped, ...],
+    notes: tuple[str, ...],
+) -> ImportReport:
+    with open_acquisition(path) as acquisition:
+        split = None
+        if shares is not None:
+            scenes = {pair.scene for pair in object_pairs(acquisition)} & set(acquisition.scenes)
+            products = {scene: acquisition.scenes[scene].product or scene for scene in sorted(scenes)}
+            split = split_by_product(products, validation=shares[0], test=shares[1], rng=shares[2])
+        summary = dataset_from_acquisition(
+            acquisition,
+            out,
+            low=low,
+            high=high,
+            split=split,
+            each_frame=each_frame,
+            dilations=_ring(dilations, acquisition.instrument.pixel_mm),
+            provenance={"source": source.name},
+            progress=progress,
+        )
+    return ImportReport(
+        layout="reference",
+        source=str(source),
+        written=str(out),
+        format="dataset",
+        read=tuple(
+            {"setting": setting, "images": summary.images, "with_foreign_object": summary.with_foreign_object}
+            for setting in summary.settings
+        ),
+        frames=summary.images,
+        skipped=(*skipped, *(Skipped(what=line.split(":", 1)[0], reason=_reason(line)) for line in summary.skipped)),
+        notes=(*notes, *summary.notes),
+    )
+
+
+def _reason(line: str) -> str:
+    return line.split(":", 1)[1].strip() if ":" in line else line
+
+
+def _ring(dilations: int | None, pixel_mm: float | None) -> int:
+    if dilations is not None:
+        return dilations
+    return DILATIONS if pixel_mm is None else dilations_for_pixel(pixel_mm)
+
+
+def _from_images(
+    folder: Path,
+    out: str | os.PathLike[str],
+    tables: Mapping[str, Any],
+    dilations: int | None,
+    shares: _Shares | None,
+    progress: Callable[[int, int], None] | None,
+) -> ImportReport:
+    where = f"{NAME}, [pairs]"
+    table = tables["pairs"]
+    if not isinstance(table, dict):
+        raise InputError(where, received="a list", expected="one table [pairs]")
+    check_words(table, _PAIR_WORDS, where=where)
+    for word in ("low", "high", "foreign_object_mask", "low_setting", "high_setting"):
+        if word not in table:
+            raise InputError(where, received=f"no {word}", expected=f"{word} = ...", remedy=f"at least: {MINIMAL}")
+    values = _choice(table, "values", ("log", "transmission"), where=where)
+    without_mask = _choice(table, "without_mask", ("skip", "clean"), where=where)
+    settings = tuple(
+        setting_from_text(text_of(table, word, where=where) or "") for word in ("low_setting", "high_setting")
+    )
+    if settings[0].kV >= settings[1].kV:
+        raise InputError(
+            where, received=f"{settings[0].kV:g} kV and {settings[1].kV:g} kV", expected="the lower tube voltage as low"
+        )
+    patterns = {
+        word: starred(folder, text_of(table, word, where=where) or "", where=f"{where}, {word}")
+        for word in ("low", "high", "foreign_object_mask", "product_mask")
+        if word in table
+    }
+    rows = _rows(folder, text_of(table, "rows", where=where), where=where)
+    skipped: list[Skipped] = []
+    names = []
+    for name in sorted(patterns["low"].keys() | patterns["high"].keys(), key=lambda text: (len(text), text)):
+        lacking = next((word for word in ("low", "high") if name not in patterns[word]), None)
+        if lacking is not None:
+            skipped.append(Skipped(what=f"image {name}", reason=f"no {lacking} image"))
+        elif name not in patterns["foreign_object_mask"] and without_mask == "skip":
+            skipped.append(Skipped(what=f"image {name}", reason="no foreign_object_mask (an empty one says: none)"))
+        else:
+            names.append(name)
+    if not names:
+        raise InputError(
+            str(folder),
+            received=f"no image pair with mask ({skipped[0].what}: {skipped[0].reason})" if skipped else "no images",
+            expected="files that match low, high and foreign_object_mask",
+        )
+    splits = {}
+    if shares is not None:
+        products = {name: rows.get(name, {}).get("product") or name for name in names}
+        splits = split_by_product(products, validation=shares[0], test=shares[1], rng=shares[2])
+    raw = raw_layout_of(tables, where=NAME)
+    ring = _ring(dilations, instrument_of(tables, where=NAME).pixel_mm)
+    notes: list[str] = []
+    counted = 0
+    shape: tuple[int, int] | None = None
+
+    def log_image(path: Path) -> NDArray[np.float32]:
+        image = np.asarray(read_image(path, raw=raw), dtype=np.float32)
+        if not bool(np.isfinite(image).all()):
+            raise FileFormatError(str(path), received="a value that is not finite", expected="finite values")
+        if shape is not None and image.shape != shape:
+            raise FileFormatError(str(path), received=f"shape {image.shape}", expected=f"shape {shape} as the others")
+        if values == "log":
+            return image
+        return np.asarray(-np.log(np.maximum(image, SMALLEST_TRANSMISSION)), dtype=np.float32)
+
+    first = log_image(patterns["low"][names[0]])
+    shape = (first.shape[0], first.shape[1])
+    with write_dataset(out, shape=shape, provenance={"source": folder.name, "values": values}) as writer:
+        for done, name in enumerate(names):
+            image = np.stack([log_image(patterns[word][name]) for word in ("low", "high")])
+            foreign = _mask(patterns["foreign_object_mask"].get(name), shape)
+            product = _mask(patterns.get("product_mask", {}).get(name), shape)
+            row = _row(name, rows.get(name, {}), image, foreign, ring, notes)
+            writer.append(
+                image=image,
+                foreign_object_mask=foreign,
+                product_mask=image[0] > PRODUCT_THRESHOLD if product is None else product,
+                row=replace(
+                    row, split=splits.get(name, row.split), setting=";".join(str(setting) for setting in settings)
+                ),
+            )
+            counted += bool(row.foreign_object)
+            if progress is not None:
+                progress(done + 1, len(names))
+    read = {"setting": ";".join(map(str, settings)), "images": len(names), "with_foreign_object": counted}
+    return ImportReport(
+        layout="reference",
+        source=str(folder),
+        written=str(out),
+        format="dataset",
+        read=(read,),
+        frames=len(names),
+        skipped=tuple(skipped),
+        notes=tuple(notes),
+    )
+
+
+def _choice(table: Mapping[str, Any], word: str, choices: tuple[str, ...], *, where: str) -> str:
+    value = text_of(table, word, where=where, default=choices[0]) or choices[0]
+    if value not in choices:
+        raise InputError(f"{where}, {word}", received=repr(value), expected="one of " + ", ".join(choices))
+    return value
+
+
+def _rows(folder: Path, name: str | None, *, where: str) -> dict[str, dict[str, str]]:
+    if name is None:
+        return {}
+    path = folder / name
+    if not path.is_file():
+        raise InputError(f"{where}, rows", received=name, expected="a csv file in the folder")
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        reader = csv.DictReader(stream, skipinitialspace=True)
+        if "image" not in (reader.fieldnames or []):
+            there = ", ".join(reader.fieldnames or []) or "none"
+            raise FileFormatError(str(path), received=f"columns {there}", expected="a column image among them")
+        return {row["image"]: row for row in reader}
+
+
+def _mask(path: Path | None, shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    if path is None:
+        return None
+    mask = read_mask(path)
+    if mask.shape != shape:
+        raise FileFormatError(
+            str(path),
+            received=f"a mask of {mask.shape[0]} x {mask.shape[1]} pixels",
+            expected=f"{shape[0]} x {shape[1]} as the images",
+            remedy="give masks on the image's own pixels",
+        )
+    return mask
+
+
+def _row(
+    name: str,
+    known: Mapping[str, str],
+    image: NDArray[np.float32],
+    foreign: NDArray[np.bool_] | None,
+    ring: int,
+    notes: list[str],
+) -> DatasetRow:
+    has_object = foreign is not None and bool(foreign.any())
+    contrast = number_or_nan(known.get("contrast"))
+    if has_object and foreign is not None and math.isnan(contrast):
+        try:
+            contrast = delta_r(image[0], image[1], foreign, dilations=ring)
+        except InputError as error:
+            notes.append(f"image {name}: no contrast ({error})")
+    split = known.get("split") or "test"
+    if split not in SPLITS:
+        raise InputError(f"split of image {name}", received=repr(split), expected="one of " + ", ".join(SPLITS))
+    return DatasetRow(
+        image=name,
+        product=known.get("product") or name,
+        foreign_object=(known.get("foreign_object") or "unnamed") if has_object else "",
+        size_mm=number_or_nan(known.get("size_mm")) if has_object else math.nan,
+        contrast=contrast if has_object else math.nan,
+        split=split,
+    )

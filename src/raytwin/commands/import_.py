@@ -1,0 +1,170 @@
+"""Turn other file layouts into an acquisition file or a dataset file.
+
+images    a folder of TIFF, PNG or raw images, described by a sidecar raytwin.toml in it   -> acquisition
+nxtomo    a NeXus NXtomo file: flats, darks and projections told apart by image_key        -> acquisition
+emva1288  a set with EMVA1288_Data.txt and the images it lists                             -> acquisition
+zenodo    the paper's data, 10.5281/zenodo.10579608: processed images                      -> dataset
+          its raw sessions or its calibration flats                                        -> acquisition
+reference your own dual-energy images with masks, or an acquisition with scenes            -> dataset
+
+`raytwin import LAYOUT --help` says more of each.
+"""
+
+import argparse
+import importlib
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from ..errors import InputError
+from ._answer import answer, say
+
+EXAMPLE = """examples:
+  raytwin import emva1288 measured/emva_ccd -o ccd.h5
+  raytwin import nxtomo scan.nxs -o scan.h5
+  raytwin import images session/ -o session.h5
+  raytwin import zenodo Submission --select "Dataset #1" -o set1.h5
+  raytwin import reference session.h5 -o reference.h5 --low kv=40,exposure_ms=100 --high kv=90,exposure_ms=100"""
+
+_LAYOUTS = {
+    "images": "a folder of TIFF, PNG or raw images with a sidecar",
+    "nxtomo": "a NeXus NXtomo file",
+    "emva1288": "a folder with EMVA1288_Data.txt",
+    "zenodo": "the paper's data: processed images, a raw session or calibration flats",
+    "reference": "dual-energy images with masks: a folder with a sidecar, or an acquisition file",
+}
+_SHOWN = 12
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    layouts = parser.add_subparsers(dest="layout", metavar="LAYOUT", required=True)
+    for name, line in _LAYOUTS.items():
+        layout = layouts.add_parser(
+            name,
+            help=line,
+            description=importlib.import_module(f"..acquisition.{name}", __package__).__doc__,
+            epilog="example:\n" + next(text for text in EXAMPLE.splitlines() if f"import {name}" in text),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        layout.add_argument("source", metavar="SOURCE", help=line)
+        layout.add_argument("-o", "--out", metavar="OUT", required=True, help="file to write (HDF5)")
+        layout.add_argument("--json", action="store_true", help="print the account as JSON")
+        if name in ("images", "reference"):
+            layout.add_argument("--sidecar", metavar="TOML", help="sidecar (default: raytwin.toml in the folder)")
+        if name == "nxtomo":
+            layout.add_argument("--detector", metavar="NAME", help="detector group, where several hold frames")
+        if name == "zenodo":
+            layout.add_argument("--select", metavar="TEXT", help="only folders whose path holds this text")
+            layout.add_argument("--kv", type=float, metavar="KV", help="tube voltage of calibration flats (kV)")
+            layout.add_argument("--exposure-ms", type=float, metavar="T", help="exposure of calibration flats (ms)")
+        if name == "reference":
+            layout.add_argument("--low", metavar="SETTING", help="low-kV setting, where there are several")
+            layout.add_argument("--high", metavar="SETTING", help="high-kV setting")
+            layout.add_argument(
+                "--each-frame", action="store_true", help="each frame is an image (default: their mean)"
+            )
+            layout.add_argument("--ring-px", type=int, metavar="N", help="ring that contrasts are measured against")
+            layout.add_argument(
+                "--validation", type=float, metavar="SHARE", help="share of the products for validation"
+            )
+            layout.add_argument("--test", type=float, metavar="SHARE", help="share of products for testing")
+            layout.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the split (default 0)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ..acquisition import open_acquisition
+
+    report = _import(arguments)
+    notes = list(report.notes)
+    if report.format == "acquisition":
+        with open_acquisition(report.written) as acquisition:
+            notes += [line for line in acquisition.missing if line not in notes]
+    for skipped in report.skipped[:_SHOWN]:
+        say(f"skipped {skipped.what}: {skipped.reason}")
+    if len(report.skipped) > _SHOWN:
+        say(f"skipped {len(report.skipped) - _SHOWN} more (all of them with --json)")
+    result: dict[str, Any] = asdict(report) | {"notes": notes}
+    answer(result, as_json=arguments.json, text=_text(result))
+    return 0
+
+
+def _import(arguments: argparse.Namespace) -> Any:
+    source, out = arguments.source, arguments.out
+    if arguments.layout == "images":
+        from ..acquisition.images import import_images
+
+        return import_images(source, out, sidecar=arguments.sidecar)
+    if arguments.layout == "nxtomo":
+        from ..acquisition.nxtomo import import_nxtomo
+
+        return import_nxtomo(source, out, detector=arguments.detector)
+    if arguments.layout == "emva1288":
+        from ..acquisition.emva1288 import import_emva1288
+
+        return import_emva1288(source, out)
+    with _Bar() as progress:
+        if arguments.layout == "zenodo":
+            from ..acquisition.zenodo import import_zenodo
+
+            return import_zenodo(
+                source,
+                out,
+                select=arguments.select,
+                kV=_positive(arguments.kv, "--kv", "kV"),
+                exposure_ms=_positive(arguments.exposure_ms, "--exposure-ms", "ms"),
+                progress=progress,
+            )
+        import numpy as np
+
+        from ..acquisition import setting_from_text
+        from ..acquisition.reference import import_reference
+
+        return import_reference(
+            source,
+            out,
+            sidecar=arguments.sidecar,
+            low=None if arguments.low is None else setting_from_text(arguments.low),
+            high=None if arguments.high is None else setting_from_text(arguments.high),
+            each_frame=arguments.each_frame,
+            dilations=arguments.ring_px,
+            validation=arguments.validation,
+            test=arguments.test,
+            rng=np.random.default_rng(arguments.seed),
+            progress=progress,
+        )
+
+
+def _positive(value: float | None, name: str, unit: str) -> float | None:
+    if value is not None and not 0 < value < float("inf"):
+        raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
+    return value
+
+
+class _Bar:
+    """A progress bar on a terminal, nothing elsewhere."""
+
+    def __enter__(self) -> Callable[[int, int], None]:
+        from tqdm import tqdm
+
+        self._tqdm: Any = tqdm(unit="image", disable=None, leave=False)
+        return self._step
+
+    def _step(self, done: int, total: int) -> None:
+        self._tqdm.total = total
+        self._tqdm.update(done - self._tqdm.n)
+
+    def __exit__(self, *_: object) -> None:
+        self._tqdm.close()
+
+
+def _text(result: dict[str, Any]) -> str:
+    read = result["read"]
+    lines = [f"{result['written']}: {result['format']} file, {result['frames']} frames from {result['source']}"]
+    for entry in read[:_SHOWN]:
+        words = [f"{key} {value}" for key, value in entry.items() if value not in (None, "", ())]
+        lines.append("  " + ", ".join(words))
+    if len(read) > _SHOWN:
+        lines.append(f"  and {len(read) - _SHOWN} more (all of them with --json)")
+    lines.append(f"skipped: {len(result['skipped'])}")
+    lines += [f"note: {note}" for note in result["notes"]]
+    return "\n".join(lines)

@@ -18,6 +18,12 @@ FloatArray = NDArray[np.float64]
 MINIMUM_ENERGY_KEV = 1.0
 MAXIMUM_ENERGY_KEV = 500.0
 
+_ELECTRON_MASS_KEV = 510.99895
+# Gauss-Legendre nodes over the cosine of the Compton angle; the integrand is smooth.
+_COMPTON_DIRECTIONS = 48
+# xraylib numbers its lines downwards, K lines first; this is the last of the L3 lines.
+_LAST_L_LINE = -113
+
 # Longer energy arrays are looked up afresh: keeping them would cost more memory than it saves time.
 _KEPT_ENERGIES = 4096
 
@@ -39,10 +45,28 @@ def _xraylib_photoelectric(number: int, energies_keV: FloatArray) -> FloatArray:
     return _row(xraylib_np.CS_Photo(np.array([number]), energies_keV))
 
 
-def _xraylib_energy(number: int, energies_keV: FloatArray) -> FloatArray:
+def _energy_absorption(number: int, energies_keV: FloatArray) -> FloatArray:
+    """mu_en/rho of an element from its parts; xraylib's own CS_Energy is up to 34 % low for air from 11 to 60 keV."""
+    import xraylib
     import xraylib_np
 
-    return _row(xraylib_np.CS_Energy(np.array([number]), energies_keV))
+    element = np.array([number])
+    absorbed = _row(xraylib_np.CS_Photo(element, energies_keV))
+    lines = {}
+    for line in range(xraylib.KL1_LINE, _LAST_L_LINE - 1, -1):
+        try:
+            lines[line] = float(xraylib.LineEnergy(number, line))
+        except ValueError:
+            continue  # this element has no such line
+    if lines:
+        produced = xraylib_np.CS_FluorLine_Kissel_Cascade(element, np.array(list(lines)), energies_keV)
+        produced_cm2_g = np.asarray(produced, dtype=float).reshape(len(lines), -1)
+        absorbed = absorbed - np.array(list(lines.values())) @ produced_cm2_g / energies_keV
+    cosines, weights = np.polynomial.legendre.leggauss(_COMPTON_DIRECTIONS)
+    scattered = np.asarray(xraylib_np.DCS_Compt(element, energies_keV, np.arccos(cosines)), dtype=float)
+    kept_share = 1.0 - 1.0 / (1.0 + energies_keV[:, None] / _ELECTRON_MASS_KEV * (1.0 - cosines))
+    compton = 2.0 * np.pi * (scattered.reshape(energies_keV.size, -1) * kept_share) @ weights
+    return np.asarray(absorbed + compton, dtype=float)
 
 
 def _chantler_total(number: int, energies_keV: FloatArray) -> FloatArray:
@@ -68,7 +92,7 @@ TABLES: Mapping[str, Callable[[int, FloatArray], FloatArray]] = {
 }
 _OTHER_TABLES: Mapping[str, Callable[[int, FloatArray], FloatArray]] = {
     "photoelectric": _xraylib_photoelectric,
-    "energy absorption": _xraylib_energy,
+    "energy absorption": _energy_absorption,
 }
 
 
@@ -141,12 +165,27 @@ def mass_photoelectric_cm2_g(material: Material, energy_keV: ArrayLike) -> Float
 
 
 def mass_energy_absorption_cm2_g(material: Material, energy_keV: ArrayLike) -> FloatArray:
-    """Mass energy-absorption coefficient mu_en/rho in cm2/g (xraylib CS_Energy, mixture rule), 1 to 500 keV.
+    """Mass energy-absorption coefficient mu_en/rho in cm2/g.
+
+    mu_en/rho = tau/rho - sum_j sigma_j E_j / E + int (d sigma_C / d Omega) (1 - E'/E) d Omega: photoelectric absorption
+    less the energy of the K and L fluorescence it leads to (with cascades), plus what Compton electrons receive
+    (bound electrons: Klein-Nishina times the incoherent scattering function). Bremsstrahlung of the electrons is left
+    out: below 0.1 % in air to 300 keV, 2 % in lead at 200 keV.
+
+    Args:
+        material: what absorbs.
+        energy_keV: photon energies, any shape, 1 to 500 keV.
+
+    Returns:
+        Array of the shape of `energy_keV`.
 
     Raises:
         InputError: an energy outside 1-500 keV.
 
-    Source: Hubbell and Seltzer, NISTIR 5632 (2004).
+    Source: Seltzer (1993), Radiat Res 136:147, eqs. 2-6; cross sections of xraylib. (xraylib's own CS_Energy is a
+        spline through too few points: 34 % low for air at 20 keV.)
+    Checked against: NIST (NISTIR 5632) for air, carbon and aluminium, 0.5 %; copper, 2.5 %
+        (tests/test_materials_attenuation.py).
     """
     return _summed(material, energy_keV, "energy absorption")
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from ..materials import (
     mu_per_mm,
     transmission,
 )
-from .grid import BIN_WIDTH_KEV
+from .grid import BIN_WIDTH_KEV, energy_grid_keV
 
 FloatArray = NDArray[np.float64]
 
@@ -91,7 +92,17 @@ def fluence_per_cm2_mAs(spectrum: Spectrum) -> float:
 
 
 def _air_kerma_weights(energies_keV: FloatArray) -> FloatArray:
+    whole = _air_kerma_weights_of_grid()
+    if np.array_equal(energies_keV, energy_grid_keV()[: energies_keV.size]):
+        return whole[: energies_keV.size]
     return energies_keV * mass_energy_absorption_cm2_g(material_from_name("air"), energies_keV)
+
+
+@lru_cache(maxsize=1)
+def _air_kerma_weights_of_grid() -> FloatArray:
+    # once for every kV: this coefficient takes some tenths of a second to tabulate
+    grid = energy_grid_keV()
+    return grid * mass_energy_absorption_cm2_g(material_from_name("air"), grid)
 
 
 def air_kerma_uGy_per_mAs(spectrum: Spectrum) -> float:

@@ -28,6 +28,8 @@ DEFAULT_MODEL = "casim"
 
 # Line yields rise as (kV / edge - 1) to about this power, so their root is nearly straight in kV.
 _YIELD_POWER = 1.65
+# Bremsstrahlung falls to zero at the end point as about this power of (kV - E).
+_TIP_POWER = 0.9
 # Bins below the first share of the kV are interpolated at fixed energy, above the second at fixed energy / kV.
 _FIXED_ENERGY_BELOW = 0.8
 _FIXED_SHARE_ABOVE = 0.9
@@ -126,28 +128,36 @@ def tube_fluence_interpolated(
         whole, lines = _tube_node(*tube, below)
         return _filled(whole + lines, energies.size)
     weights = {node: weight for node, weight in _cubic_weights(below, share, anode).items() if weight != 0.0}
-    bins = energy_grid_keV(kV).size
-    grid = energy_grid_keV()[:bins]
+    nodes = sorted(weights)
+    grid = energy_grid_keV(kV)
+    bins = grid.size
+    relative = grid / kV
+    tip = int((relative > _FIXED_ENERGY_BELOW).argmax())
     fixed_energy = np.zeros(bins)
     fixed_share = np.zeros(bins)
-    roots = np.zeros(bins)
-    tip = (grid / kV > _FIXED_ENERGY_BELOW).argmax()
-    for node, weight in weights.items():
+    roots = np.zeros((len(nodes), bins))
+    end = 0.0
+    for row, node in enumerate(nodes):
         bremsstrahlung, _ = _tube_node(*tube, node)
-        used = min(bins, energy_grid_keV(node).size)
-        fixed_energy[:used] += weight * bremsstrahlung[:used]
-        roots[:used] += weight * _line_roots(*tube, node)[:used]
-        known = energy_grid_keV(node).size
-        energies_of_node = np.append(energy_grid_keV()[:known], node)
-        values_of_node = np.append(bremsstrahlung[:known], 0.0)
-        fixed_share[tip:] += weight * np.interp(grid[tip:] * (node / kV), energies_of_node, values_of_node, right=0.0)
-    # the bin of the end point: the mean of a straight line to zero at kV, instead of its value at the centre
-    low_edge = grid[-1] - 0.5 * BIN_WIDTH_KEV
-    slope = fixed_share[-2] / (kV - grid[-2])
-    fixed_share[-1] = slope * (kV - low_edge) ** 2 / (2.0 * BIN_WIDTH_KEV)
-    blend = np.clip((grid / kV - _FIXED_ENERGY_BELOW) / (_FIXED_SHARE_ABOVE - _FIXED_ENERGY_BELOW), 0.0, 1.0)
+        used = min(bins, bremsstrahlung.size)
+        fixed_energy[:used] += weights[node] * bremsstrahlung[:used]
+        roots[row, :used] = _line_roots(*tube, node)[:used]
+        centres = energy_grid_keV(float(node))
+        straightened = np.interp(relative[tip:] * node, centres, _straightened(*tube, node))
+        height = weights[node] * (node / kV) ** _TIP_POWER * straightened
+        fixed_share[tip:] += height * np.clip(kV - grid[tip:], 0.0, None) ** _TIP_POWER
+        end += float(height[-1])
+    # the bin that holds the end point: its centre's value when it is full, falling with the share that the beam fills
+    covered = (kV - (grid[-1] - 0.5 * BIN_WIDTH_KEV)) / BIN_WIDTH_KEV
+    fixed_share[-1] = end * (0.5 * BIN_WIDTH_KEV) ** _TIP_POWER * covered ** (_TIP_POWER + 1.0)
+    blend = np.clip((relative - _FIXED_ENERGY_BELOW) / (_FIXED_SHARE_ABOVE - _FIXED_ENERGY_BELOW), 0.0, 1.0)
     blend = blend * blend * (3.0 - 2.0 * blend)
-    fluence = (1.0 - blend) * fixed_energy + blend * fixed_share + np.clip(roots, 0.0, None) ** _YIELD_POWER
+    # below the edge there is no yield: its root goes on straight there, so that the curve starts at the edge itself
+    for row in range(len(nodes) - 3, -1, -1):
+        silent = (roots[row] == 0.0) & (roots[row + 1] != 0.0)
+        roots[row, silent] = 2.0 * roots[row + 1, silent] - roots[row + 2, silent]
+    yields = np.clip(np.array([weights[node] for node in nodes]) @ roots, 0.0, None) ** _YIELD_POWER
+    fluence = (1.0 - blend) * fixed_energy + blend * fixed_share + yields
     return _filled(np.clip(fluence, 0.0, None), energies.size)
 
 
@@ -201,6 +211,12 @@ def _tube_node(anode: str, anode_angle_deg: float, model: str, kV: int) -> Float
 @lru_cache(maxsize=2048)
 def _line_roots(anode: str, anode_angle_deg: float, model: str, kV: int) -> FloatArray:
     return np.asarray(_tube_node(anode, anode_angle_deg, model, kV)[1] ** (1.0 / _YIELD_POWER), dtype=float)
+
+
+@lru_cache(maxsize=2048)
+def _straightened(anode: str, anode_angle_deg: float, model: str, kV: int) -> FloatArray:
+    bremsstrahlung = _tube_node(anode, anode_angle_deg, model, kV)[0]
+    return np.asarray(bremsstrahlung / (kV - energy_grid_keV(float(kV))) ** _TIP_POWER, dtype=float)
 
 
 def _spekpy_fluence(anode: str, anode_angle_deg: float, model: str, kV: int) -> FloatArray:

@@ -1,0 +1,136 @@
+"""Generate dual-energy images at a setting from low-noise reference images: only the noise they lack is added.
+
+REFERENCE is a dataset file, or an acquisition whose object series pair up by scene. The target has the kV and filter of
+the references and less tube load; current, exposure and averaging are free.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from ._answer import answer, say
+
+EXAMPLE = """example:
+  raytwin generate twin.h5 references.h5 -n 200 --seed 1 -o train_20ms.h5 \\
+    --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `raytwin generate`."""
+    parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
+    parser.add_argument("reference", metavar="REFERENCE", type=Path, help="dataset or acquisition with references")
+    parser.add_argument("--low", metavar="SETTING", required=True, help="target setting at the low kV")
+    parser.add_argument("--high", metavar="SETTING", required=True, help="target setting at the high kV")
+    parser.add_argument("-n", "--images", type=int, required=True, help="number of image pairs")
+    parser.add_argument("--seed", type=int, required=True, help="same seed, same bytes")
+    parser.add_argument("-o", "--output", metavar="DATASET", type=Path, required=True, help="dataset file to write")
+    parser.add_argument("--recipe", choices=("raytwin", "as_published"), default="raytwin", help="noise recipe")
+    parser.add_argument("--split", choices=("train", "val", "test"), help="use references of this split only")
+    parser.add_argument("--product-material", default="chicken_breast", help="what hardens the beam (noise gain)")
+    parser.add_argument("--reference-low", metavar="SETTING", help="setting of the references where they do not say")
+    parser.add_argument("--reference-high", metavar="SETTING", help="the same at the high kV")
+    parser.add_argument("--no-counts", action="store_true", help="leave out the raw counts")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run `raytwin generate`."""
+    from ..acquisition import open_acquisition, read_dataset, setting_from_text
+    from ..acquisition.pairs import dataset_from_acquisition
+    from ..errors import FileFormatError, InputError
+    from ..files import sha256_of_file
+    from ..generator.generate import generate_dataset
+    from ..generator.twin_io import read_twin
+    from ..materials import material_from_name
+
+    twin = read_twin(arguments.twin)
+    low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
+    material_from_name(arguments.product_material)
+    if (arguments.reference_low is None) != (arguments.reference_high is None):
+        raise InputError(
+            "--reference-low and --reference-high", received="one of the two", expected="both or neither"
+        )
+    fallback = None
+    if arguments.reference_low is not None:
+        fallback = (setting_from_text(arguments.reference_low), setting_from_text(arguments.reference_high))
+    with tempfile.TemporaryDirectory() as scratch:
+        reference_path = arguments.reference
+        try:
+            read_dataset(reference_path).close()
+        except FileFormatError:
+            try:
+                acquisition = open_acquisition(arguments.reference)
+            except FileFormatError as error:
+                raise FileFormatError(
+                    str(arguments.reference),
+                    received=error.received,
+                    expected="a raytwin-dataset or raytwin-acquisition file",
+                ) from None
+            with acquisition:
+                reference_path = Path(scratch) / "reference.h5"
+                longest = _longest_pair(acquisition)
+                bad = twin.maps.bad_pixels > 0
+                dataset_from_acquisition(
+                    acquisition,
+                    reference_path,
+                    low=longest[0],
+                    high=longest[1],
+                    with_counts=False,
+                    bad_pixels=bad if bad.shape == longest[2] else None,
+                )
+        with read_dataset(reference_path) as reference:
+            bar = _bar(arguments.images)
+            summary = generate_dataset(
+                twin,
+                reference,
+                arguments.output,
+                low=low,
+                high=high,
+                images=arguments.images,
+                seed=arguments.seed,
+                recipe=arguments.recipe,
+                product_material=arguments.product_material,
+                split=arguments.split,
+                with_counts=not arguments.no_counts,
+                reference_setting=fallback,
+                twin_sha256=sha256_of_file(arguments.twin),
+                progress=lambda done: bar.update(done - bar.n),
+            )
+            bar.close()
+    result = summary.as_dict()
+    for warning in result["warnings"]:
+        say(f"warning: {warning}")
+    answer(result, as_json=arguments.json, text=_text(result, arguments.output))
+    return 0
+
+
+def _longest_pair(acquisition: Any) -> tuple[Any, Any, tuple[int, int]]:
+    from ..acquisition.pairs import object_pairs
+    from ..errors import InputError
+
+    pairs = object_pairs(acquisition)
+    if not pairs:
+        raise InputError(
+            acquisition.path, received="no object series that pair up by scene", expected="scenes measured at two kV"
+        )
+    best = max(pairs, key=lambda pair: pair.seconds)
+    low, high = best.settings
+    return low, high, best.low.shape
+
+
+def _bar(total: int) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(total=total, unit="pair", desc="generating", disable=None, file=sys.stderr)
+
+
+def _text(result: dict[str, Any], path: Path) -> str:
+    return (
+        f"{result['images']} image pairs ({result['with_foreign_object']} with a foreign object) from"
+        f" {result['references']} references at {result['setting']}\n"
+        f"seed {result['seed']}, recipe {result['recipe']}, SHA-256 {result['hashes']['dataset_sha256']}\n"
+        f"dataset written to {path}"
+    )

@@ -1,6 +1,6 @@
 """Attenuation and energy absorption of materials, by energy."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +13,7 @@ from .library import Library, library_from_files, material_from_name
 from .material import Material, atomic_number_from_symbol
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 # The common range of the tables; each table's own limits are checked on top.
 MINIMUM_ENERGY_KEV = 1.0
@@ -23,6 +24,8 @@ _ELECTRON_MASS_KEV = 510.99895
 _COMPTON_DIRECTIONS = 48
 # xraylib numbers its lines downwards, K lines first; this is the last of the L3 lines.
 _LAST_L_LINE = -113
+
+_ENERGIES_INSIDE_A_BIN = 25
 
 # Longer energy arrays are looked up afresh: keeping them would cost more memory than it saves time.
 _KEPT_ENERGIES = 4096
@@ -200,7 +203,12 @@ def mu_per_mm(material: Material, energy_keV: ArrayLike, *, table: str = "xrayli
 
 
 def transmission(
-    filters: Sequence[Filter], energy_keV: ArrayLike, *, table: str = "xraylib", library: Library | None = None
+    filters: Sequence[Filter],
+    energy_keV: ArrayLike,
+    *,
+    table: str = "xraylib",
+    library: Library | None = None,
+    bin_width_keV: float = 0.0,
 ) -> FloatArray:
     """Fraction of photons (0 to 1) that cross all layers without interacting: exp(-sum_i mu_i t_i).
 
@@ -211,6 +219,8 @@ def transmission(
         energy_keV: photon energies, any shape, 1 to 500 keV.
         table: see `mass_attenuation_cm2_g`.
         library: where the names are looked up; None: as `material_from_name`.
+        bin_width_keV: energies are the centres of bins this wide, and a bin that an absorption edge of a layer cuts
+            gets the mean over the bin instead of the value on one side of the edge; 0: the value at the energy.
 
     Returns:
         Array of the shape of `energy_keV`.
@@ -218,7 +228,53 @@ def transmission(
     Raises:
         InputError: an unknown material, an energy outside 1-500 keV, or an unknown table.
     """
-    return np.exp(-optical_depth(filters, energy_keV, table=table, library=library))
+    passed = np.exp(-optical_depth(filters, energy_keV, table=table, library=library))
+    if bin_width_keV > 0:
+        energies = np.asarray(energy_keV, dtype=float)
+        look_up = library_from_files() if library is None else library
+        materials = [material_from_name(layer.material, library=look_up) for layer in filters]
+        cut = bins_cut_by_edges(materials, energies, bin_width_keV=bin_width_keV)
+        if np.any(cut):
+            inside = energies_inside_bins(energies[cut], bin_width_keV=bin_width_keV)
+            depth = optical_depth(filters, inside, table=table, library=library)
+            passed[cut] = np.exp(-depth).mean(axis=-1)
+    return passed
+
+
+def absorption_edges_keV(material: Material) -> FloatArray:
+    """K and L absorption edges in keV above 1 keV of a material's elements, rising."""
+    edges = [edge for symbol in material.mass_fractions for edge in _element_edges(atomic_number_from_symbol(symbol))]
+    return np.unique(np.array(edges, dtype=float))
+
+
+@lru_cache(maxsize=128)
+def _element_edges(number: int) -> tuple[float, ...]:
+    import xraylib
+
+    edges = []
+    for shell in (xraylib.K_SHELL, xraylib.L1_SHELL, xraylib.L2_SHELL, xraylib.L3_SHELL):
+        try:
+            edges.append(float(xraylib.EdgeEnergy(number, shell)))
+        except ValueError:
+            continue  # light elements have no L edges in the table
+    return tuple(edge for edge in edges if edge > MINIMUM_ENERGY_KEV)
+
+
+def bins_cut_by_edges(materials: Iterable[Material], energy_keV: ArrayLike, *, bin_width_keV: float) -> BoolArray:
+    """True where the bin around an energy (any shape, keV) holds an absorption edge of one of the materials."""
+    energies = np.asarray(energy_keV, dtype=float)
+    cut = np.zeros(energies.shape, dtype=bool)
+    for material in materials:
+        for edge in absorption_edges_keV(material):
+            cut |= np.abs(energies - edge) < 0.5 * bin_width_keV
+    return cut
+
+
+def energies_inside_bins(energy_keV: ArrayLike, *, bin_width_keV: float) -> FloatArray:
+    """Energies (..., 25) in keV spread evenly over bins with these centres (...), for means over a bin."""
+    offsets = (np.arange(_ENERGIES_INSIDE_A_BIN) + 0.5) / _ENERGIES_INSIDE_A_BIN - 0.5
+    inside = np.asarray(energy_keV, dtype=float)[..., None] + bin_width_keV * offsets
+    return np.clip(inside, MINIMUM_ENERGY_KEV, MAXIMUM_ENERGY_KEV)
 
 
 def optical_depth(

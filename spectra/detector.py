@@ -12,11 +12,14 @@ from ..materials import (
     Library,
     Material,
     atomic_number_from_symbol,
+    bins_cut_by_edges,
+    energies_inside_bins,
     mass_photoelectric_cm2_g,
     material_from_name,
     mu_per_mm,
     transmission,
 )
+from .grid import BIN_WIDTH_KEV, energy_grid_keV
 
 FloatArray = NDArray[np.float64]
 
@@ -67,6 +70,7 @@ def detector_response(
     escape: bool = True,
     table: str = "xraylib",
     library: Library | None = None,
+    bin_width_keV: float | None = None,
 ) -> Response:
     """Moments of the energy (keV, keV2) that a photon of each energy leaves in the detector.
 
@@ -89,6 +93,8 @@ def detector_response(
         escape: False leaves the K-fluorescence out.
         table: attenuation table.
         library: where the names are looked up.
+        bin_width_keV: energies are the centres of bins this wide, and a bin that an absorption edge cuts gets the mean
+            over the bin; 0: values at the energies; None: the bin width where the energies are the common grid, else 0.
 
     Raises:
         InputError: no sensitive layer, an unknown material or table, an energy outside 1-500 keV.
@@ -101,26 +107,18 @@ def detector_response(
             expected="at least one layer of more than 0 mm",
             remedy="for example CsI:0.5",
         )
-    reaching = transmission(cover, energies, table=table, library=library)
-    interacting = np.zeros(energies.shape)
-    mean = np.zeros(energies.shape)
-    mean_square = np.zeros(energies.shape)
-    for layer in scintillator:
-        material = material_from_name(layer.material, library=library)
-        passed = np.exp(-mu_per_mm(material, energies, table=table) * layer.thickness_mm)
-        share = reaching * (1.0 - passed)
-        escaping: list[tuple[float, FloatArray]] = []
-        if escape and layer.thickness_mm > 0:
-            escaping = k_escape_fractions(material, energies, thickness_mm=layer.thickness_mm, table=table)
-        kept_keV = energies.copy()
-        kept_keV2 = energies**2
-        for line_keV, fraction in escaping:
-            kept_keV -= fraction * line_keV
-            kept_keV2 += fraction * ((energies - line_keV) ** 2 - energies**2)
-        interacting += share
-        mean += share * kept_keV
-        mean_square += share * kept_keV2
-        reaching = reaching * passed
+    moments = _moments(energies, scintillator, cover, escape=escape, table=table, library=library)
+    if bin_width_keV is None:
+        on_grid = np.array_equal(energies, energy_grid_keV(500.0)[: energies.size])
+        bin_width_keV = BIN_WIDTH_KEV if on_grid else 0.0
+    if bin_width_keV > 0:
+        materials = [material_from_name(layer.material, library=library) for layer in (*cover, *scintillator)]
+        cut = bins_cut_by_edges(materials, energies, bin_width_keV=bin_width_keV)
+        if np.any(cut):
+            inside = energies_inside_bins(energies[cut], bin_width_keV=bin_width_keV)
+            finer = _moments(inside.ravel(), scintillator, cover, escape=escape, table=table, library=library)
+            moments[:, cut] = finer.reshape(3, *inside.shape).mean(axis=-1)
+    interacting, mean, mean_square = moments
     return Response(
         energies_keV=energies,
         interacting_fraction=interacting,
@@ -129,6 +127,36 @@ def detector_response(
         mean_square_deposited_keV2=interacting if counting else mean_square,
         counting=counting,
     )
+
+
+def _moments(
+    energies: FloatArray,
+    scintillator: Sequence[Filter],
+    cover: Sequence[Filter],
+    *,
+    escape: bool,
+    table: str,
+    library: Library | None,
+) -> FloatArray:
+    """(3, n): share that interacts, first and second moment of the deposited energy, at the energies themselves."""
+    reaching = transmission(cover, energies, table=table, library=library)
+    moments = np.zeros((3, energies.size))
+    for layer in scintillator:
+        if layer.thickness_mm == 0:
+            continue
+        material = material_from_name(layer.material, library=library)
+        passed = np.exp(-mu_per_mm(material, energies, table=table) * layer.thickness_mm)
+        share = reaching * (1.0 - passed)
+        kept_keV = energies.copy()
+        kept_keV2 = energies**2
+        if escape:
+            escaping = k_escape_fractions(material, energies, thickness_mm=layer.thickness_mm, table=table)
+            for line_keV, fraction in escaping:
+                kept_keV -= fraction * line_keV
+                kept_keV2 += fraction * ((energies - line_keV) ** 2 - energies**2)
+        moments += share * np.stack([np.ones_like(energies), kept_keV, kept_keV2])
+        reaching = reaching * passed
+    return moments
 
 
 def k_escape_fractions(

@@ -67,12 +67,16 @@ class Spectrum:
 def filtered_spectrum(
     spectrum: Spectrum, filters: Sequence[Filter], *, table: str = "xraylib", library: Library | None = None
 ) -> Spectrum:
-    """The spectrum behind more layers: fluence exp(-sum mu t), taken at the bin centres.
+    """The spectrum behind more layers: fluence exp(-sum mu t).
+
+    Taken at the bin centres; in a bin that an absorption edge of a layer cuts, the mean over the bin.
 
     Raises:
         InputError: an unknown material or table, or layers so thick that no photon is left.
     """
-    passed = transmission(filters, spectrum.energies_keV, table=table, library=library)
+    passed = transmission(
+        filters, spectrum.energies_keV, table=table, library=library, bin_width_keV=spectrum.bin_width_keV
+    )
     behind = spectrum.fluence * passed
     if not np.any(behind > 0):
         raise InputError(

@@ -133,8 +133,8 @@ def warn_of_soft_beam(spectrum: Spectrum) -> None:
     share = float(energy[spectrum.energies_keV < SOFT_KEV].sum() / energy.sum())
     if share > SOFT_SHARE and spectrum.anode is not None:
         say(
-            f"note: {100 * share:.0f} % of the beam's energy lies below {SOFT_KEV:g} keV, which the window of most tubes"
-            " stops; name the inherent filtration, for example --filter Be:0.8 --filter Al:1"
+            f"note: {100 * share:.0f} % of the beam's energy lies below {SOFT_KEV:g} keV, which most tube windows stop;"
+            " name the inherent filtration, for example --filter Be:0.8 --filter Al:1"
         )
 
 

@@ -10,6 +10,7 @@ _PLACES = {
     "LabSystem": "system",
     "PROTOCOLS": "protocols",
     "Product": "objects",
+    "RenderedScene": "bench",
     "Slab": "objects",
     "aperture_share": "response",
     "compute_incidence": "response",
@@ -21,7 +22,24 @@ _PLACES = {
     "system_of_seed": "protocols",
 }
 
-__all__ = sorted(_PLACES)
+__all__ = [
+    "PROTOCOLS",
+    "Bench",
+    "Bone",
+    "Fillet",
+    "LabSystem",
+    "Product",
+    "RenderedScene",
+    "Slab",
+    "aperture_share",
+    "compute_incidence",
+    "compute_level",
+    "compute_truth",
+    "detector_maps",
+    "run_protocol",
+    "sample_system",
+    "system_of_seed",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ from ._random import gamma, normal, poisson, seed_stream, uniform
 _ONE_BY_ONE = 5.0
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True)
 def light_of_photons(  # type: ignore[no-untyped-def]
     cell, rates, totals, factor, deposit_keV, light_variance, key, frame, sub, keep, alias, light
 ):
@@ -50,7 +50,7 @@ def light_of_photons(  # type: ignore[no-untyped-def]
                 light[row, column] = first
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True)
 def spread_light(light, taps, sub, out):  # type: ignore[no-untyped-def]
     """Collect fine light in square pixels behind a separable spread.
 
@@ -75,7 +75,7 @@ def spread_light(light, taps, sub, out):  # type: ignore[no-untyped-def]
             out[row, column] = total
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True)
 def electrons_of_light(light_keV, electrons_per_keV, dark_electrons, key, frame, keep, alias, out):  # type: ignore[no-untyped-def]
     """Poisson numbers of electrons, light and dark current together."""
     for row in prange(light_keV.shape[0]):
@@ -86,9 +86,9 @@ def electrons_of_light(light_keV, electrons_per_keV, dark_electrons, key, frame,
             out[row, column] = poisson(state, mean, keep, alias)
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True)
 def read_out(electrons, DN_per_electron, dark_DN, noise_DN, share, key, frame, out):  # type: ignore[no-untyped-def]
-    """DN before the ADC: conversion, offset and white electronic noise; `share` divides the electrons of summed frames."""
+    """DN before the ADC: conversion, offset, white electronic noise; `share` divides the electrons of summed frames."""
     for row in prange(electrons.shape[0]):
         state = np.empty(4, dtype=np.uint64)
         seed_stream(state, key, 3, frame, row)

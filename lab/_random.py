@@ -52,12 +52,12 @@ def poisson_tables() -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     return keep, alias
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def _rotl(x, k):  # type: ignore[no-untyped-def]
     return (x << k) | (x >> (np.uint64(64) - k))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def seed_stream(state, key, stage, frame, row):  # type: ignore[no-untyped-def]
     """Fill `state` (4 uint64) for one (key, stage, frame, row); different arguments give unrelated streams."""
     x = key
@@ -73,7 +73,7 @@ def seed_stream(state, key, stage, frame, row):  # type: ignore[no-untyped-def]
         state[i] = z ^ (z >> _U31)
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def next_bits(state):  # type: ignore[no-untyped-def]
     """64 random bits."""
     s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
@@ -88,13 +88,13 @@ def next_bits(state):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def uniform(state):  # type: ignore[no-untyped-def]
     """A uniform number in (0, 1)."""
     return (np.float64(next_bits(state) >> _U11) + 0.5) * _TO_UNIT_53
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _poisson_large(state, mean):  # type: ignore[no-untyped-def]
     b = 0.931 + 2.53 * math.sqrt(mean)
     a = -0.059 + 0.02483 * b
@@ -114,7 +114,7 @@ def _poisson_large(state, mean):  # type: ignore[no-untyped-def]
             return k
 
 
-@njit(inline="always")  # type: ignore[untyped-decorator]
+@njit(inline="always")
 def poisson(state, mean, keep, alias):  # type: ignore[no-untyped-def]
     """A Poisson number (float64) of mean `mean`; `keep` and `alias` are `poisson_tables()`."""
     if mean >= TABLE_MEAN:
@@ -138,7 +138,7 @@ def poisson(state, mean, keep, alias):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def normal(state):  # type: ignore[no-untyped-def]
     """A standard normal number (polar method)."""
     while True:
@@ -149,7 +149,7 @@ def normal(state):  # type: ignore[no-untyped-def]
             return x * math.sqrt(-2.0 * math.log(r) / r)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def gamma(state, shape):  # type: ignore[no-untyped-def]
     """A gamma number of mean and variance `shape`, for shape >= 1/3."""
     d = shape - 1.0 / 3.0 if shape >= 1.0 else shape + 2.0 / 3.0

@@ -1,22 +1,40 @@
 """The bench of the virtual lab: put something in the beam, press the button, get frames."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
-from .chain import BASE_STAGES, SUBPIXELS, Arrivals, FrameContext, Stage, margin_px, run_chain
-from .objects import Scene, thickness_on_fine_grid
+from .chain import BASE_STAGES, Arrivals, FrameContext, Stage, run_chain
+from .objects import Scene, fine_shape, thickness_on_fine_grid
 from .response import Incidence, compute_incidence, tube_load_mAs
 from .system import LabSystem, detector_maps
 
 Frame = NDArray[np.uint16] | NDArray[np.float32]
 
 _CELLS_AT_ONCE = 65536
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RenderedScene:
+    """A scene as the sub-pixels of one detector see it, so that it need not be drawn again for every setting.
+
+    Fields: thickness_mm: material -> (fine row, fine column), margins included; cell (fine row, fine column) number of
+    the covered sub-pixel, 0 in the open field; covered_mm: material -> (covered sub-pixel,).
+    """
+
+    thickness_mm: Mapping[str, NDArray[np.float32]]
+    cell: NDArray[np.int32]
+    covered_mm: Mapping[str, NDArray[np.float32]]
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """What the scene is made of."""
+        return tuple(self.thickness_mm)
 
 
 class Bench:
@@ -34,7 +52,7 @@ class Bench:
         self._next_frame = 0
         self._memory: dict[str, Any] = {}
 
-    def arrivals(self, setting: Setting, *, scene: Scene | None = None) -> Arrivals:
+    def arrivals(self, setting: Setting, *, scene: Scene | RenderedScene | None = None) -> Arrivals:
         """Photons that one exposure brings to every sub-pixel, behind a scene or the open field."""
         load_mAs = tube_load_mAs(setting)
         system = self.system
@@ -44,10 +62,17 @@ class Bench:
         incidence = compute_incidence(
             system, kV=setting.kV, filters=setting.filters, materials=() if scene is None else scene.materials
         )
-        cell, rates = _cells(system, incidence, scene)
+        if scene is None:
+            cell = np.zeros(fine_shape(system), dtype=np.int32)
+            rates = _rates_behind(incidence, {})
+        else:
+            rendered = scene if isinstance(scene, RenderedScene) else render(system, scene)
+            cell, rates = rendered.cell, _rates_behind(incidence, rendered.covered_mm)
         return Arrivals(cell=cell, rates=rates, deposit_keV=incidence.deposit_keV, load_mAs=load_mAs)
 
-    def expose(self, setting: Setting, *, frames: int, scene: Scene | None = None) -> Iterator[tuple[Frame, float]]:
+    def expose(
+        self, setting: Setting, *, frames: int, scene: Scene | RenderedScene | None = None
+    ) -> Iterator[tuple[Frame, float]]:
         """Frames with the beam on, each with the time (s) at which it began.
 
         A setting with `averaged` above 1 gives means of so many exposures, float32.
@@ -101,27 +126,28 @@ class Bench:
         return highest_DN + 6.0 * noise_DN > system.saturation_DN or lowest_DN < 6.0 * dark_noise_DN
 
 
-def _cells(
-    system: LabSystem, incidence: Incidence, scene: Scene | None
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Which row of a table of rates each sub-pixel takes, and the table: row 0 is the open field."""
-    open_field = incidence.rates_per_mAs()[None, :].astype(np.float32)
-    margin = margin_px(system.psf_sigma_px)
-    shape = ((system.rows + 2 * margin) * SUBPIXELS, (system.columns + 2 * margin) * SUBPIXELS)
-    if scene is None:
-        return np.zeros(shape, dtype=np.int32), open_field
+def render(system: LabSystem, scene: Scene) -> RenderedScene:
+    """A scene on the sub-pixels of a system's detector."""
     lengths = thickness_on_fine_grid(system, scene)
-    covered = np.zeros(shape, dtype=bool)
-    for length in lengths.values():
-        covered |= length > 0
-    cell = np.zeros(shape, dtype=np.int32)
-    count = int(covered.sum())
-    cell[covered] = np.arange(1, count + 1, dtype=np.int32)
-    rates = np.empty((count + 1, open_field.shape[1]), dtype=np.float32)
-    rates[0] = open_field
-    flat = {material: length[covered] for material, length in lengths.items()}
+    covered = np.any([length > 0 for length in lengths.values()], axis=0)
+    cell = np.zeros(covered.shape, dtype=np.int32)
+    cell[covered] = np.arange(1, int(covered.sum()) + 1, dtype=np.int32)
+    return RenderedScene(
+        thickness_mm=lengths, cell=cell, covered_mm={material: length[covered] for material, length in lengths.items()}
+    )
+
+
+def _rates_behind(incidence: Incidence, covered_mm: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Rates of every class: row 0 in the open field, then one row a covered sub-pixel."""
+    count = len(next(iter(covered_mm.values()))) if covered_mm else 0
+    share = incidence.class_share.astype(np.float32)
+    photons = incidence.photons_per_mAs.astype(np.float32)
+    rates = np.empty((count + 1, share.shape[1]), dtype=np.float32)
+    rates[0] = incidence.rates_per_mAs()
     for start in range(0, count, _CELLS_AT_ONCE):
         piece = slice(start, min(start + _CELLS_AT_ONCE, count))
-        behind = incidence.rates_per_mAs({material: length[piece] for material, length in flat.items()})
-        rates[piece.start + 1 : piece.stop + 1] = behind
-    return cell, rates
+        exponent = np.zeros((piece.stop - piece.start, photons.size), dtype=np.float32)
+        for material, length in covered_mm.items():
+            exponent -= length[piece, None] * incidence.mu_of[material].astype(np.float32)
+        np.matmul(photons * np.exp(exponent, out=exponent), share, out=rates[piece.start + 1 : piece.stop + 1])
+    return rates

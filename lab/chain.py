@@ -79,7 +79,8 @@ def spread_taps(psf_sigma_px: float) -> NDArray[np.float32]:
         return np.ones(SUBPIXELS, dtype=np.float32)
     taps = ndtr((x + 0.5) / psf_sigma_px) - ndtr((x - 0.5) / psf_sigma_px)
     phases = taps.reshape(-1, SUBPIXELS)
-    return (phases / phases.sum(axis=0)).ravel().astype(np.float32)
+    shares: NDArray[np.float32] = (phases / phases.sum(axis=0)).ravel().astype(np.float32)
+    return shares
 
 
 def _photons(arrivals: Arrivals, context: FrameContext) -> NDArray[np.float32]:

@@ -71,9 +71,12 @@ class Fillet:
 
     def outline_at(self, angle: Array) -> Array:
         """Outline over the ellipse of the half axes, at angles in radians."""
-        order = np.arange(2, 2 + len(self.outline))
-        arms = np.asarray(angle)[..., None] * order
-        result: Array = 1.0 + np.cos(arms) @ self.outline[:, 0] + np.sin(arms) @ self.outline[:, 1]
+        turn = np.exp(1j * np.asarray(angle))
+        power = turn.copy()
+        result: Array = np.ones(turn.shape)
+        for cosine, sine in self.outline:
+            power *= turn
+            result += cosine * power.real + sine * power.imag
         return result
 
     def extent_mm(self, rotation: float) -> tuple[float, float]:
@@ -93,10 +96,11 @@ class Fillet:
         inside = rho < 2.0
         rho_in = rho[inside] / self.outline_at(np.arctan2(v[inside], u[inside]))
         body = self.peak_mm * np.maximum(1.0 - rho_in**3, 0.0) ** 0.6
-        relief = np.ones_like(body)
-        y_in, x_in = y_mm[inside], x_mm[inside]
-        for amplitude, wave_y, wave_x, phase in self.waves:
-            relief += amplitude * np.cos(2.0 * np.pi * (wave_y * y_in + wave_x * x_in) + phase)
+        # Single precision: 1e-6 of a relief of a few per cent, in a third of the time.
+        relief = np.ones(body.shape, dtype=np.float32)
+        y_in, x_in = y_mm[inside].astype(np.float32), x_mm[inside].astype(np.float32)
+        for amplitude, wave_y, wave_x, phase in self.waves.astype(np.float32):
+            relief += amplitude * np.cos(np.float32(2.0 * np.pi) * (wave_y * y_in + wave_x * x_in) + phase)
         thickness[inside] = body * np.maximum(relief, 0.3)
         return thickness
 
@@ -184,17 +188,26 @@ def field_mm(system: LabSystem) -> tuple[float, float]:
     return system.rows * scale, system.columns * scale
 
 
-def fine_grid_mm(system: LabSystem) -> tuple[Array, Array]:
-    """Object-plane coordinates (mm) of the sub-pixels' middles, margins of the light's spread included: y (n, 1), x (1, m)."""
+def fine_shape(system: LabSystem) -> tuple[int, int]:
+    """Rows and columns of the grid of sub-pixels, margins of the light's spread included."""
     margin = margin_px(system.psf_sigma_px)
+    return (system.rows + 2 * margin) * SUBPIXELS, (system.columns + 2 * margin) * SUBPIXELS
+
+
+def fine_grid_mm(system: LabSystem) -> tuple[Array, Array]:
+    """Object-plane coordinates (mm) of the sub-pixels' middles, margins of the light's spread included.
+
+    Returns:
+        y (n, 1) and x (1, m).
+    """
     step = system.pixel_mm / system.magnification / SUBPIXELS
 
-    def line(pixels: int) -> Array:
-        count = (pixels + 2 * margin) * SUBPIXELS
-        middles: Array = (np.arange(count) - (count - 1) / 2.0) * step
+    def line(count: int) -> Array:
+        middles: Array = (np.arange(count, dtype=np.float64) - (count - 1) / 2.0) * step
         return middles
 
-    return line(system.rows)[:, None], line(system.columns)[None, :]
+    rows, columns = fine_shape(system)
+    return line(rows)[:, None], line(columns)[None, :]
 
 
 def thickness_on_fine_grid(system: LabSystem, scene: Scene) -> dict[str, NDArray[np.float32]]:
@@ -281,7 +294,7 @@ def place_fillet(rng: np.random.Generator, *, fillet: Fillet, system: LabSystem,
 
 
 def place_bone(rng: np.random.Generator, *, product: Product, bone: Bone) -> Product:
-    """The same product with a bone somewhere in it, embedded or on top, where the meat is a quarter of its peak or more."""
+    """The same product with a bone in or on it, somewhere where the meat is a quarter of its peak or more."""
     fillet = product.fillet
     reach_mm = max(fillet.half_y_mm, fillet.half_x_mm) * 1.3
     half = max(bone.size_mm / 2.0 - bone.width_mm / 2.0, 0.0)

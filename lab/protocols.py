@@ -1,9 +1,11 @@
-"""What is measured in a session: the calibration, and the paper's two sets of products, as plans that a bench works off."""
+"""What is measured in a session, as plans that a bench works off: a calibration, the paper's two sets of products."""
 
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from ..acquisition.acquisition_io import write_acquisition
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..files import sha256_of_file, whole_file
-from .bench import Bench
+from .bench import Bench, RenderedScene, render
 from .objects import (
     BONE_MATERIAL,
     Bone,
@@ -25,7 +27,6 @@ from .objects import (
     place_fillet,
     sample_bone,
     sample_fillet,
-    thickness_on_fine_grid,
 )
 from .system import LabSystem, sample_system
 from .truth import compute_truth, flat_truth
@@ -90,9 +91,9 @@ def _dark(exposure_ms: float, *, frames: int, label: str, averaged: int = 1) -> 
 def plan_calibration(*, frames: int) -> Plan:
     """Darks and flats from which a twin is calibrated, and a few settings held back to judge it by.
 
-    Darks at 20, 50 and 100 ms before, between and after; flats behind 50 um copper at 40 and 90 kV, at the paper's eight
-    powers (20 ms) and at 20, 50 and 100 ms with 40 W (40 kV) and 45 W (90 kV). Held back (`role` evaluation): 60 kV,
-    other filters, and an exposure and power between the measured ones.
+    Darks at 20, 50 and 100 ms before, between and after; flats behind 50 um copper at 40 and 90 kV, at the paper's
+    eight powers (20 ms) and at 20, 50 and 100 ms with 40 W (40 kV) and 45 W (90 kV). Held back (`role` evaluation):
+    60 kV, other filters, and an exposure and power between the measured ones.
     """
     exposures_ms = (20.0, 50.0, 100.0)
     takes: list[Take] = [_dark(exposure_ms, frames=frames, label="before") for exposure_ms in exposures_ms]
@@ -154,8 +155,8 @@ def _fillets(
     fillets = []
     for number in range(count):
         if product_mm is None:
-            half_y_mm = 0.40 * height_mm * rng.uniform(0.94, 1.0)
-            half_x_mm = 0.40 * width_mm * rng.uniform(0.94, 1.0)
+            half_y_mm = 0.43 * height_mm * rng.uniform(0.94, 1.0)
+            half_x_mm = 0.43 * width_mm * rng.uniform(0.94, 1.0)
         else:
             half_x_mm = product_mm / 2.0
             half_y_mm = half_x_mm * rng.uniform(0.72, 0.85)
@@ -164,7 +165,7 @@ def _fillets(
         # The outline's waves must not make the product longer than what was asked for.
         full_y_mm, full_x_mm = fillet.extent_mm(0.0)
         wanted_y_mm, wanted_x_mm = (
-            (half_y_mm, half_x_mm) if product_mm is not None else (0.44 * height_mm, 0.44 * width_mm)
+            (half_y_mm, half_x_mm) if product_mm is not None else (0.45 * height_mm, 0.45 * width_mm)
         )
         shrink = min(1.0, wanted_y_mm / full_y_mm, wanted_x_mm / full_x_mm)
         fillets.append(replace(fillet, half_y_mm=half_y_mm * shrink, half_x_mm=half_x_mm * shrink))
@@ -172,7 +173,13 @@ def _fillets(
 
 
 def plan_set_1(
-    rng: np.random.Generator, system: LabSystem, *, products: int, frames: int, product_mm: float | None = None
+    rng: np.random.Generator,
+    system: LabSystem,
+    *,
+    products: int,
+    frames: int,
+    product_mm: float | None = None,
+    bones_mm: tuple[float, ...] | None = None,
 ) -> Plan:
     """The paper's first set: fillets with bones of 1.5 to 11 mm and boneless ones (163 to 91), each at 1 s.
 
@@ -187,16 +194,26 @@ def plan_set_1(
     edges_mm = np.geomspace(1.5, 11.0, n_bones + 1)
     bones = [
         sample_bone(rng, name=f"bone{number + 1:02d}", size_mm=round(float(rng.uniform(low, high)), 1))
-        for number, (low, high) in enumerate(zip(edges_mm[:-1], edges_mm[1:], strict=True))
+        for number, (low, high) in enumerate(pairwise(edges_mm))
     ]
-    bone_order = [bones[number % n_bones] for number in range(n_with_bone)]
+    if bones_mm is not None:
+        bones = [
+            sample_bone(rng, name=f"bone{number + 1:02d}", size_mm=size_mm) for number, size_mm in enumerate(bones_mm)
+        ]
+    bone_order = [bones[number % len(bones)] for number in range(n_with_bone)]
     contents: list[Bone | None] = [*bone_order, *([None] * (products - n_with_bone))]
     shuffled = [contents[int(number)] for number in rng.permutation(products)]
     return _product_plan(rng, system, fillets=fillets, contents=shuffled, exposures=((100.0, 10),), frames=frames)
 
 
 def plan_set_2(
-    rng: np.random.Generator, system: LabSystem, *, products: int, frames: int, product_mm: float | None = None
+    rng: np.random.Generator,
+    system: LabSystem,
+    *,
+    products: int,
+    frames: int,
+    product_mm: float | None = None,
+    bones_mm: tuple[float, ...] | None = None,
 ) -> Plan:
     """The paper's second set: two fillets, bones of 2 and 3 mm in many places, at 1 s, 100, 50 and 20 ms each.
 
@@ -205,11 +222,11 @@ def plan_set_2(
     fillets = _fillets(rng, system, count=2, product_mm=product_mm, prefix="test_fillet")
     bones = [
         sample_bone(rng, name=f"test_bone{number + 1}", size_mm=size_mm)
-        for number, size_mm in enumerate(SET_2_BONES_MM)
+        for number, size_mm in enumerate(bones_mm or SET_2_BONES_MM)
     ]
     n_boneless = max(1, round(products * SET_2_BONELESS / SET_2_PRODUCTS)) if products > 1 else 0
     contents: list[Bone | None] = [None] * n_boneless
-    contents += [bones[number % 2] for number in range(products - n_boneless)]
+    contents += [bones[number % len(bones)] for number in range(products - n_boneless)]
     return _product_plan(
         rng,
         system,
@@ -252,9 +269,20 @@ DEFAULT_FRAMES = {"calibration": 20, "set1": 1, "set2": 1}
 DEFAULT_PRODUCTS = {"set1": SET_1_PRODUCTS, "set2": SET_2_PRODUCTS}
 
 
-def system_of_seed(seed: int, *, rows: int = 128, columns: int = 160, pixel_mm: float = 0.45) -> LabSystem:
+def system_of_seed(
+    seed: int,
+    *,
+    rows: int = 128,
+    columns: int = 160,
+    pixel_mm: float = 0.45,
+    source_detector_mm: float | None = None,
+) -> LabSystem:
     """The hidden system of a seed, with a detector of the given size: the same in every protocol and session."""
-    return sample_system(np.random.default_rng([seed, 0])).at_size(rows=rows, columns=columns, pixel_mm=pixel_mm)
+    if not (math.isfinite(pixel_mm) and 0.01 <= pixel_mm <= 10.0):
+        raise InputError("pixel_mm", received=f"{pixel_mm:g} mm", expected="0.01 to 10 mm")
+    return sample_system(np.random.default_rng([seed, 0])).at_size(
+        rows=rows, columns=columns, pixel_mm=pixel_mm, source_detector_mm=source_detector_mm
+    )
 
 
 def make_plan(
@@ -265,6 +293,7 @@ def make_plan(
     frames: int | None = None,
     products: int | None = None,
     product_mm: float | None = None,
+    bones_mm: tuple[float, ...] | None = None,
 ) -> Plan:
     """The plan of a protocol by name; see `PROTOCOLS`.
 
@@ -285,8 +314,10 @@ def make_plan(
         raise InputError("products", received=products, expected="2 or more")
     if product_mm is not None and not 10.0 <= product_mm <= 1000.0:
         raise InputError("product_mm", received=f"{product_mm:g} mm", expected="10 to 1000 mm")
+    if bones_mm is not None and not (bones_mm and all(0.2 <= size_mm <= 100.0 for size_mm in bones_mm)):
+        raise InputError("bones_mm", received=bones_mm, expected="lengths of 0.2 to 100 mm")
     plan = plan_set_1 if protocol == "set1" else plan_set_2
-    return plan(rng, system, products=products, frames=frames, product_mm=product_mm)
+    return plan(rng, system, products=products, frames=frames, product_mm=product_mm, bones_mm=bones_mm)
 
 
 def truth_path(acquisition: str | os.PathLike[str]) -> Path:
@@ -303,9 +334,11 @@ def run_protocol(
     rows: int = 128,
     columns: int = 160,
     pixel_mm: float = 0.45,
+    source_detector_mm: float | None = None,
     frames: int | None = None,
     products: int | None = None,
     product_mm: float | None = None,
+    bones_mm: tuple[float, ...] | None = None,
     session: int = 0,
     system: LabSystem | None = None,
     begin: Callable[[int], None] = lambda frames: None,
@@ -318,9 +351,11 @@ def run_protocol(
         protocol: `calibration`, `set1` or `set2`.
         seed: draws the hidden system, the products and the noise; the same seed is the same system in all protocols.
         rows, columns, pixel_mm: the detector; distances scale with the pixel, see `LabSystem.at_size`.
+        source_detector_mm: another distance than the one that scales with the pixel; nearer means more photons.
         frames: frames per series (of the product sets: per object at a single exposure).
         products: how many (sets only).
-        product_mm: length of a product; by default four fifths of the field.
+        product_mm: length of a product; by default nine tenths of the field.
+        bones_mm: lengths of the bones, instead of the set's own.
         session: another number is another day: other noise and other products on the same system.
         system: a system to measure with, instead of the seed's.
         begin, advance: called with the number of frames to come, and after each.
@@ -333,21 +368,32 @@ def run_protocol(
     """
     if seed < 0 or session < 0:
         raise InputError("seed and session", received=f"{seed} and {session}", expected="whole numbers of 0 or more")
-    if not 0.01 <= pixel_mm <= 10.0:
-        raise InputError("pixel_mm", received=f"{pixel_mm:g} mm", expected="0.01 to 10 mm")
     if system is None:
-        system = system_of_seed(seed, rows=rows, columns=columns, pixel_mm=pixel_mm)
+        system = system_of_seed(
+            seed, rows=rows, columns=columns, pixel_mm=pixel_mm, source_detector_mm=source_detector_mm
+        )
     place = list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else 0
     plan_rng, noise_rng = (np.random.default_rng([seed, 1 + place, session, part]) for part in (0, 1))
-    plan = make_plan(protocol, system=system, rng=plan_rng, frames=frames, products=products, product_mm=product_mm)
+    plan = make_plan(
+        protocol,
+        system=system,
+        rng=plan_rng,
+        frames=frames,
+        products=products,
+        product_mm=product_mm,
+        bones_mm=bones_mm,
+    )
     bench = Bench(system, rng=noise_rng)
     begin(plan.frames)
     series: dict[str, dict[str, Any]] = {}
     with write_acquisition(path, system.instrument()) as writer:
-        for name, product in plan.scenes.items():
-            writer.add_scene(name, kind="product", **_scene_contents(system, product))
+        in_beam, rendered = "", None
         for take in plan.takes:
-            series[take.name] = _measure(writer, bench, take, plan.scenes.get(take.scene), advance)
+            if take.scene and take.scene != in_beam:
+                in_beam, product = take.scene, plan.scenes[take.scene]
+                rendered = render(system, product)
+                writer.add_scene(in_beam, kind="product", **_scene_contents(system, product, rendered))
+            series[take.name] = _measure(writer, bench, take, rendered if take.scene else None, advance)
     truth: dict[str, Any] = {
         "format": "raytwin-lab-truth",
         "version": 1,
@@ -370,7 +416,7 @@ def run_protocol(
 
 
 def _measure(
-    writer: Any, bench: Bench, take: Take, product: Product | None, advance: Callable[[], None]
+    writer: Any, bench: Bench, take: Take, scene: RenderedScene | None, advance: Callable[[], None]
 ) -> dict[str, Any]:
     setting, system = take.setting, bench.system
     common: dict[str, Any] = {
@@ -386,7 +432,7 @@ def _measure(
         exposures = bench.dark(setting.exposure_ms, frames=take.frames, averaged=setting.averaged)
     else:
         sink = writer.add_series(take.name, setting=setting, **common)
-        exposures = bench.expose(setting, frames=take.frames, scene=product)
+        exposures = bench.expose(setting, frames=take.frames, scene=scene)
     for frame, began_s in exposures:
         sink.append(frame, time_s=began_s)
         advance()
@@ -396,11 +442,9 @@ def _measure(
     return expected
 
 
-def _scene_contents(system: LabSystem, product: Product) -> dict[str, Any]:
+def _scene_contents(system: LabSystem, product: Product, rendered: RenderedScene) -> dict[str, Any]:
     """Thickness maps, masks and identifiers of a product for the acquisition file."""
-    thickness_mm = {
-        material: pixel_means(system, fine) for material, fine in thickness_on_fine_grid(system, product).items()
-    }
+    thickness_mm = {material: pixel_means(system, fine) for material, fine in rendered.thickness_mm.items()}
     bone = thickness_mm.get(BONE_MATERIAL)
     total = np.sum(list(thickness_mm.values()), axis=0)
     return {

@@ -125,20 +125,28 @@ class LabSystem:
         """Highest number of the ADC (DN)."""
         return int(2**self.bits) - 1
 
-    def at_size(self, *, rows: int, columns: int, pixel_mm: float) -> "LabSystem":
+    def at_size(
+        self, *, rows: int, columns: int, pixel_mm: float, source_detector_mm: float | None = None
+    ) -> "LabSystem":
         """The same tube and the same electronics with another detector, distances scaled with the pitch.
 
         Flux at the detector falls with the square of the distance and a pixel's area grows with the square of the
-        pitch, so the photons per pixel at a given power stay, and the paper's settings keep their meaning.
+        pitch, so the photons per pixel at a given power stay, and the paper's settings keep their meaning. Another
+        distance can be asked for (magnification unchanged): half of it means four times the photons.
         """
-        scale = pixel_mm / PAPER_PIXEL_MM
+        if source_detector_mm is None:
+            source_detector_mm = pixel_mm / PAPER_PIXEL_MM * PAPER_SOURCE_DETECTOR_MM
+        if not (math.isfinite(source_detector_mm) and 100.0 <= source_detector_mm <= 100000.0):
+            raise InputError(
+                "source_detector_mm", received=f"{source_detector_mm:g} mm", expected="a distance of 100 to 100000 mm"
+            )
         return replace(
             self,
             rows=rows,
             columns=columns,
             pixel_mm=pixel_mm,
-            source_object_mm=scale * PAPER_SOURCE_OBJECT_MM,
-            source_detector_mm=scale * PAPER_SOURCE_DETECTOR_MM,
+            source_object_mm=source_detector_mm * PAPER_SOURCE_OBJECT_MM / PAPER_SOURCE_DETECTOR_MM,
+            source_detector_mm=source_detector_mm,
         )
 
     def instrument(self) -> Instrument:
@@ -210,7 +218,8 @@ def _smooth_pattern(rng: np.random.Generator, *, rows: int, columns: int) -> NDA
     for _ in range(6):
         wave_y, wave_x = rng.uniform(-3.0, 3.0, size=2)
         pattern += rng.standard_normal() * np.cos(2 * np.pi * (wave_y * y + wave_x * x) + rng.uniform(0, 2 * np.pi))
-    return (pattern - pattern.mean()) / max(float(pattern.std()), 1e-12)
+    scaled: NDArray[np.float64] = (pattern - pattern.mean()) / max(float(pattern.std()), 1e-12)
+    return scaled
 
 
 def detector_maps(system: LabSystem) -> DetectorMaps:

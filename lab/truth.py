@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.setting import Setting, text_from_filters
+from .attenuation import mu_per_mm
 from .response import (
     Level,
     aperture_share,
@@ -16,7 +17,6 @@ from .response import (
     level_of_groups,
     tube_load_mAs,
 )
-from .attenuation import mu_per_mm
 from .system import DetectorMaps, LabSystem, detector_maps
 
 
@@ -40,7 +40,7 @@ def flat_truth(system: LabSystem, maps: DetectorMaps, setting: Setting) -> dict[
 
     Returns:
         `mean_DN` above dark, `sd_DN` (temporal, one pixel, of the mean of `averaged` frames), `gain_DN` (quantum
-        variance over signal with the blur's share restored, secondary quanta included; it does not depend on the level),
+        variance over signal with the blur's share restored, secondary quanta included; the same at every level),
         `photon_transfer_slope_DN` (what a straight line through variance against signal gives),
         `photons_absorbed` (per pixel, single frame), `DN_per_ms`.
     """

@@ -1,8 +1,8 @@
 """Measure a session in the virtual lab: an acquisition file, and the truth about it in a separate file.
 
 The lab stands in for a real X-ray line whose truth is known: photons are sampled one energy class at a time, their
-light spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden system
-(tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
+light spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden
+system (tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
 `--protocol calibration` can be judged on `--protocol set2` of the same seed.
 """
 
@@ -36,6 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--products", type=int, metavar="N", help="products in a set (default 254 in set1, 84 in set2)")
     parser.add_argument("--product-mm", type=float, metavar="MM", help="length of a product (default: fills the field)")
+    parser.add_argument("--bones-mm", metavar="MM,MM", help="lengths of the bones (default: those of the set)")
+    parser.add_argument(
+        "--source-detector-mm",
+        type=float,
+        metavar="MM",
+        help="distance (default: scales with the pixel, 3177 mm at 0.45 mm); nearer means more photons per pixel",
+    )
     parser.add_argument(
         "--session", type=int, default=0, metavar="K", help="another day with the same system (default 0)"
     )
@@ -55,6 +62,15 @@ def _size(text: str) -> tuple[int, int]:
     if not all(8 <= pixels <= 8192 for pixels in size):
         raise InputError("--size", received=repr(text), expected="N or ROWSxCOLUMNS from 8 to 8192 pixels")
     return size
+
+
+def _lengths(text: str | None) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError:
+        raise InputError("--bones-mm", received=repr(text), expected="lengths in mm joined by commas") from None
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -90,10 +106,16 @@ def run(arguments: argparse.Namespace) -> int:
             frames=arguments.frames,
             products=arguments.products,
             product_mm=arguments.product_mm,
+            bones_mm=_lengths(arguments.bones_mm),
+            source_detector_mm=arguments.source_detector_mm,
             session=arguments.session,
             begin=begin,
             advance=advance,
         )
+    except OSError as error:
+        raise InputError(
+            "--output", received=arguments.output, expected="a file that can be written", remedy=str(error)
+        ) from error
     finally:
         if bar is not None:
             bar.close()

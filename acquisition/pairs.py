@@ -349,8 +349,8 @@ def dataset_from_acquisition(
     Args:
         acquisition: open acquisition file with objects, and darks and flats at their settings.
         out: dataset file to write.
-        low, high: settings of the pair; None where the acquisition holds one pair of settings only. Tube current and
-            power are compared only where they are given.
+        low, high: settings of the pair; None where the acquisition holds one pair of settings only. Tube current,
+            power and distance are compared only where they are given, filters where that leaves a pair.
         contrast_from: settings of the low-noise pair that contrasts are computed from; None takes, for each scene, the
             pair with the longest exposure.
         with_counts: keep the raw frames (DN, dark included) beside the log images.
@@ -375,7 +375,7 @@ def dataset_from_acquisition(
             expected="object series at two tube voltages that name the same scene",
             remedy="; ".join(unpaired_objects(acquisition)[:3]),
         )
-    chosen = [pair for pair in pairs if _fits(low, pair.low.setting) and _fits(high, pair.high.setting)]
+    chosen = _choose(pairs, low, high)
     kinds = sorted({_text(pair) for pair in chosen})
     if len(kinds) != 1:
         there = kinds or sorted({_text(pair) for pair in pairs})
@@ -503,9 +503,9 @@ def _reference(
     candidates = [other for other in pairs if other.scene == pair.scene and other.low.shape == pair.low.shape]
     if contrast_from is None:
         return max(candidates, key=lambda other: other.seconds)
-    for other in candidates:
-        if _fits(contrast_from[0], other.low.setting) and _fits(contrast_from[1], other.high.setting):
-            return other
+    fitting = _choose(candidates, *contrast_from)
+    if fitting:
+        return max(fitting, key=lambda other: other.seconds)
     raise InputError(
         f"contrast of scene {pair.scene}",
         received="no pair at " + ";".join(str(setting) for setting in contrast_from),
@@ -513,7 +513,21 @@ def _reference(
     )
 
 
-def _fits(wanted: Setting | None, setting: Setting | None) -> bool:
+def _choose(pairs: Sequence[ObjectPair], low: Setting | None, high: Setting | None) -> list[ObjectPair]:
+    """The pairs at the settings asked for; filters need not be named where nothing fits without them."""
+    for any_filter in (False, True):
+        found = [
+            pair
+            for pair in pairs
+            if _fits(low, pair.low.setting, any_filter=any_filter)
+            and _fits(high, pair.high.setting, any_filter=any_filter)
+        ]
+        if found:
+            return found
+    return []
+
+
+def _fits(wanted: Setting | None, setting: Setting | None, *, any_filter: bool) -> bool:
     if wanted is None:
         return True
     if setting is None:
@@ -522,7 +536,7 @@ def _fits(wanted: Setting | None, setting: Setting | None) -> bool:
         _same(wanted.kV, setting.kV)
         and _same(wanted.exposure_ms, setting.exposure_ms)
         and wanted.averaged == setting.averaged
-        and wanted.filters == setting.filters
+        and (wanted.filters == setting.filters or (any_filter and not wanted.filters))
         and (wanted.tube_current_mA is None or _same_load(wanted, setting))
         and (wanted.source_detector_mm is None or _same(wanted.source_detector_mm, setting.source_detector_mm))
     )

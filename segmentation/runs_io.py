@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import pickle
+import warnings
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -324,15 +325,18 @@ def _short(value: object) -> str:
 
 def _save(path: Path, content: dict[str, Any]) -> None:
     torch = load_torch()
-    with whole_file(path) as temporary:
-        torch.save(content, temporary)
+    # Through a stream: torch writes a path's name into the file, and a temporary name would change its hash.
+    with whole_file(path) as temporary, open(temporary, "wb") as stream:
+        torch.save(content, stream)
 
 
 def _load(path: Path, *, format_name: str) -> dict[str, Any]:
     torch = load_torch()
     held: object = None
     try:
-        held = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            held = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         received = "no such file"
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile) as error:

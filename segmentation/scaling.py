@@ -70,7 +70,7 @@ def scale_residual(image: NDArray[Any]) -> NDArray[np.float32]:
             curve = np.linalg.lstsq(powers * weights[:, None], y * weights, rcond=None)[0]
             residual = np.abs(y - powers @ curve)
             sd = max(1.4826 * float(np.median(residual)), 1e-6)
-            weights = np.sqrt(1.0 / np.maximum(1.0, residual / (2.0 * sd)))
+            weights = 1.0 / np.maximum(1.0, residual / (2.0 * sd))
     beyond = np.clip((low - high * (curve[0] + curve[1] * high)) / sd, -_RESIDUAL_LIMIT, _RESIDUAL_LIMIT)
     thickness = np.clip(2.0 * high / top - 1.0, -3.0, 3.0)
     return np.stack([beyond / _RESIDUAL_UNIT, thickness]).astype(np.float32)

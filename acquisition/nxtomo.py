@@ -109,8 +109,10 @@ def _choose(opened: list[Any], path: Path, wanted: str | None) -> tuple[_Detecto
                 expected="one a frame",
             )
         detectors.append(_Detector(name=short, group=node, frames=frames, image_key=image_key))
-    # The same frames may stand under several names (an NXdata group that links to the detector).
-    unique = {(one.frames.file.filename, one.frames.name): one for one in reversed(detectors)}
+    # The same frames may stand under several names (an NXdata group that links to the detector); h5py compares objects
+    # by their place in the file.
+    told_most = sorted(detectors, key=lambda one: len(one.group))
+    unique = {one.frames: one for one in told_most}
     if not unique:
         raise FileFormatError(
             str(path),

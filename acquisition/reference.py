@@ -59,6 +59,7 @@ def import_reference(
     validation: float | None = None,
     test: float | None = None,
     rng: np.random.Generator | None = None,
+    bad_pixels: NDArray[np.bool_] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Turn reference images with masks into a dataset file.
@@ -73,6 +74,7 @@ def import_reference(
             0.15 mm where the pixel size is known, else 21.
         validation, test: shares of the products to put into these splits; None keeps the splits that are given.
         rng: deals the products out to the splits; needed with `validation` or `test`.
+        bad_pixels: (row, column), True where raw frames are replaced by their neighbours.
         progress: called with (pairs done, pairs in all).
 
     Raises:
@@ -86,7 +88,7 @@ def import_reference(
         shares = (validation or 0.0, test or 0.0, rng)
     if path.is_file():
         return _from_acquisition(
-            path, path, out, low, high, each_frame, dilations, shares, progress, skipped=(), notes=()
+            path, path, out, low, high, each_frame, dilations, shares, bad_pixels, progress, skipped=(), notes=()
         )
     tables = read_sidecar(
         path,
@@ -101,7 +103,7 @@ def import_reference(
         step = Path(folder) / "acquisition.h5"
         report = import_images(path, step, sidecar=sidecar)
         return _from_acquisition(
-            path, step, out, low, high, each_frame, dilations, shares, progress, report.skipped, report.notes
+            path, step, out, low, high, each_frame, dilations, shares, bad_pixels, progress, report.skipped, report.notes
         )
 
 
@@ -117,6 +119,7 @@ def _from_acquisition(
     each_frame: bool,
     dilations: int | None,
     shares: _Shares | None,
+    bad_pixels: NDArray[np.bool_] | None,
     progress: Callable[[int, int], None] | None,
     skipped: tuple[Skipped, ...],
     notes: tuple[str, ...],
@@ -135,6 +138,7 @@ def _from_acquisition(
             split=split,
             each_frame=each_frame,
             dilations=_ring(dilations, acquisition.instrument.pixel_mm),
+            bad_pixels=bad_pixels,
             provenance={"source": source.name},
             progress=progress,
         )

@@ -69,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
             layout.add_argument("--test", type=float, metavar="SHARE", help="share of products for testing")
             layout.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the split (default 0)")
+            layout.add_argument("--twin", metavar="TWIN", help="replace this twin's bad pixels in raw frames")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -130,8 +131,15 @@ def _import(arguments: argparse.Namespace) -> Any:
             validation=arguments.validation,
             test=arguments.test,
             rng=np.random.default_rng(arguments.seed),
+            bad_pixels=None if arguments.twin is None else _bad_pixels(arguments.twin),
             progress=progress,
         )
+
+
+def _bad_pixels(twin: str) -> Any:
+    from ..generator.twin_io import read_twin
+
+    return read_twin(twin).maps.bad_pixels > 0
 
 
 def _positive(value: float | None, name: str, unit: str) -> float | None:

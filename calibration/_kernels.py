@@ -8,9 +8,7 @@ _BLOCK = 4096  # pixels a thread takes at a time: its sums stay in the cache
 
 
 @njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
-def accumulate(
-    frames: Any, last: Any, has_last: bool, reference: Any, deviation: Any, square: Any, pair: Any
-) -> None:
+def accumulate(frames: Any, last: Any, has_last: bool, reference: Any, deviation: Any, square: Any, pair: Any) -> None:
     """Add frames (n, pixels) to the running sums (pixels,); `last` is the frame before and is replaced."""
     count, pixels = frames.shape
     blocks = (pixels + _BLOCK - 1) // _BLOCK

@@ -49,8 +49,8 @@ def calibrate_twin(
         beams = {(level.kV, level.filters) for level in transfer.levels if level.kV is not None}
         if len(beams) == 1:
             warnings.append(
-                "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or the"
-                " same kV with a known filter"
+                "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or"
+                " the same kV with a known filter"
             )
         elif len(voltages) == 1:
             warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
@@ -69,8 +69,8 @@ def calibrate_twin(
             }
             if fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data):
                 warnings.append(
-                    f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data} data):"
-                    " check kV, filter and power of the series"
+                    f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
+                    " data): check kV, filter and power of the series"
                 )
     else:
         warnings.append("no series states its kV: no spectral part, no prediction at other settings")

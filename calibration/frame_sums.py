@@ -1,7 +1,7 @@
 """Sums over the frames of one series: all that photon transfer needs, from one pass in constant memory.
 
-The sums of two parts of a series, or of two sessions, add up (`merge_frame_sums`); the frame pair across the seam of two
-parts is then missing, nothing else.
+The sums of two parts of a series, or of two sessions, add up (`merge_frame_sums`); the frame pair across the seam of
+two parts is then missing, nothing else.
 """
 
 from collections.abc import Iterable
@@ -102,7 +102,9 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
             integer = integer and bool(np.all(flat == np.rint(flat)))
         if not sums:
             shape = piece.shape[1:]
-            sums = [flat[0].astype(np.float64)] + [np.zeros(flat.shape[1]) for _ in range(3)] + [np.zeros(flat.shape[1])]
+            sums = (
+                [flat[0].astype(np.float64)] + [np.zeros(flat.shape[1]) for _ in range(3)] + [np.zeros(flat.shape[1])]
+            )
         reference, deviation, square, pair, last = sums
         accumulate(flat, last, frames > 0, reference, deviation, square, pair)
         pairs += flat.shape[0] - (1 if frames == 0 else 0)

@@ -38,7 +38,7 @@ class NoiseCovariance:
     @property
     def radius(self) -> int:
         """Largest lag R, px."""
-        return self.covariance_DN2.shape[0] // 2
+        return int(self.covariance_DN2.shape[0]) // 2
 
 
 def compute_noise_covariance(
@@ -50,8 +50,8 @@ def compute_noise_covariance(
 ) -> NoiseCovariance:
     """Autocovariance of the noise of one frame from successive differences, DN^2.
 
-    C(o) = mean over pixels r of d(r) d(r + o) / 2 for d = x_(i+1) - x_i, after the part of d that is proportional to the
-    signal (one common factor a frame: tube output) or, without signal, its mean is projected out; the share of the
+    C(o) = mean over pixels r of d(r) d(r + o) / 2 for d = x_(i+1) - x_i, after the part of d that is proportional to
+    the signal (one common factor a frame: tube output) or, without signal, its mean is projected out; the share of the
     covariance that this projection takes away is restored.
 
     Args:
@@ -190,7 +190,9 @@ class _Problem:
 
         for item in series:
             cut = item.radius - radius
-            window = item.covariance_DN2[cut : item.covariance_DN2.shape[0] - cut, cut : item.covariance_DN2.shape[1] - cut]
+            window = item.covariance_DN2[
+                cut : item.covariance_DN2.shape[0] - cut, cut : item.covariance_DN2.shape[1] - cut
+            ]
             smooth = self._smoothed(window, item.samples, read_variance)
             matrix = sampling_covariance(smooth, item.samples, radius)
             lower = cholesky(matrix + 1e-12 * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), lower=True)
@@ -233,7 +235,7 @@ class _Problem:
         target = np.concatenate([target, np.zeros(self.groups)])
         coefficients = np.linalg.lstsq(matrix, target, rcond=None)[0]
         residual = target - matrix @ coefficients
-        return float(residual @ residual), coefficients, matrix
+        return float(residual @ residual), np.asarray(coefficients, dtype=np.float64), matrix
 
 
 def fit_spread(
@@ -246,8 +248,8 @@ def fit_spread(
     """Fit C_s(o) = I_s [A_g rho(o; sigma) + W_g delta(o)] + r^2 delta(o) to all series by generalised least squares.
 
     rho is the autocovariance of unit quanta after the spread (sums to 1), so gain_g = A_g + W_g and the slope of a
-    photon-transfer line is A_g rho(0) + W_g. Both descriptions of the spread are tried and the better kept; where the data
-    cannot tell them apart the width's standard deviation covers both.
+    photon-transfer line is A_g rho(0) + W_g. Both descriptions of the spread are tried and the better kept; where the
+    data cannot tell them apart the width's standard deviation covers both.
 
     Args:
         series: covariances, darks included (signal 0).
@@ -262,7 +264,9 @@ def fit_spread(
 
     if not any(index >= 0 for index in group):
         raise FitError("the noise fit needs at least one flat series with two or more frames")
-    read_guess = min((s.covariance_DN2[s.radius, s.radius] for s, g in zip(series, group, strict=True) if g < 0), default=0.0)
+    read_guess = min(
+        (s.covariance_DN2[s.radius, s.radius] for s, g in zip(series, group, strict=True) if g < 0), default=0.0
+    )
     problem = _Problem(series, group, radius, float(read_guess))
     widest = 0.45 * radius
     found: dict[str, tuple[float, float]] = {}
@@ -272,7 +276,9 @@ def fit_spread(
         best = int(np.argmin(values))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
         result = minimize_scalar(
-            lambda sigma, model=model: problem.solve(model, float(sigma))[0], bounds=(low, high), method="bounded",
+            lambda sigma, model=model: problem.solve(model, float(sigma))[0],
+            bounds=(low, high),
+            method="bounded",
             options={"xatol": 1e-5},
         )
         found[model] = (float(result.fun), float(result.x))
@@ -285,7 +291,9 @@ def fit_spread(
     # standard deviations: the width joins the linear coefficients through its numerical derivative
     step = max(1e-3, 0.01 * sigma)
     lower = max(sigma - step, 0.0)
-    derivative = (problem.solve(model, sigma + step)[2] - problem.solve(model, lower)[2]) @ coefficients / (sigma + step - lower)
+    derivative = (
+        (problem.solve(model, sigma + step)[2] - problem.solve(model, lower)[2]) @ coefficients / (sigma + step - lower)
+    )
     jacobian = np.column_stack([matrix, derivative])
     information = jacobian.T @ jacobian
     scale = np.sqrt(np.clip(np.diag(information), 1e-300, None))

@@ -33,7 +33,7 @@ class SeriesPoint:
 
     Fields: series, kV, filters, exposure_ms, load_mAs (None where unknown), frames, averaged, signal_DN (median),
     mean_signal_DN, pair_variance_DN2, stack_variance_DN2 (of one single frame: averaging undone), used (False: masked,
-    with the reason in `masked`), lag_correlation, drift_percent (change of the frame mean over the series),
+    with the reason in `masked`), drift_percent (change of the frame mean over the series),
     common_mode_percent (rms output noise from frame to frame).
     """
 
@@ -350,7 +350,9 @@ def compute_photon_transfer(
     rounding = 1.0 / 12.0 if quantised else 0.0
     read_variance = fit.read_variance_DN2 - rounding
     if not dark_pairs:
-        warnings.append("no dark series of two or more frames: the read noise is the intercept of the photon-transfer line")
+        warnings.append(
+            "no dark series of two or more frames: the read noise is the intercept of the photon-transfer line"
+        )
     if read_variance <= 0:
         warnings.append("read noise not seen above the ADC's rounding; set to 0 with its interval")
     read_sd = fit.read_sd_DN2
@@ -411,9 +413,7 @@ def _fit(covariances: list[NoiseCovariance], groups: list[int], usable: list[boo
     )
 
 
-def _bent(
-    covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], fit: SpreadFit
-) -> int | None:
+def _bent(covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], fit: SpreadFit) -> int | None:
     """Index of the brightest flat of a group if its variance lies 6 sigma and 5 % below the line through the others."""
     present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
     for group in present:
@@ -456,7 +456,8 @@ def _dark_estimate(
     """Median dark (DN) at the shortest exposure of the flats that was measured dark; spread of repeats included."""
     known = sorted(key for key in darks.by_exposure if key is not None)
     shared = [key for key in known if key in exposures]
-    exposure = (shared or known or [None])[0]
+    candidates = shared or known
+    exposure = candidates[0] if candidates else None
     mean = darks.at(exposure)
     level = float(np.median(mean[good]))
     repeats = [float(np.median(total.mean_DN[good])) for item, total in darks.sums if item.exposure_ms == exposure]
@@ -519,8 +520,8 @@ def _gain_map(
         return np.ones(good.shape)
     ratio = numerator / weight_sum
     ratio = ratio / float(np.median(ratio[good]))
-    keep = _shrinkage(ratio[good], 1.0 / weight_sum)
-    return np.asarray(np.where(good, np.clip(1.0 + keep * (ratio - 1.0), 0.1, 10.0), 1.0))
+    real = _shrinkage(ratio[good], 1.0 / weight_sum)
+    return np.asarray(np.where(good, np.clip(1.0 + real * (ratio - 1.0), 0.1, 10.0), 1.0))
 
 
 def _points(
@@ -575,8 +576,10 @@ def _points(
 def _load(item: Series) -> float | None:
     if item.kV is None or item.exposure_ms is None:
         return None
-    current = item.current_mA if item.current_mA is not None else (
-        item.power_W / item.kV if item.power_W is not None else None
+    current = (
+        item.current_mA
+        if item.current_mA is not None
+        else (item.power_W / item.kV if item.power_W is not None else None)
     )
     return None if current is None else current * item.exposure_ms / 1000.0
 
@@ -639,7 +642,9 @@ def _rate(points: Sequence[SeriesPoint], darks: _Darks, good: NDArray[np.bool_])
     noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
     frames = np.array([point.frames for point in known], dtype=np.float64)
     # median over pixels: quantum and read noise average out, the dark's own noise and 0.1 % of reproducibility stay
-    variance = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames / good.sum() * 2.0 + (1e-3 * signal) ** 2
+    variance = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames / good.sum() * 2.0 + (
+        1e-3 * signal
+    ) ** 2
     weight = load**2 / variance
     rate = float(np.sum(weight * signal / load) / np.sum(weight))
     scatter = float(np.sum(weight * (signal / load - rate) ** 2)) / max(len(known) - 1, 1)
@@ -671,12 +676,13 @@ def _evidence(
     linearity = _linearity(used)
     if linearity is not None and linearity["largest_departure_percent"] > 1.0:
         warnings.append(
-            f"signal departs from a line in tube load or exposure by up to {linearity['largest_departure_percent']:.2g} %"
+            "signal departs from a line in tube load or exposure by up to"
+            f" {linearity['largest_departure_percent']:.2g} %"
         )
     if fit.degrees > 0 and fit.chi_square / fit.degrees > 2.0:
         warnings.append(
-            f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f} per"
-            " degree of freedom); intervals are widened by its root"
+            f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f}"
+            " per degree of freedom); intervals are widened by its root"
         )
     dark_levels = [
         {
@@ -694,7 +700,9 @@ def _evidence(
         centre = neighbour[0].radius
         zero = sum(c.covariance_DN2[centre, centre] for c in neighbour)
         dark_correlation = {
-            "row_direction": float(sum(c.covariance_DN2[centre + 1, centre] for c in neighbour) / zero) if zero else 0.0,
+            "row_direction": float(sum(c.covariance_DN2[centre + 1, centre] for c in neighbour) / zero)
+            if zero
+            else 0.0,
             "column_direction": float(sum(c.covariance_DN2[centre, centre + 1] for c in neighbour) / zero)
             if zero
             else 0.0,
@@ -723,7 +731,7 @@ def _linearity(points: Sequence[SeriesPoint]) -> dict[str, Any] | None:
     groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
     for point in points:
         groups.setdefault((point.kV, point.filters, point.source_detector_mm), []).append(point)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for members in groups.values():
         for quantity in ("load_mAs", "photons_per_pixel", "exposure_ms"):
             values = [getattr(point, quantity) for point in members]
@@ -744,5 +752,5 @@ def _linearity(points: Sequence[SeriesPoint]) -> dict[str, Any] | None:
                 break
     if not rows:
         return None
-    largest = max(max(abs(value) for value in row["departure_percent_of_full"]) for row in rows)  # type: ignore[attr-defined]
+    largest = max(max(abs(value) for value in row["departure_percent_of_full"]) for row in rows)
     return {"largest_departure_percent": largest, "groups": rows}

@@ -23,7 +23,11 @@ class Prior:
 
 PRIORS: dict[str, Prior] = {
     "inherent_filtration_mm_Al": Prior(
-        centre=1.0, sd=1.5, low=0.0, high=12.0, reason="exit window, oil, housing and air as mm Al, beyond what is declared"
+        centre=1.0,
+        sd=1.5,
+        low=0.0,
+        high=12.0,
+        reason="exit window, oil, housing and air as mm Al, beyond what is declared",
     ),
     "log_scintillator_thickness": Prior(
         centre=0.0, sd=0.2, low=-1.6, high=1.6, reason="packing density and tolerance of a declared scintillator"
@@ -46,8 +50,12 @@ PRIORS: dict[str, Prior] = {
 UNDECLARED_SCINTILLATOR = Prior(
     centre=0.0, sd=0.5, low=-1.6, high=1.6, reason="scintillator not declared: CsI 0.5 mm assumed"
 )
-COUNTING_SWANK = Prior(centre=-0.005, sd=0.01, low=-0.1, high=0.0, reason="a counter has no energy-dependent pulse noise")
-ATTENUATION_SCALE = Prior(centre=0.0, sd=0.015, reason="attenuation tables differ by 1-4 % (xraylib, Chantler, PENELOPE)")
+COUNTING_SWANK = Prior(
+    centre=-0.005, sd=0.01, low=-0.1, high=0.0, reason="a counter has no energy-dependent pulse noise"
+)
+ATTENUATION_SCALE = Prior(
+    centre=0.0, sd=0.015, reason="attenuation tables differ by 1-4 % (xraylib, Chantler, PENELOPE)"
+)
 
 LEVEL_DISCREPANCY = 0.003  # of the level of a kV and filter: reproducibility of tube and filters beyond the parameters
 GAIN_DISCREPANCY = 0.01  # of the gain of a kV and filter

@@ -54,7 +54,7 @@ class _Datum:
 
 
 def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None) -> float:
-    """Photons on a pixel over those on 1 mm2 at 1 m: (1000 / d)^2 a^2; unknown distances and pitches count as 1 m, 1 mm."""
+    """Photons on a pixel over those on 1 mm2 at 1 m: (1000 / d)^2 a^2; what is unknown counts as 1 m, 1 mm."""
     distance = 1000.0 if source_detector_mm is None else source_detector_mm
     pitch = 1.0 if pixel_mm is None else pixel_mm
     return (1000.0 / distance) ** 2 * pitch**2
@@ -109,7 +109,7 @@ def fit_spectrum(
         cover=instrument.detector_cover or (),
         counting=bool(instrument.counting),
         filter_materials=materials,
-        highest_kV=max(160.0, max(level.kV or 0.0 for level in known)),
+        highest_kV=max(160.0, *(level.kV or 0.0 for level in known)),
     )
     priors = priors_for(model, scintillator_declared=instrument.scintillator is not None)
     data = []
@@ -164,8 +164,8 @@ class _Posterior:
     """Log posterior in units of the prior, u = (parameter - centre) / sd.
 
     Logarithms of levels and gains are linear in the scales (output, DN a keV, Swank factor, yield exponent), so these
-    are integrated out exactly: y ~ N(f(nonlinear), S) with one S for all, and drawn back from their conditional Gaussian.
-    What is left is a handful of shape parameters.
+    are integrated out exactly: y ~ N(f(nonlinear), S) with one S for all, and drawn back from their conditional
+    Gaussian. What is left is a handful of shape parameters.
     """
 
     def __init__(self, model: SpectralModel, priors: dict[str, Prior], data: Sequence[_Datum]) -> None:
@@ -223,10 +223,8 @@ class _Posterior:
             result[inside] = -0.5 * np.sum(whitened**2, axis=1) - 0.5 * np.sum(u[inside] ** 2, axis=1)
         return result
 
-    def with_scales(
-        self, u: NDArray[np.float64], rng: np.random.Generator | None
-    ) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter): scales drawn given the shapes, or their conditional mean without rng."""
+    def with_scales(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:
+        """Full parameter sets (draw, parameter): scales drawn given the shapes; without rng their mean."""
         full = self.parameters(u)
         misfit = self.misfit(full)
         precision = np.eye(len(self.linear)) + self.design.T @ (self.design / self.noise[:, None] ** 2)
@@ -294,7 +292,7 @@ class _Posterior:
 def _mixture_draws(
     mean: NDArray[np.float64], covariance: NDArray[np.float64], draws: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draws (draw, shape) and log density of 70 % Student t about the mode, 20 % three times as wide, 10 % the prior."""
+    """Draws (draw, shape), log density: 70 % Student t about the mode, 20 % three times as wide, 10 % the prior."""
     size = len(mean)
     lower = np.linalg.cholesky(covariance)
     normal = rng.standard_normal((draws, size))
@@ -320,9 +318,7 @@ def _mixture_draws(
     return u, np.asarray(np.logaddexp.reduce(parts, axis=0))
 
 
-def _undetermined(
-    names: Sequence[str], samples: NDArray[np.float64], priors: dict[str, Prior]
-) -> tuple[str, ...]:
+def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: dict[str, Prior]) -> tuple[str, ...]:
     """Parameters whose spread is still more than 0.7 of the prior's: the data say nothing of them alone."""
     result = []
     for index, name in enumerate(names):
@@ -331,10 +327,11 @@ def _undetermined(
         share = float(np.std(samples[:, index])) / priors[name].sd
         if share > 0.7:
             result.append(f"{name}: {100 * share:.0f} % of the prior's width is left")
-    correlation = np.corrcoef(samples.T)
+    correlation = np.asarray(np.corrcoef(samples.T)).reshape(len(names), len(names))
     for i in range(len(names)):
         for j in range(i):
             if abs(correlation[i, j]) > 0.9:
-                result.append(f"{names[j]} and {names[i]} are known only together (correlation {correlation[i, j]:+.2f})")
+                result.append(
+                    f"{names[j]} and {names[i]} are known only together (correlation {correlation[i, j]:+.2f})"
+                )
     return tuple(result)
-

@@ -1,4 +1,4 @@
-"""Predictions of a twin against measured flats: per series, with intervals that include the series' own sampling noise."""
+"""Predictions of a twin against measured flats: per series, with intervals that include the series' sampling noise."""
 
 import math
 from collections.abc import Callable
@@ -178,5 +178,3 @@ def _widened(estimate: Estimate, sd: float) -> Estimate:
     below = math.hypot(estimate.value - estimate.low, 1.959964 * sd)
     above = math.hypot(estimate.high - estimate.value, 1.959964 * sd)
     return Estimate(value=estimate.value, low=estimate.value - below, high=estimate.value + above)
-
-

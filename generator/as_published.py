@@ -1,11 +1,11 @@
 """The paper's recipe for a noisy image, kept as the baseline that everything else is compared with.
 
-Its order and constants: one gain for both tube voltages, full noise on top of the reference's own, the Gaussian blur last
-and over signal, quantum noise and electronic noise alike, with the width of the noise autocovariance read as that of the
-blur.
+Its order and constants: one gain for both tube voltages, full noise on top of the reference's own, the Gaussian blur
+last and over signal, quantum noise and electronic noise alike, with the width of the noise autocovariance read as that
+of the blur.
 
-Source: Andriiashen et al., X-ray Image Generation as a Method of Performance Prediction for Real-Time Inspection, Eq. 5-6
-and the calibration section.
+Source: Andriiashen et al., X-ray Image Generation as a Method of Performance Prediction for Real-Time Inspection, Eq.
+5-6 and the calibration section.
 """
 
 import math

@@ -122,9 +122,7 @@ class ChannelModel:
             rng=rng,
         )
 
-    def sample_as_published(
-        self, transmission: NDArray[np.floating], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def sample_as_published(self, transmission: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (row, column) at the target by the paper's recipe, DN."""
         return sample_as_published(
             self.open_signal_DN * transmission, dark_DN=self.dark_DN, rng=rng, **published_parameters(self.twin)
@@ -190,7 +188,9 @@ def generate_dataset(
     if images < 1:
         raise InputError("number of images", received=images, expected="1 or more")
     if high.kV <= low.kV:
-        raise InputError("settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV")
+        raise InputError(
+            "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
+        )
     if reference.shape != twin.maps.shape:
         raise InputError(
             "reference",
@@ -252,7 +252,9 @@ def generate_dataset(
                 progress(number + 1)
     clipped_percent = 100.0 * clipped / values
     if clipped_percent > 0.1:
-        warnings.append(f"{clipped_percent:.2g} % of the values lie below 1 DN above dark and are clipped in the log image")
+        warnings.append(
+            f"{clipped_percent:.2g} % of the values lie below 1 DN above dark and are clipped in the log image"
+        )
     return GenerationSummary(
         images=images,
         references=min(images, len(chosen)),

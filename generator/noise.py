@@ -1,7 +1,7 @@
 """Noise of a detector frame, drawn in its physical order: quanta, spread, signal-following white noise, electronics.
 
-Everything is above dark and in DN. The quantum part is drawn on a frame larger than the image by the reach of the spread,
-so that the borders have the variance and the correlation of the middle.
+Everything is above dark and in DN. The quantum part is drawn on a frame larger than the image by the reach of the
+spread, so that the borders have the variance and the correlation of the middle.
 """
 
 import math
@@ -99,7 +99,7 @@ def frame_sd_DN(
 ) -> NDArray[np.float64]:
     """Temporal standard deviation of one pixel of the mean of `averaged` frames, DN.
 
-    sqrt((slope x signal + read variance) / averaged), slope being the photon-transfer slope (the spread's share is in it).
+    sqrt((slope x signal + read variance) / averaged), slope being the photon-transfer slope (the spread's share in it).
     """
     if averaged < 1:
         raise InputError("averaged", received=averaged, expected="1 frame or more")

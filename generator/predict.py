@@ -24,8 +24,8 @@ class Prediction:
 
     Fields: mean_DN (above dark), sd_DN (temporal, one pixel), gain_DN (single frame), photons_absorbed (a pixel and
     frame), air_kerma_uGy (a frame, at the object or, where its distance is unknown, at the detector); intervals are of
-    the quantity itself, without the sampling noise of a later measurement. None where the twin cannot say; extrapolated:
-    outside the calibrated range; warnings say why and what else to know.
+    the quantity itself, without the sampling noise of a later measurement. None where the twin cannot say;
+    extrapolated: outside the calibrated range; warnings say why and what else to know.
     """
 
     setting: Setting
@@ -167,8 +167,8 @@ def check_limits(twin: Twin, setting: Setting) -> None:
 def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     """Flatfield at a setting, with 95 % intervals.
 
-    At a kV and filter that was measured the measured level is scaled to the load; elsewhere the posterior of the spectral
-    parameters is projected and the calibration's discrepancies are added (doubled where it extrapolates).
+    At a kV and filter that was measured the measured level is scaled to the load; elsewhere the posterior of the
+    spectral parameters is projected and the calibration's discrepancies are added (doubled where it extrapolates).
 
     Raises:
         InputError: no tube load given, power above the tube's, or a twin that has neither this level nor a spectrum.
@@ -188,14 +188,16 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
         raise InputError(
             "setting",
             received=str(setting),
-            expected=f"one of the measured levels with a known tube load ({known}), because this twin has no spectral part",
+            expected=f"a measured level with a known tube load ({known}), because this twin has no spectral part",
             remedy="calibrate from flats that state kV and current or power",
         )
     distance = setting.source_detector_mm or instrument.source_detector_mm
     if distance is None:
         distance = level.source_detector_mm if level is not None and level.source_detector_mm else 1000.0
         if posterior is not None:
-            warnings.append("source-detector distance unknown: 1 m assumed on both sides, so only ratios are meaningful")
+            warnings.append(
+                "source-detector distance unknown: 1 m assumed on both sides, so only ratios are meaningful"
+            )
     pitch = instrument.pixel_mm
     if pitch is None:
         warnings.append("pixel pitch unknown: photon numbers are not absolute")

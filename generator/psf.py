@@ -32,7 +32,7 @@ def sampled_gaussian_1d(sigma_px: float, radius: int) -> NDArray[np.float64]:
     """Gaussian sampled at -radius..radius (2 radius + 1,), normalised to sum 1."""
     position = np.arange(-radius, radius + 1)
     if sigma_px < 1e-6:
-        return (position == 0).astype(np.float64)
+        return np.asarray(position == 0, dtype=np.float64)
     weight = np.exp(-0.5 * (position / sigma_px) ** 2)
     return np.asarray(weight / weight.sum(), dtype=np.float64)
 
@@ -55,7 +55,7 @@ def noise_autocovariance_1d(model: str, sigma_px: float, radius: int) -> NDArray
         return np.asarray(full[2 * reach : 2 * reach + radius + 1])
     width = math.sqrt(2.0) * sigma_px
     if width < 1e-6:
-        return (lag == 0).astype(np.float64)
+        return np.asarray(lag == 0, dtype=np.float64)
     from scipy.special import ndtr
 
     def second_integral(position: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """Signal, gain and photon number of an open beam from tube, filters and scintillator, for many parameter sets at once.
 
-Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting fraction D(E)):
+Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting
+fraction D(E)):
 
     N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^h exp(-sum mu t) (1000 / d)^2 a^2
     signal  = gamma sum N m1            gain = (gamma / A_S) sum N m2 / sum N m1            absorbed = sum N D
@@ -111,7 +112,9 @@ class SpectralModel:
 
         # keV / cm2 -> uGy: 1.602e-16 J / 1e-3 kg; fluence is per cm2
         self._kerma = energies * mass_energy_absorption_cm2_g(air, energies) * 1.602176634e-13 * 1e6
-        inherent_mu = sum((self.mu(layer.material) * layer.thickness_mm for layer in self.inherent), start=0.0 * energies)
+        inherent_mu = sum(
+            (self.mu(layer.material) * layer.thickness_mm for layer in self.inherent), start=0.0 * energies
+        )
         self._inherent = np.exp(-inherent_mu)
 
     def mu(self, material: str) -> NDArray[np.float64]:
@@ -146,7 +149,7 @@ class SpectralModel:
         return np.zeros(len(self.names))
 
     def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
-        """Photons in the beam (draw, energy) per bin, mAs and mm2 of pixel at 1 m, for parameter sets (draw, parameter)."""
+        """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
         kV_error = self._column(samples, "kV_error")
         nodes = self.fluence(beam.kV)
         top = int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1
@@ -158,14 +161,19 @@ class SpectralModel:
             scale = np.exp(self._column(samples, name)) if name in self._index else np.ones(len(samples))
             exponent = exponent - (layer.thickness_mm * scale)[:, None] * self.mu(layer.material)[:top]
         exponent = exponent + self._column(samples, "hardness_exponent")[:, None] * np.log(energies / REFERENCE_KEV)
-        exponent = exponent + (
-            self._column(samples, "log_output")
-            + self._column(samples, "yield_exponent") * np.log(beam.kV / REFERENCE_KV)
-        )[:, None]
+        exponent = (
+            exponent
+            + (
+                self._column(samples, "log_output")
+                + self._column(samples, "yield_exponent") * np.log(beam.kV / REFERENCE_KV)
+            )[:, None]
+        )
         width = energies[1] - energies[0]
         return np.asarray(fluence * self._inherent[:top] * np.exp(exponent) * (width / 100.0))
 
-    def signal(self, samples: NDArray[np.float64], beam: OpenBeam, through: NDArray[np.float64] | None = None) -> BeamSignal:
+    def signal(
+        self, samples: NDArray[np.float64], beam: OpenBeam, through: NDArray[np.float64] | None = None
+    ) -> BeamSignal:
         """Rate, gain and photons of a beam for parameter sets (draw, parameter).
 
         Args:

@@ -1,7 +1,7 @@
 """From a reference image to a shorter exposure: add the noise that is missing, no more.
 
-A reference is itself a measurement. Scaled to the target it already carries a share of the target's noise, blurred by the
-same detector, so the signal is not blurred again and only the rest is drawn.
+A reference is itself a measurement. Scaled to the target it already carries a share of the target's noise, blurred by
+the same detector, so the signal is not blurred again and only the rest is drawn.
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
             "target setting",
             received=f"{target}",
             expected=f"the kV and filter of the reference ({reference})",
-            remedy="a top-up changes current, exposure and averaging; measure or generate references at this kV and filter",
+            remedy="a top-up changes current, exposure and averaging; measure references at this kV and filter",
         )
     if target.source_detector_mm != reference.source_detector_mm and None not in (
         target.source_detector_mm,

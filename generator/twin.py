@@ -27,7 +27,9 @@ class Estimate:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.value) and self.low <= self.value <= self.high):
             raise InputError(
-                "estimate", received=f"{self.value} ({self.low} to {self.high})", expected="low <= value <= high, finite"
+                "estimate",
+                received=f"{self.value} ({self.low} to {self.high})",
+                expected="low <= value <= high, finite",
             )
 
     def as_dict(self) -> dict[str, float]:
@@ -46,9 +48,9 @@ class Level:
     """One tube voltage and filter that was measured.
 
     Fields: kV (None where unknown), filters; gain_DN (variance per signal, the spread's share restored);
-    photon_transfer_slope_DN (variance of one pixel per signal, as measured); rate_DN_per_mAs (detector median above dark
-    at source_detector_mm; None where the tube load is unknown); saturation_DN (None where none was seen); flat_shape
-    (row, column): signal relative to the detector median.
+    photon_transfer_slope_DN (variance of one pixel per signal, as measured); rate_DN_per_mAs (detector median above
+    dark at source_detector_mm; None where the tube load is unknown); saturation_DN (None where none was seen);
+    flat_shape (row, column): signal relative to the detector median.
     """
 
     kV: float | None
@@ -73,8 +75,8 @@ class Level:
 class NoiseModel:
     """Noise of the detector: see generator.psf for the two descriptions of the optical spread.
 
-    Fields: psf_model, psf_sigma_px; white_fraction: signal-following white variance over the quantum variance before the
-    spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN.
+    Fields: psf_model, psf_sigma_px; white_fraction: signal-following white variance over the quantum variance before
+    the spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN.
     """
 
     psf_model: str
@@ -91,7 +93,7 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorMaps:
-    """Per-pixel maps (row, column): dark at `dark_exposure_ms`, its growth a ms, relative gain, read variance, bad pixels.
+    """Maps (row, column): dark at `dark_exposure_ms`, its growth a ms, relative gain, read variance, bad pixels.
 
     gain_relative is the pixel's gain over the detector median, shrunk towards 1 as far as the data are thin.
     """

@@ -38,4 +38,3 @@ def answer(result: Mapping[str, Any], *, as_json: bool, text: str) -> None:
 def say(line: str) -> None:
     """Print a progress or warning line to standard error."""
     sys.stderr.write(line.rstrip("\n") + "\n")
-

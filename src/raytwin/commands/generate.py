@@ -50,9 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
     material_from_name(arguments.product_material)
     if (arguments.reference_low is None) != (arguments.reference_high is None):
-        raise InputError(
-            "--reference-low and --reference-high", received="one of the two", expected="both or neither"
-        )
+        raise InputError("--reference-low and --reference-high", received="one of the two", expected="both or neither")
     fallback = None
     if arguments.reference_low is not None:
         fallback = (setting_from_text(arguments.reference_low), setting_from_text(arguments.reference_high))

@@ -61,7 +61,9 @@ def _text(result: dict[str, Any]) -> str:
     lines = [result["setting"]]
     for name, unit in units.items():
         value = result[name]
-        text = "not known" if value is None else f"{value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g}) {unit}"
+        text = (
+            "not known" if value is None else f"{value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g}) {unit}"
+        )
         lines.append(f"{name:<17} {text}")
     lines.append(f"extrapolated      {'yes' if result['extrapolated'] else 'no'}")
     return "\n".join(lines)

@@ -783,3 +783,11 @@ def test_every_layout_has_a_help_with_an_example(layout, capsys):
         main(["import", layout, "--help"])
     assert caught.value.code == 0
     assert f"raytwin import {layout}" in capsys.readouterr().out
+
+
+def test_an_output_that_cannot_be_written_is_one_line(emva, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for out, told in ((tmp_path, "got a folder"), (tmp_path / "file" / "o.h5", "got a place that cannot be written")):
+        assert main(["import", "emva1288", str(emva), "-o", str(out)]) == 2
+        line = capsys.readouterr().err
+        assert told in line and line.count("\n") == 1

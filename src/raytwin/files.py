@@ -7,14 +7,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .errors import InputError
+
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes `path` when the block succeeds and disappears when it fails."""
+    """A temporary name beside `path` that becomes `path` when the block succeeds and disappears when it fails.
+
+    Raises:
+        InputError: `path` is a folder, or lies where nothing can be written.
+    """
     final = Path(path)
-    final.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent)
-    os.close(handle)
+    if final.is_dir():
+        raise InputError(str(path), received="a folder", expected="the name of a file to write")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{final.name}.", suffix=".part", dir=final.parent)
+        os.close(handle)
+    except OSError as error:
+        raise InputError(
+            str(path),
+            received=f"a place that cannot be written ({error.strerror})",
+            expected="a file in a folder of yours",
+        ) from None
     temporary = Path(name)
     try:
         yield temporary

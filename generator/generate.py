@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.dataset_io import Dataset, DatasetRow, write_dataset
-from ..acquisition.pairs import flat_corrected_log
+from ..acquisition.pairs import flat_corrected_log, replace_bad_pixels
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import InputError
 from ..files import sha256_of_file
@@ -81,8 +81,11 @@ class ChannelModel:
             )
         predicted = predict_flatfield(self.twin, replace(self.target, averaged=1))
         self.level = level
-        self.open_signal_DN = predicted.mean_DN.value * level.flat_shape.astype(np.float64)
-        self.dark_DN = self.twin.maps.dark_at(self.target.exposure_ms)
+        # bad pixels were replaced by their neighbours in the references, so flat, dark and noise are those of a good pixel
+        bad = self.twin.maps.bad_pixels > 0
+        shape = replace_bad_pixels(level.flat_shape.astype(np.float64), bad)
+        self.open_signal_DN = predicted.mean_DN.value * shape
+        self.dark_DN = replace_bad_pixels(self.twin.maps.dark_at(self.target.exposure_ms), bad)
         self.gain_DN = predicted.gain_DN.value
         if self.twin.spectral is None:
             self._transmission, self._gain_ratio = np.array([0.0, 1.0]), np.ones(2)
@@ -133,7 +136,6 @@ class ChannelModel:
         return flat_corrected_log(counts, dark_DN=self.dark_DN, flat_DN=self.open_signal_DN + self.dark_DN)
 
     def _read_variance(self) -> NDArray[np.float32]:
-        # bad pixels were replaced by their neighbours in the references, so they get a good pixel's noise
         variance = self.twin.maps.read_variance_DN2
         good = self.twin.maps.bad_pixels == 0
         return np.where(good, variance, np.float32(np.median(variance[good]))).astype(np.float32)

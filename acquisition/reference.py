@@ -20,7 +20,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from .contrast import DILATIONS, PRODUCT_THRESHOLD, delta_r, dilations_for_pixel
 from .dataset_io import SPLITS, DatasetRow, write_dataset
 from .images import import_images
 from .import_report import ImportReport, Skipped
-from .pairs import dataset_from_acquisition, object_pairs, split_by_product
+from .pairs import dataset_from_acquisition, object_pairs, replace_bad_pixels, split_by_product
 from .setting import Setting, setting_from_text
 
 MINIMAL = "[pairs] low='low/*.tif' high='high/*.tif' foreign_object_mask='bone/*.png' low_setting=... high_setting=..."
@@ -74,7 +74,7 @@ def import_reference(
             0.15 mm where the pixel size is known, else 21.
         validation, test: shares of the products to put into these splits; None keeps the splits that are given.
         rng: deals the products out to the splits; needed with `validation` or `test`.
-        bad_pixels: (row, column), True where raw frames are replaced by their neighbours.
+        bad_pixels: (row, column), True where the log images are replaced by their neighbours.
         progress: called with (pairs done, pairs in all).
 
     Raises:
@@ -86,10 +86,17 @@ def import_reference(
         if rng is None:
             raise InputError("rng", received="none", expected="a random generator to deal products out to splits")
         shares = (validation or 0.0, test or 0.0, rng)
+    wanted = _Wanted(
+        low=low,
+        high=high,
+        each_frame=each_frame,
+        dilations=dilations,
+        shares=shares,
+        bad_pixels=bad_pixels,
+        progress=progress,
+    )
     if path.is_file():
-        return _from_acquisition(
-            path, path, out, low, high, each_frame, dilations, shares, bad_pixels, progress, skipped=(), notes=()
-        )
+        return _from_acquisition(path, path, out, wanted)
     tables = read_sidecar(
         path,
         None if sidecar is None else Path(sidecar),
@@ -97,50 +104,47 @@ def import_reference(
         minimal=MINIMAL,
     )
     if "pairs" in tables:
-        return _from_images(path, out, tables, dilations, shares, progress)
+        return _from_images(path, out, tables, wanted)
     with tempfile.TemporaryDirectory(prefix="raytwin-") as folder:
         # The frames take the way of every raw series; the acquisition is not needed afterwards.
         step = Path(folder) / "acquisition.h5"
-        report = import_images(path, step, sidecar=sidecar)
-        return _from_acquisition(
-            path, step, out, low, high, each_frame, dilations, shares, bad_pixels, progress, report.skipped, report.notes
-        )
+        images = import_images(path, step, sidecar=sidecar)
+        report = _from_acquisition(path, step, out, wanted)
+        return replace(report, skipped=(*images.skipped, *report.skipped), notes=(*images.notes, *report.notes))
 
 
-_Shares = tuple[float, float, np.random.Generator]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Wanted:
+    """The choices of one import, as `import_reference` explains them."""
+
+    low: Setting | None
+    high: Setting | None
+    each_frame: bool
+    dilations: int | None
+    shares: tuple[float, float, np.random.Generator] | None
+    bad_pixels: NDArray[np.bool_] | None
+    progress: Callable[[int, int], None] | None
 
 
-def _from_acquisition(
-    source: Path,
-    path: Path,
-    out: str | os.PathLike[str],
-    low: Setting | None,
-    high: Setting | None,
-    each_frame: bool,
-    dilations: int | None,
-    shares: _Shares | None,
-    bad_pixels: NDArray[np.bool_] | None,
-    progress: Callable[[int, int], None] | None,
-    skipped: tuple[Skipped, ...],
-    notes: tuple[str, ...],
-) -> ImportReport:
+def _from_acquisition(source: Path, path: Path, out: str | os.PathLike[str], wanted: _Wanted) -> ImportReport:
     with open_acquisition(path) as acquisition:
         split = None
-        if shares is not None:
+        if wanted.shares is not None:
             scenes = {pair.scene for pair in object_pairs(acquisition)} & set(acquisition.scenes)
             products = {scene: acquisition.scenes[scene].product or scene for scene in sorted(scenes)}
-            split = split_by_product(products, validation=shares[0], test=shares[1], rng=shares[2])
+            validation, test, rng = wanted.shares
+            split = split_by_product(products, validation=validation, test=test, rng=rng)
         summary = dataset_from_acquisition(
             acquisition,
             out,
-            low=low,
-            high=high,
+            low=wanted.low,
+            high=wanted.high,
             split=split,
-            each_frame=each_frame,
-            dilations=_ring(dilations, acquisition.instrument.pixel_mm),
-            bad_pixels=bad_pixels,
+            each_frame=wanted.each_frame,
+            dilations=_ring(wanted.dilations, acquisition.instrument.pixel_mm),
+            bad_pixels=wanted.bad_pixels,
             provenance={"source": source.name},
-            progress=progress,
+            progress=wanted.progress,
         )
     return ImportReport(
         layout="reference",
@@ -152,8 +156,8 @@ def _from_acquisition(
             for setting in summary.settings
         ),
         frames=summary.images,
-        skipped=(*skipped, *(Skipped(what=line.split(":", 1)[0], reason=_reason(line)) for line in summary.skipped)),
-        notes=(*notes, *summary.notes),
+        skipped=tuple(Skipped(what=line.split(":", 1)[0], reason=_reason(line)) for line in summary.skipped),
+        notes=summary.notes,
     )
 
 
@@ -167,14 +171,7 @@ def _ring(dilations: int | None, pixel_mm: float | None) -> int:
     return DILATIONS if pixel_mm is None else dilations_for_pixel(pixel_mm)
 
 
-def _from_images(
-    folder: Path,
-    out: str | os.PathLike[str],
-    tables: Mapping[str, Any],
-    dilations: int | None,
-    shares: _Shares | None,
-    progress: Callable[[int, int], None] | None,
-) -> ImportReport:
+def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str, Any], wanted: _Wanted) -> ImportReport:
     where = f"{NAME}, [pairs]"
     table = tables["pairs"]
     if not isinstance(table, dict):
@@ -215,11 +212,12 @@ def _from_images(
             expected="files that match low, high and foreign_object_mask",
         )
     splits = {}
-    if shares is not None:
+    if wanted.shares is not None:
+        validation, test, rng = wanted.shares
         products = {name: rows.get(name, {}).get("product") or name for name in names}
-        splits = split_by_product(products, validation=shares[0], test=shares[1], rng=shares[2])
+        splits = split_by_product(products, validation=validation, test=test, rng=rng)
     raw = raw_layout_of(tables, where=NAME)
-    ring = _ring(dilations, instrument_of(tables, where=NAME).pixel_mm)
+    ring = _ring(wanted.dilations, instrument_of(tables, where=NAME).pixel_mm)
     notes: list[str] = []
     counted = 0
     shape: tuple[int, int] | None = None
@@ -230,9 +228,11 @@ def _from_images(
             raise FileFormatError(str(path), received="a value that is not finite", expected="finite values")
         if shape is not None and image.shape != shape:
             raise FileFormatError(str(path), received=f"shape {image.shape}", expected=f"shape {shape} as the others")
-        if values == "log":
-            return image
-        return np.asarray(-np.log(np.maximum(image, SMALLEST_TRANSMISSION)), dtype=np.float32)
+        if values == "transmission":
+            image = np.asarray(-np.log(np.maximum(image, SMALLEST_TRANSMISSION)), dtype=np.float32)
+        if wanted.bad_pixels is not None and bool(wanted.bad_pixels.any()):
+            image = np.asarray(replace_bad_pixels(image, wanted.bad_pixels), dtype=np.float32)
+        return image
 
     first = log_image(patterns["low"][names[0]])
     shape = (first.shape[0], first.shape[1])
@@ -251,8 +251,8 @@ def _from_images(
                 ),
             )
             counted += bool(row.foreign_object)
-            if progress is not None:
-                progress(done + 1, len(names))
+            if wanted.progress is not None:
+                wanted.progress(done + 1, len(names))
     read = {"setting": ";".join(map(str, settings)), "images": len(names), "with_foreign_object": counted}
     return ImportReport(
         layout="reference",

@@ -16,6 +16,7 @@ from raytwin.acquisition import (
     delta_r,
     open_acquisition,
     read_dataset,
+    replace_bad_pixels,
     setting_from_text,
     write_acquisition,
 )
@@ -791,3 +792,13 @@ def test_an_output_that_cannot_be_written_is_one_line(emva, tmp_path, capsys):
         assert main(["import", "emva1288", str(emva), "-o", str(out)]) == 2
         line = capsys.readouterr().err
         assert told in line and line.count("\n") == 1
+
+
+def test_bad_pixels_of_a_twin_are_replaced_in_every_image(pairs, tmp_path):
+    bad = np.zeros(SHAPE, bool)
+    bad[6, 8] = True
+    import_reference(pairs, tmp_path / "d.h5", bad_pixels=bad)
+    with read_dataset(tmp_path / "d.h5") as dataset:
+        images = np.stack(log_pair(2, bone=True)[:2])
+        np.testing.assert_array_equal(dataset.images(1), replace_bad_pixels(images, bad))
+        assert (dataset.images(1) != images).any()

@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
             layout.add_argument("--test", type=float, metavar="SHARE", help="share of products for testing")
             layout.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the split (default 0)")
-            layout.add_argument("--twin", metavar="TWIN", help="replace this twin's bad pixels in raw frames")
+            layout.add_argument("--twin", metavar="TWIN", help="replace the bad pixels that this twin knows")
 
 
 def run(arguments: argparse.Namespace) -> int:

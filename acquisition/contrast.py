@@ -51,8 +51,7 @@ def delta_r(
             received=f"shapes {low.shape}, {high.shape} and {mask.shape}",
             expected="one shape (row, column)",
         )
-    if dilations < 1:
-        raise InputError("dilations", received=dilations, expected="1 pixel or more")
+    check_dilations(dilations)
     if not mask.any():
         raise InputError("foreign-object mask", received="an empty mask", expected="at least one pixel")
     inside = mask & (high > 0)
@@ -70,6 +69,12 @@ def delta_r(
                 remedy="check that mask and image belong together",
             )
     return float(np.mean(low[inside] / high[inside]) - np.mean(low[ring] / high[ring]))
+
+
+def check_dilations(dilations: int) -> None:
+    """Refuse a ring that is no pixel wide."""
+    if dilations < 1:
+        raise InputError("dilations", received=dilations, expected="1 pixel or more")
 
 
 def dilations_for_pixel(pixel_mm: float) -> int:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .acquisition_io import AcquisitionFile, Scene, Series
-from .contrast import DILATIONS, PRODUCT_THRESHOLD, delta_r
+from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r
 from .dataset_io import DatasetRow, write_dataset
 from .setting import Setting
 
@@ -367,6 +367,7 @@ def dataset_from_acquisition(
     Raises:
         InputError: no pair, several pairs of settings and none chosen, or no dark or flat that matches.
     """
+    check_dilations(dilations)
     pairs = object_pairs(acquisition)
     if not pairs:
         raise InputError(

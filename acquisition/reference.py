@@ -31,7 +31,7 @@ from ..errors import FileFormatError, InputError
 from ._image_files import number_or_nan, read_image, read_mask
 from ._sidecar import NAME, check_words, instrument_of, raw_layout_of, read_sidecar, starred, text_of
 from .acquisition_io import open_acquisition
-from .contrast import DILATIONS, PRODUCT_THRESHOLD, delta_r, dilations_for_pixel
+from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r, dilations_for_pixel
 from .dataset_io import SPLITS, DatasetRow, write_dataset
 from .images import import_images
 from .import_report import ImportReport, Skipped
@@ -55,7 +55,7 @@ def import_reference(
     low: Setting | None = None,
     high: Setting | None = None,
     each_frame: bool = False,
-    dilations: int | None = None,
+    dilations: int = DILATIONS,
     validation: float | None = None,
     test: float | None = None,
     rng: np.random.Generator | None = None,
@@ -70,8 +70,7 @@ def import_reference(
         sidecar: TOML file; None = `raytwin.toml` in the folder.
         low, high: settings of the pair, where an acquisition holds several.
         each_frame: every frame of an acquisition makes an image; otherwise the frames of a series are averaged.
-        dilations: width of the ring (pixels) that contrasts are measured against; None = as wide as 21 pixels of
-            0.15 mm where the pixel size is known, else 21.
+        dilations: width of the ring (pixels) that contrasts are measured against.
         validation, test: shares of the products to put into these splits; None keeps the splits that are given.
         rng: deals the products out to the splits; needed with `validation` or `test`.
         bad_pixels: (row, column), True where the log images are replaced by their neighbours.
@@ -81,6 +80,7 @@ def import_reference(
         InputError: no sidecar, no pair, settings that do not fit, masks of another shape.
     """
     path = Path(source)
+    check_dilations(dilations)
     shares = None
     if validation is not None or test is not None:
         if rng is None:
@@ -120,7 +120,7 @@ class _Wanted:
     low: Setting | None
     high: Setting | None
     each_frame: bool
-    dilations: int | None
+    dilations: int
     shares: tuple[float, float, np.random.Generator] | None
     bad_pixels: NDArray[np.bool_] | None
     progress: Callable[[int, int], None] | None
@@ -141,11 +141,12 @@ def _from_acquisition(source: Path, path: Path, out: str | os.PathLike[str], wan
             high=wanted.high,
             split=split,
             each_frame=wanted.each_frame,
-            dilations=_ring(wanted.dilations, acquisition.instrument.pixel_mm),
+            dilations=wanted.dilations,
             bad_pixels=wanted.bad_pixels,
             provenance={"source": source.name},
             progress=wanted.progress,
         )
+        ring_note = _ring_note(wanted.dilations, acquisition.instrument.pixel_mm)
     return ImportReport(
         layout="reference",
         source=str(source),
@@ -157,7 +158,7 @@ def _from_acquisition(source: Path, path: Path, out: str | os.PathLike[str], wan
         ),
         frames=summary.images,
         skipped=tuple(Skipped(what=line.split(":", 1)[0], reason=_reason(line)) for line in summary.skipped),
-        notes=summary.notes,
+        notes=(*summary.notes, *ring_note),
     )
 
 
@@ -165,10 +166,13 @@ def _reason(line: str) -> str:
     return line.split(":", 1)[1].strip() if ":" in line else line
 
 
-def _ring(dilations: int | None, pixel_mm: float | None) -> int:
-    if dilations is not None:
-        return dilations
-    return DILATIONS if pixel_mm is None else dilations_for_pixel(pixel_mm)
+def _ring_note(dilations: int, pixel_mm: float | None) -> tuple[str, ...]:
+    if pixel_mm is None or dilations != DILATIONS or dilations_for_pixel(pixel_mm) == DILATIONS:
+        return ()
+    return (
+        f"contrasts are measured against a ring of {dilations} pixels, here {dilations * pixel_mm:.2g} mm wide;"
+        f" --ring-px {dilations_for_pixel(pixel_mm)} makes it as wide as the paper's",
+    )
 
 
 def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str, Any], wanted: _Wanted) -> ImportReport:
@@ -217,8 +221,7 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
         products = {name: rows.get(name, {}).get("product") or name for name in names}
         splits = split_by_product(products, validation=validation, test=test, rng=rng)
     raw = raw_layout_of(tables, where=NAME)
-    ring = _ring(wanted.dilations, instrument_of(tables, where=NAME).pixel_mm)
-    notes: list[str] = []
+    notes = list(_ring_note(wanted.dilations, instrument_of(tables, where=NAME).pixel_mm))
     counted = 0
     shape: tuple[int, int] | None = None
 
@@ -241,7 +244,7 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
             image = np.stack([log_image(patterns[word][name]) for word in ("low", "high")])
             foreign = _mask(patterns["foreign_object_mask"].get(name), shape)
             product = _mask(patterns.get("product_mask", {}).get(name), shape)
-            row = _row(name, rows.get(name, {}), image, foreign, ring, notes)
+            row = _row(name, rows.get(name, {}), image, foreign, wanted.dilations, notes)
             writer.append(
                 image=image,
                 foreign_object_mask=foreign,

@@ -698,7 +698,8 @@ def test_corrected_pairs_with_masks_become_a_dataset(pairs, tmp_path, capsys):
         low, high, masks = log_pair(2, bone=True)
         np.testing.assert_array_equal(dataset.images(1), [low, high])
         np.testing.assert_array_equal(dataset.product_masks(1), masks[0] != 0)
-        assert row.contrast == pytest.approx(delta_r(low, high, masks[1], dilations=7))
+        assert row.contrast == pytest.approx(delta_r(low, high, masks[1]))
+        assert any("--ring-px 7 makes it as wide" in note for note in account["notes"])
         assert dataset.rows[2].foreign_object == "unnamed" and dataset.rows[0].foreign_object == ""
 
 
@@ -740,6 +741,11 @@ def test_incomplete_pairs_are_skipped_and_products_dealt_out(pairs, tmp_path):
 def test_a_sidecar_of_pairs_that_cannot_be_used_says_why(pairs, tmp_path, capsys, old, new, message):
     (pairs / "raytwin.toml").write_text(PAIRS.replace(old, new))
     assert message in refused(capsys, "reference", pairs, out=tmp_path / "d.h5")
+
+
+def test_a_ring_narrower_than_a_pixel_is_refused(pairs, tmp_path, capsys):
+    line = refused(capsys, "reference", pairs, "--ring-px", "0", out=tmp_path / "d.h5")
+    assert "dilations: got 0; expected 1 pixel or more" in line
 
 
 def test_masks_of_another_shape_are_refused(pairs, tmp_path, capsys):

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             layout.add_argument(
                 "--each-frame", action="store_true", help="each frame is an image (default: their mean)"
             )
-            layout.add_argument("--ring-px", type=int, metavar="N", help="ring that contrasts are measured against")
+            layout.add_argument("--ring-px", type=int, default=21, metavar="N", help="ring of a contrast (default 21)")
             layout.add_argument(
                 "--validation", type=float, metavar="SHARE", help="share of the products for validation"
             )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..files import whole_file
 
 ENVIRONMENT_VARIABLE = "RAYTWIN_CACHE"
@@ -25,7 +26,8 @@ def cache_folder() -> Path:
 def read_kept(name: str, key: dict[str, object], *, size: int) -> NDArray[np.float64] | None:
     """The array (2, size) kept under `name` for exactly this key, or None where absent, damaged or of another key."""
     try:
-        with np.load(cache_folder() / name, allow_pickle=False) as stored:
+        # opened here, because numpy leaves the file open when the archive is damaged
+        with (cache_folder() / name).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             if str(stored["key"]) != _text(key):
                 return None
             values = np.asarray(stored["fluence"], dtype=float)
@@ -40,7 +42,7 @@ def keep(name: str, key: dict[str, object], values: NDArray[np.float64]) -> None
     try:
         with whole_file(cache_folder() / name) as temporary, temporary.open("wb") as stream:
             np.savez(stream, key=np.array(_text(key)), fluence=values)
-    except OSError:
+    except (OSError, InputError):
         return
 
 

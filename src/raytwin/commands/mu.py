@@ -78,7 +78,6 @@ def run(arguments: argparse.Namespace) -> int:
         lines = [f"mu       {mu:.6g} /mm ({result['mass_attenuation_cm2_g']:.6g} cm2/g)"]
     else:
         spectrum = beam_of(arguments, library)
-        warn_of_soft_beam(spectrum)
         response = detector_of(arguments, spectrum, library)
         thin = float(effective_mu_per_mm(material, spectrum=spectrum, response=response, table=arguments.table))
         result["mu_eff_per_mm"] = thin
@@ -93,6 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
             result["mu_eff_at_thickness_per_mm"] = thick
             lines.append(f"mu_eff   {thick:.6g} /mm (measured through {thickness:g} mm)")
+        warn_of_soft_beam(spectrum)
     head = f"{material.name}, {material.density_g_cm3:.4g} g/cm3, {where}"
     answer(result, as_json=arguments.json, text="\n".join([head, *lines]))
     return 0

@@ -47,8 +47,7 @@ class Laplace:
         s2 = float(sd[1]) if self.second is not None else 0.0
         step = np.zeros_like(b)
         best = np.inf
-        keep = b
-        logdet = 0.0
+        weight = np.zeros_like(offset)
         for _ in range(100):
             trial = b + step
             eta = offset + s1 * trial[:n1][self.first]
@@ -61,14 +60,16 @@ class Laplace:
                 if np.abs(step).max() < 1e-14:
                     break
                 continue
-            best, b, keep = value, trial, trial
+            best, b = value, trial
             score = self.hits * parts.log_hit_1 + self.misses * parts.log_miss_1
             weight = -(self.hits + self.misses) * parts.log_hit_1 * parts.log_miss_1
             gradient = self._spread(score, s1, s2) - b
-            step, logdet = self._solve(weight, gradient, s1, s2)
-            if float(gradient @ step) < 1e-12:
+            # Newton with the observed curvature finds the mode of a log-concave density; scoring may circle it
+            step, _ = self._solve(-(self.hits * parts.log_hit_2 + self.misses * parts.log_miss_2), gradient, s1, s2)
+            if float(gradient @ step) < 1e-18:
                 break
-        self.mode = keep
+        self.mode = b
+        _, logdet = self._solve(weight, np.zeros_like(b), s1, s2)
         return best + logdet
 
     def _spread(self, rows: Array, s1: float, s2: float) -> Array:

@@ -147,7 +147,7 @@ def _filled(whole: Array, free: NDArray[np.bool_], part: Array) -> Array:
 
 
 def minimise(
-    function: Callable[[Array], float], start: Array, *, hessian: Array | None = None, tolerance: float = 1e-7
+    function: Callable[[Array], float], start: Array, *, hessian: Array | None = None, tolerance: float = 1e-11
 ) -> tuple[Array, float, Array, bool]:
     """Minimum of a smooth function of a few parameters: point, value, Hessian, success.
 
@@ -158,20 +158,19 @@ def minimise(
     value = function(point)
     model = second_differences(function, point, value) if hessian is None else hessian.copy()
     gradient = _gradient(function, point)
+    fresh = hessian is None
     for iteration in range(200):
         step = -np.linalg.solve(_positive(model), gradient)
         longest = np.abs(step).max()
         step *= min(1.0, 2.0 / max(longest, 1e-300))
         gain = -float(gradient @ step)
-        if gain < tolerance:
+        if gain < tolerance * (1 + abs(value)):
             if hessian is not None:
                 return point, value, model, True
-            model = second_differences(function, point, value)
-            fresh = -np.linalg.solve(_positive(model), gradient)
-            if -float(gradient @ fresh) < 10 * tolerance:
-                return point, value, model, True
-            step = fresh * min(1.0, 1.0 / max(np.abs(fresh).max(), 1e-300))
-            gain = -float(gradient @ step)
+            if not fresh:
+                model, fresh = second_differences(function, point, value), True
+                continue
+            return point, value, model, True
         length = 1.0
         for _ in range(30):
             trial = point + length * step
@@ -180,7 +179,11 @@ def minimise(
                 break
             length *= 0.5
         else:
-            return point, value, model, gain < 1e-4
+            # no lower point along the step: a poor model of the curvature, or the minimum to rounding
+            if fresh:
+                return point, value, model, gain < 1e-5 * (1 + abs(value))
+            model, fresh = second_differences(function, point, value), True
+            continue
         moved = trial - point
         new_gradient = _gradient(function, trial)
         change = new_gradient - gradient
@@ -194,7 +197,7 @@ def minimise(
             )
         elif iteration % 5 == 4:
             model = second_differences(function, trial, trial_value)
-        point, value, gradient = trial, trial_value, new_gradient
+        point, value, gradient, fresh = trial, trial_value, new_gradient, False
     return point, value, model, False
 
 
@@ -215,7 +218,7 @@ def _gradient(function: Callable[[Array], float], point: Array, width: float = 1
 
 
 def second_differences(
-    function: Callable[[Array], float], point: Array, value: float | None = None, width: float = 1e-3
+    function: Callable[[Array], float], point: Array, value: float | None = None, width: float = 3e-3
 ) -> Array:
     """Hessian (parameter, parameter) of a function by central second differences."""
     size = len(point)
@@ -412,7 +415,7 @@ def _bounds(
             eta90 = averaged_eta(0.9, math.hypot(*parameters[1:]), link=link)
             return laplace.deviance(eta90 + parameters[0] * (x - at), parameters[1:])
 
-        point, value, hessian, _ = minimise(held, state["point"], hessian=state["hessian"], tolerance=1e-5)
+        point, value, hessian, _ = minimise(held, state["point"], hessian=state["hessian"], tolerance=1e-8)
         state["point"], state["hessian"] = point, hessian
         return value - mixed.deviance
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FitError, InputError
 from .likelihood import Curve, size_bound
 from .links import Link, link_from_name
+from .modified import modified_bound
 from .separation import check_separation
 from .solver import fit_batch
 from .trials import Trials, check_trials, group_by_size
@@ -31,10 +32,15 @@ Z_TWO_SIDED = 1.959963984540054
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bounds:
-    """One bound by both constructions, in the size's unit; None where the data support none."""
+    """One bound by each construction, in the size's unit; None where the data support none.
+
+    modified: the likelihood ratio with Skovgaard's correction for few trials (see `modified.py`); None where the fit
+    is not a maximum-likelihood one of independent trials.
+    """
 
     likelihood_ratio: float | None = None
     wald: float | None = None
+    modified: float | None = None
 
 
 NO_BOUNDS = Bounds()
@@ -213,6 +219,7 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
         covariance=covariance,
         supremum=supremum,
         divisor=divisor,
+        at_maximum=used == "ml",
     )
     sizes = sizes_from_curve(curve, table=table, log_size=log_size)
     return PodFit(
@@ -294,8 +301,13 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, robust: Arr
         for key, z, upper in (("one", Z_ONE_SIDED, True), ("two", Z_TWO_SIDED, True), ("low", Z_TWO_SIDED, False)):
             ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=x90)
             wald = x90 + z * error if upper else x90 - z * error
+            modified = None
+            if curve.at_maximum and robust is None:
+                modified = modified_bound(judged, eta=eta, z=z, upper=upper, start=ratio)
             bounds[key] = Bounds(
-                likelihood_ratio=size_from_x(ratio, log_size=log_size), wald=size_from_x(wald, log_size=log_size)
+                likelihood_ratio=size_from_x(ratio, log_size=log_size),
+                wald=size_from_x(wald, log_size=log_size),
+                modified=size_from_x(modified, log_size=log_size),
             )
         one, two, low = bounds["one"], bounds["two"], bounds["low"]
         if two.likelihood_ratio is None:
@@ -305,7 +317,7 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, robust: Arr
                 " bound on a90 (more trials, or sizes over a wider range, would)"
             )
         largest_size = float(table.size.max())
-        given = [value for value in (one.likelihood_ratio, one.wald) if value is not None]
+        given = [value for value in (one.likelihood_ratio, one.wald, one.modified) if value is not None]
         if given and max(given) > largest_size:
             notes.append(f"a 95 % bound on a90 lies beyond the largest size tested ({largest_size:g}): extrapolated")
     return Sizes(

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 class Curve:
     """A curve's data and fit on the x it is linear in: distinct x, hits and misses (distinct,), link, coefficients.
 
-    `supremum` is the largest attainable log-likelihood, `divisor` what the likelihood is divided by (repeats).
+    `supremum` is the largest attainable log-likelihood, `divisor` what the likelihood is divided by (repeats),
+    `at_maximum` whether the coefficients are the most likely ones (not so for a bias-reduced fit).
     """
 
     x: Array
@@ -33,6 +34,7 @@ class Curve:
     covariance: Array
     supremum: float
     divisor: float = 1.0
+    at_maximum: bool = True
 
 
 def profile(curve: Curve, x: Array, eta: Array, slope: Array) -> tuple[Array, Array, Array]:

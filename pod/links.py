@@ -53,7 +53,9 @@ def _hazard_parts(eta: Array) -> tuple[Array, Array, Array, Array]:
     t = np.exp(np.clip(eta, -_LIMIT, 6.5))
     complement = -np.expm1(-t)
     r = t * (1 - complement) / complement
-    slope = np.where(t < 1e-4, -t / 2 + t * t / 6, r * (1 - t - r))
+    slope = r * (1 - t - r)
+    if t.min(initial=1.0) < 1e-4:
+        slope = np.where(t < 1e-4, -t / 2 + t * t / 6, slope)
     return t, np.log(complement), r, slope
 
 

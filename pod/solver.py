@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .links import Link
 
 Array = NDArray[np.float64]
-_CHUNK = 1_000_000  # elements of (fit, row) in memory at once
+_CHUNK = 32_768  # elements of (fit, row) worked on at once: they stay in the processor's cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +78,7 @@ def fit_batch(
     information = np.full((fits, width, width), np.nan)
     log_likelihood = np.full(fits, np.nan)
     converged = np.zeros(fits, bool)
-    step = max(1, _CHUNK // max(rows, 1))
+    step = max(8, _CHUNK // max(rows, 1))
     solve = _adjusted if bias_reduced else _newton
     for first in range(0, fits, step):
         part = slice(first, first + step)
@@ -118,52 +118,72 @@ def _solve_one(matrix: Array, vector: Array) -> Array:
         return np.full_like(vector, np.nan)
 
 
+def _products(columns: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Distinct products of two columns, (row, product), and where they stand in the matrix of all."""
+    upper = np.triu_indices(columns.shape[1])
+    places = np.empty((columns.shape[1],) * 2, np.intp)
+    places[upper] = places[upper[::-1]] = np.arange(len(upper[0]))
+    return np.ascontiguousarray(columns[:, upper[0]] * columns[:, upper[1]]), places
+
+
 def _newton(
     columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     fits, width = begin.shape
-    products = np.einsum("ki,kj->kij", columns, columns).reshape(len(columns), width * width)
-    current = begin
-    last_step = np.zeros_like(current)
-    best = np.full(fits, -np.inf)
-    gradient = np.zeros_like(current)
-    hessian = np.zeros((fits, width, width))
+    products, places = _products(columns)
+    result = np.full((fits, width), np.nan)
     information = np.full((fits, width, width), np.nan)
+    log_likelihood = np.full(fits, np.nan)
     converged = np.zeros(fits, bool)
-    running = np.arange(fits)
+    running = np.arange(fits)  # the arrays below hold these fits only
+    shared = bool(np.all(begin == begin[:1]))
+    current, step = begin, np.zeros_like(begin)
+    best = np.full(fits, -np.inf)
     for _ in range(iterations):
-        trial = current[running] + last_step[running]
-        eta = trial @ columns.T
-        parts = link.log_parts(eta)
-        h, m = hits[running], misses[running]
-        value = np.einsum("fk,fk->f", h, parts.log_hit) + np.einsum("fk,fk->f", m, parts.log_miss)
-        floor = best[running]
-        worse = ~(value >= floor - 1e-10 * (1 + np.abs(floor)))
-        last_step[running[worse]] *= 0.5
-        better = ~worse
-        moved = running[better]
-        if moved.size:
-            slope = h[better] * parts.log_hit_1[better] + m[better] * parts.log_miss_1[better]
-            weight = -(h[better] * parts.log_hit_2[better] + m[better] * parts.log_miss_2[better])
-            fisher = -(h[better] + m[better]) * parts.log_hit_1[better] * parts.log_miss_1[better]
-            current[moved] = trial[better]
-            best[moved] = value[better]
-            gradient[moved] = slope @ columns
-            hessian[moved] = (weight @ products).reshape(-1, width, width)
-            last_step[moved] = _solve(hessian[moved], gradient[moved])
-            information[moved] = (fisher @ products).reshape(-1, width, width)
-            decrement = np.einsum("fj,fj->f", gradient[moved], last_step[moved])
-            # half the decrement is what is left to gain; a last full step makes the error its square
-            done = decrement < 1e-13 * (1 + np.abs(best[moved]))
-            converged[moved[done]] = True
-        lost = ~np.isfinite(last_step[running]).all(axis=1) | (np.abs(last_step[running]).max(axis=1) < 1e-300)
-        running = running[~converged[running] & ~lost]
-        if not running.size:
+        if shared:
+            # all fits still stand at one point: one row of eta serves them all, and the sums are plain products
+            parts = link.log_parts(current[:1] @ columns.T)
+            value = hits @ parts.log_hit[0] + misses @ parts.log_miss[0]
+            gradient = hits @ (parts.log_hit_1.T * columns) + misses @ (parts.log_miss_1.T * columns)
+            curvature = hits @ (-parts.log_hit_2.T * products) + misses @ (-parts.log_miss_2.T * products)
+        else:
+            parts = link.log_parts((current + step) @ columns.T)
+            value = np.einsum("fk,fk->f", hits, parts.log_hit) + np.einsum("fk,fk->f", misses, parts.log_miss)
+            gradient = (hits * parts.log_hit_1 + misses * parts.log_miss_1) @ columns
+            curvature = -(hits * parts.log_hit_2 + misses * parts.log_miss_2) @ products
+        better = value >= best - 1e-10 * (1 + np.abs(best))
+        hessian = curvature[:, places]
+        newton = _solve(hessian, gradient)
+        decrement = np.einsum("fj,fj->f", gradient, newton)
+        # what is left is the square of the step: one more step without a look is exact to rounding
+        done = better & (np.abs(decrement) < 1e-12 * (1 + np.abs(value)))
+        if done.any():
+            at = running[done]
+            result[at] = current[done] + step[done] + newton[done]
+            share = -parts.log_hit_1 * parts.log_miss_1
+            information[at] = ((hits[done] + misses[done]) * (share if shared else share[done]) @ products)[:, places]
+            log_likelihood[at] = value[done] + 0.5 * decrement[done]
+            converged[at] = True
+        shared = False
+        if better.all():
+            current, best, step = current + step, value, newton
+        else:
+            current = np.where(better[:, None], current + step, current)
+            best = np.where(better, value, best)
+            step = np.where(better[:, None], newton, 0.5 * step)
+        going = ~done & np.isfinite(step).all(axis=1) & (np.abs(step).max(axis=1) > 1e-300)
+        if not going.any():
             break
-    # a fit whose curve became a step has run off to infinity: no maximum exists
-    converged &= np.abs(current).max(axis=1) < 200.0
-    current[~converged] = np.nan
-    return current, information, np.where(converged, best, np.nan), converged
+        if not going.all():
+            running, current, step, best = running[going], current[going], step[going], best[going]
+            hits, misses = hits[going], misses[going]
+    # where the curve became a step on its way to infinity, the information has lost a direction: no maximum exists
+    scale = np.sqrt(np.einsum("fjj->fj", information))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        even = np.linalg.det(information / scale[:, :, None] / scale[:, None, :])
+    converged &= (even > 1e-11) & (scale.max(axis=1) > 1e-5)
+    result[~converged] = np.nan
+    return result, information, np.where(converged, log_likelihood, np.nan), converged
 
 
 def _adjusted(

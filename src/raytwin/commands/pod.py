@@ -21,9 +21,7 @@ EXAMPLE = """examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("table", metavar="TABLE.csv", help="a row per trial, or per size with --trials")
-    parser.add_argument(
-        "--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... whichever is there first"
-    )
+    parser.add_argument("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
     parser.add_argument("--hit", metavar="COLUMN", help="0 or 1; A,B,C = one inspection each; default: hit")
     parser.add_argument("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
     parser.add_argument("--link", default="cloglog", choices=("cloglog", "loglog", "logit", "probit"))

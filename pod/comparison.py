@@ -1,0 +1,349 @@
+"""Are two POD curves the same? Real against generated, before against after.
+
+difference = a90_second - a90_first, ratio = a90_second / a90_first, both with 95 % intervals built from the two
+curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. Verdict at a
+stated margin on the ratio by two one-sided tests: equivalent when the 90 % interval of the ratio lies within [1 / (1 +
+m), 1 + m].
+Source: Zou & Donner, Stat. Med. 27 (2008) 1693, doi:10.1002/sim.3095; Schuirmann, J. Pharmacokin. Biopharm. 15 (1987)
+657.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FitError, InputError
+from .crossed import fit_mixed, usable_factors
+from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, PodFit, fit_trials
+from .likelihood import Curve
+from .links import LINKS
+from .robust import bread, clustered_covariance, clustered_meat, score_rows
+from .solver import fit_batch
+from .trials import Trials
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interval:
+    """An estimate with its two-sided 95 % interval; an end is None where the data give none."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurveTest:
+    """Test that one curve serves both tables: statistic, degrees of freedom, p-value and how it was made."""
+
+    statistic: float
+    degrees_of_freedom: int
+    p: float
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """Two POD curves beside each other; sizes in the tables' unit.
+
+    difference_a90 (second - first) and ratio_a90 (second / first); equivalence_low, equivalence_high: 90 % interval of
+    the ratio; p_equivalence: the larger of the two one-sided p-values; correlation: of the two a90, from shared images
+    and networks; paired: what is shared (`image`, `network`, `image and network`, `nothing`).
+    """
+
+    first: PodFit
+    second: PodFit
+    difference_a90: Interval
+    ratio_a90: Interval
+    margin: float
+    equivalence_low: float | None
+    equivalence_high: float | None
+    p_equivalence: float | None
+    verdict: str
+    correlation: float
+    paired: str
+    curve_test: CurveTest | None
+    warnings: tuple[str, ...]
+
+
+def compare_pod(
+    first: Trials,
+    second: Trials,
+    *,
+    link: str = "cloglog",
+    log_size: bool = False,
+    method: str = "auto",
+    repeats: str = "pooled",
+    margin: float = 0.1,
+    shared_images: bool = False,
+    shared_networks: bool = False,
+) -> Comparison:
+    """Compare the a90 of two tables of trials; sizes in the tables' unit.
+
+    Args:
+        first, second: the trials; where images or networks are shared, their codes must mean the same in both.
+        link: the link's name, for both.
+        log_size: fit on ln size.
+        method: see `fit_pod`.
+        repeats: see `fit_pod`, for both.
+        margin: m of the equivalence test, as a share of a90 (0.1: within some 10 %).
+        shared_images, shared_networks: whether the same images and networks stand in both (the comparison is paired).
+
+    Raises:
+        InputError: a margin that is no positive number.
+    """
+    if not (math.isfinite(margin) and margin > 0):
+        raise InputError("margin", received=margin, expected="a positive share of a90, for example 0.1")
+    fits = tuple(
+        fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
+        for table in (first, second)
+    )
+    notes = [f"{name}: {note}" for name, fit in zip(("first", "second"), fits, strict=True) for note in fit.warnings]
+    pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
+    paired = " and ".join(pairs) or "nothing"
+    correlation = 0.0
+    if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
+        correlation = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
+    empty = Interval(value=None, low=None, high=None)
+    difference = ratio = empty
+    low90 = high90 = p = None
+    verdict = "inconclusive"
+    a, b = fits[0].a90, fits[1].a90
+    if a is None or b is None:
+        notes.append("one of the curves has no a90: nothing to compare there")
+    else:
+        difference = _mover(b, a, *_ends(fits[1], 1.0), *_ends(fits[0], 1.0), correlation)
+        logs = _mover(
+            math.log(b) if b > 0 else math.nan,
+            math.log(a) if a > 0 else math.nan,
+            *_log_ends(fits[1], 1.0),
+            *_log_ends(fits[0], 1.0),
+            correlation,
+        )
+        if a <= 0 or b <= 0:
+            notes.append("sizes are not all above 0 (a log scale?): no ratio and no equivalence test")
+            ratio = empty
+        else:
+            ratio = Interval(
+                value=b / a,
+                low=None if logs.low is None else math.exp(logs.low),
+                high=None if logs.high is None else math.exp(logs.high),
+            )
+            # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
+            share = Z_ONE_SIDED / Z_TWO_SIDED
+            short = _mover(
+                math.log(b), math.log(a), *_log_ends(fits[1], share), *_log_ends(fits[0], share), correlation
+            )
+            low90 = None if short.low is None else math.exp(short.low)
+            high90 = None if short.high is None else math.exp(short.high)
+            edge = math.log1p(margin)
+            middle = math.log(b / a)
+            p = _p_equivalence(middle, logs, edge)
+            inside = low90 is not None and high90 is not None and low90 > math.exp(-edge) and high90 < math.exp(edge)
+            apart = (ratio.low is not None and ratio.low > 1) or (ratio.high is not None and ratio.high < 1)
+            verdict = _verdict(inside=inside, apart=apart)
+    test = None
+    if all(fit.curve is not None and not fit.separated for fit in fits):
+        test = _curve_test(first, second, link=link, log_size=log_size, repeats=repeats, fits=fits, shared=pairs)
+    else:
+        notes.append("no test of the whole curves where one of the tables has no most likely curve")
+    return Comparison(
+        first=fits[0],
+        second=fits[1],
+        difference_a90=difference,
+        ratio_a90=ratio,
+        margin=margin,
+        equivalence_low=low90,
+        equivalence_high=high90,
+        p_equivalence=p,
+        verdict=verdict,
+        correlation=correlation,
+        paired=paired,
+        curve_test=test,
+        warnings=tuple(notes),
+    )
+
+
+def _verdict(*, inside: bool, apart: bool) -> str:
+    if inside:
+        return "different within the margin" if apart else "equivalent"
+    return "different" if apart else "inconclusive"
+
+
+def _compressed(table: Trials) -> Trials:
+    """The table with codes that count only its own networks, images and sites."""
+    codes = {name: getattr(table, name) for name in ("network", "image", "site")}
+    packed = {
+        name: None if one is None else np.unique(one, return_inverse=True)[1].astype(np.intp)
+        for name, one in codes.items()
+    }
+    return replace(table, network=packed["network"], image=packed["image"], site=packed["site"])
+
+
+def _ends(fit: PodFit, share: float) -> tuple[float | None, float | None]:
+    """Two-sided interval of a90, its arms shortened to `share`: modified likelihood ratio where there is one."""
+    ends: list[float | None] = []
+    for bounds in (fit.a90_low_two_sided, fit.a90_95_two_sided):
+        end = bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
+        ends.append(None if end is None or fit.a90 is None else fit.a90 + share * (end - fit.a90))
+    return ends[0], ends[1]
+
+
+def _log_ends(fit: PodFit, share: float) -> tuple[float | None, float | None]:
+    low, high = _ends(fit, 1.0)
+    middle = math.log(fit.a90) if fit.a90 is not None and fit.a90 > 0 else math.nan
+    found = [
+        middle + share * (math.log(end) - middle) if end is not None and end > 0 and math.isfinite(middle) else None
+        for end in (low, high)
+    ]
+    return found[0], found[1]
+
+
+def _mover(
+    b: float, a: float, b_low: float | None, b_high: float | None, a_low: float | None, a_high: float | None, r: float
+) -> Interval:
+    """Interval of b - a from the intervals of b and a and their correlation."""
+
+    def arm(one: float, two: float) -> float:
+        return math.sqrt(max(one * one + two * two - 2 * r * one * two, 0.0))
+
+    low = None if b_low is None or a_high is None else b - a - arm(b - b_low, a_high - a)
+    high = None if b_high is None or a_low is None else b - a + arm(b_high - b, a - a_low)
+    return Interval(value=b - a, low=low, high=high)
+
+
+def _p_equivalence(middle: float, logs: Interval, edge: float) -> float | None:
+    """The larger p of the two one-sided tests of |ln ratio| >= edge, each with the spread of its own side."""
+    from statistics import NormalDist
+
+    if logs.low is None or logs.high is None:
+        return None
+    spread_low, spread_high = (middle - logs.low) / Z_TWO_SIDED, (logs.high - middle) / Z_TWO_SIDED
+    if not (spread_low > 0 and spread_high > 0):
+        return None
+    normal = NormalDist()
+    return max(1 - normal.cdf((middle + edge) / spread_low), normal.cdf((middle - edge) / spread_high))
+
+
+def _codes(table: Trials, shared: list[str]) -> list[NDArray[np.intp]]:
+    """Codes of the shared labels, as they stand in both tables."""
+    return [
+        codes
+        for codes in (table.network if "network" in shared else None, table.image if "image" in shared else None)
+        if codes is not None
+    ]
+
+
+def _correlation(
+    first: Trials, second: Trials, fits: tuple[PodFit, ...], *, log_size: bool, shared: list[str], repeats: str
+) -> float:
+    """Correlation of the two a90 by the clustered covariance of their scores, as pooled curves."""
+    gradients, spreads, influences = [], [], []
+    apart = repeats == "pooled"  # looks taken as independent: only a look at the same image by the same network pairs
+    for table, fit in zip((first, second), fits, strict=True):
+        curve = fit.curve
+        if curve is None:
+            return 0.0
+        x90 = (curve.link.eta_from_pod(0.9) - curve.coefficients[0]) / curve.coefficients[1]
+        gradient = -np.array([1.0, x90]) / curve.coefficients[1]
+        groups = [codes for codes in (table.network, table.image) if codes is not None and codes.max() > 0]
+        if groups and not apart:
+            covariance = clustered_covariance(table, curve, groups=groups, log_size=log_size)
+        else:
+            covariance = curve.covariance
+        gradients.append(gradient)
+        spreads.append(math.sqrt(float(gradient @ covariance @ gradient)))
+        influences.append((score_rows(table, curve, log_size=log_size), bread(table, curve, log_size=log_size)))
+    if not all(spread > 0 for spread in spreads):
+        return 0.0
+    left, right = _codes(first, shared), _codes(second, shared)
+    if len(left) != len(right) or not left:
+        return 0.0
+    if apart and len(left) > 1:
+        base = 1 + max(int(left[1].max()), int(right[1].max()))
+        left, right = [left[0] * base + left[1]], [right[0] * base + right[1]]
+    meat = clustered_meat(influences[0][0], influences[1][0], left, right)
+    across = influences[0][1] @ meat @ influences[1][1]
+    value = float(gradients[0] @ across @ gradients[1]) / (spreads[0] * spreads[1])
+    return min(max(value, -0.99), 0.99)
+
+
+def _curve_test(
+    first: Trials,
+    second: Trials,
+    *,
+    link: str,
+    log_size: bool,
+    repeats: str,
+    fits: tuple[PodFit, ...],
+    shared: list[str],
+) -> CurveTest | None:
+    """One curve for both against two: likelihood ratio, 2 degrees of freedom."""
+    shape = LINKS[link]
+    both = _stacked(first, second, shared)
+    x = np.log(both.size) if log_size else both.size
+    group = np.concatenate((np.zeros(len(first.size)), np.ones(len(second.size))))
+    centred = x - x.mean()
+    small = np.stack((np.ones_like(x), centred), axis=1)
+    large = np.stack((np.ones_like(x), centred, group, group * centred), axis=1)
+    if repeats == "crossed":
+        factors, _, _ = usable_factors(both)
+        if factors:
+            try:
+                values = [
+                    fit_mixed(design, both.hits, both.misses, factors=factors, link=shape).deviance
+                    for design in (small, large)
+                ]
+            except FitError:
+                return None
+            kind = "likelihood ratio with crossed random effects"
+            return _test(values[0] - values[1], kind)
+    found = [
+        float(fit_batch(design, both.hits[None], both.misses[None], link=shape).log_likelihood[0])
+        for design in (small, large)
+    ]
+    if not all(math.isfinite(value) for value in found):
+        return None
+    statistic = 2 * (found[1] - found[0])
+    kind = "likelihood ratio"
+    if repeats in ("scaled", "cluster"):
+        inflation = [_inflation(fit) for fit in fits]
+        statistic /= max(float(np.mean(inflation)), 1e-12)
+        kind = "likelihood ratio divided by the mean inflation of the curves' variances by repeats"
+    return _test(statistic, kind)
+
+
+def _inflation(fit: PodFit) -> float:
+    curve: Curve | None = fit.curve
+    if curve is None or fit.naive is None or not (fit.se0 and fit.se1 and fit.naive.se0 and fit.naive.se1):
+        return 1.0
+    return 0.5 * ((fit.se0 / fit.naive.se0) ** 2 + (fit.se1 / fit.naive.se1) ** 2)
+
+
+def _test(statistic: float, kind: str) -> CurveTest:
+    value = max(statistic, 0.0)
+    return CurveTest(statistic=value, degrees_of_freedom=2, p=math.exp(-value / 2), kind=kind)
+
+
+def _stacked(first: Trials, second: Trials, shared: list[str]) -> Trials:
+    """Both tables as one; codes that are not shared are kept apart."""
+    columns: dict[str, NDArray[np.intp] | None] = {}
+    for name in ("network", "image"):
+        one, two = getattr(first, name), getattr(second, name)
+        if one is None or two is None:
+            columns[name] = None
+            continue
+        apart = 0 if name in shared else int(one.max()) + 1
+        columns[name] = np.unique(np.concatenate((one, two + apart)), return_inverse=True)[1].astype(np.intp)
+    return replace(
+        first,
+        size=np.concatenate((first.size, second.size)),
+        hits=np.concatenate((first.hits, second.hits)),
+        misses=np.concatenate((first.misses, second.misses)),
+        network=columns["network"],
+        image=columns["image"],
+        site=None,
+    )

@@ -1,0 +1,355 @@
+"""POD from a continuous response (a-hat against a): a network's probability, an echo's height, a contrast.
+
+T(response) = b0 + b1 x + tau Z,  POD(a) = Phi((b0 + b1 x - T(decision)) / tau)
+
+x is the size or its logarithm, T the identity, the logarithm or Box and Cox's (r^lambda - 1) / lambda. Responses at or
+below the left limit (noise) and at or above the right limit (saturation) are censored: they say only that much. The
+POD curve is a probit one with c0 = (b0 - T(decision)) / tau and c1 = b1 / tau; mu = -c0 / c1 and sigma = 1 / c1 are
+the handbook's. Validity: a straight line and normal scatter of one width on the chosen scales (look at the residuals).
+Source: MIL-HDBK-1823A (2009) G.3 and example 1; Olsen, Econometrica 46 (1978) 1211 (the concave form); Box & Cox
+(1964).
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FitError, InputError
+from .hit_miss import NO_BOUNDS, Z_ONE_SIDED, Z_TWO_SIDED, Bounds, size_from_x, size_in_range
+from .links import LINKS
+from .robust import clustered_meat
+from .trials import codes_from_labels
+
+Array = NDArray[np.float64]
+
+_PROBIT = LINKS["probit"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResponseFit:
+    """A fitted line and its POD curve. Sizes in the data's unit, None where the data cannot support a number.
+
+    intercept, slope, scatter: b0, b1, tau on the transformed scales. box_cox: lambda (1 = as it is, 0 = logarithm).
+    mu, sigma: of the POD curve on x. covariance: of (c0, c1). a90_95 and the like: see `PodFit`.
+    """
+
+    log_size: bool
+    box_cox: float
+    decision: float
+    n: int
+    n_above: int
+    n_left_censored: int
+    n_right_censored: int
+    smallest_size: float
+    largest_size: float
+    intercept: float
+    slope: float
+    scatter: float
+    c0: float
+    c1: float
+    se0: float
+    se1: float
+    mu: float | None
+    sigma: float | None
+    covariance: Array
+    log_likelihood: float
+    a50: float | None
+    a90: float | None
+    a90_95: Bounds
+    a90_95_two_sided: Bounds
+    a90_low_two_sided: Bounds
+    reaches_90: bool
+    repeats: str
+    warnings: tuple[str, ...]
+
+
+def fit_response_pod(
+    size: ArrayLike,
+    response: ArrayLike,
+    *,
+    decision: float,
+    left: float | None = None,
+    right: float | None = None,
+    log_size: bool = False,
+    box_cox: float | None = 1.0,
+    network: ArrayLike | None = None,
+    image: ArrayLike | None = None,
+    repeats: str = "pooled",
+) -> ResponseFit:
+    """Fit response against size and derive the POD curve; sizes in the data's unit.
+
+    Args:
+        size: (row,), any unit; above 0 with `log_size`.
+        response: (row,), any unit; above 0 unless `box_cox` is 1.
+        decision: the response above which an object counts as detected.
+        left, right: limits at and beyond which a response is censored; None = none.
+        log_size: line on ln size.
+        box_cox: lambda; 1 = the response as it is, 0 = its logarithm, None = the most likely one within [-1, 2].
+        network, image: (row,), labels, for `repeats="cluster"`.
+        repeats: `pooled`, or `cluster` (bounds robust to repeated networks and images).
+
+    Raises:
+        InputError: columns or limits that cannot be used.
+        FitError: too few responses between the limits, or one size only.
+    """
+    x, y = _checked(size, response, log_size=log_size)
+    if left is not None and right is not None and not left < right:
+        raise InputError("left and right", received=f"{left:g} and {right:g}", expected="a left limit below the right")
+    if not math.isfinite(decision):
+        raise InputError("decision", received=decision, expected="a finite response")
+    if box_cox is None:
+        from scipy.optimize import minimize_scalar
+
+        def cost(power: float) -> float:
+            return -_fit(x, y, power, left, right).log_likelihood
+
+        box_cox = float(minimize_scalar(cost, bounds=(-1.0, 2.0), method="bounded", options={"xatol": 1e-4}).x)
+    if box_cox != 1 and not decision > 0:
+        raise InputError("decision", received=decision, expected="above 0 where the response is transformed")
+    line = _fit(x, y, box_cox, left, right)
+    threshold = float(transformed(np.array(decision), box_cox))
+    notes: list[str] = []
+    # c = M (gamma0, gamma1, h)
+    matrix = np.array([[1.0, 0.0, -threshold], [0.0, 1.0, 0.0]])
+    parameter_covariance = np.linalg.inv(line.information(line.q))
+    divisor = 1.0
+    if repeats == "cluster":
+        groups = [
+            codes
+            for codes in (
+                None if labels is None else codes_from_labels(name, labels, len(x))
+                for name, labels in (("network", network), ("image", image))
+            )
+            if codes is not None and codes.max() > 0
+        ]
+        if groups:
+            scores = line.score_rows(line.q)
+            meat = clustered_meat(scores, scores, groups)
+            if np.linalg.eigvalsh(meat).min() <= 0:
+                meat = sum((clustered_meat(scores, scores, [codes]) for codes in groups), np.zeros((3, 3)))
+            robust = parameter_covariance @ meat @ parameter_covariance
+        else:
+            robust = parameter_covariance
+            notes.append("no repeated network or image: the bounds are those of independent rows")
+    elif repeats == "pooled":
+        robust = parameter_covariance
+    else:
+        raise InputError("repeats", received=repr(repeats), expected="pooled or cluster for a response")
+    c0, c1 = (float(value) for value in matrix @ line.q)
+    covariance = matrix @ robust @ matrix.T
+    h = float(line.q[2])
+    smallest, largest = float(x.min()), float(x.max())
+    a50 = a90 = None
+    one = two = low = NO_BOUNDS
+    if c1 > 0:
+        found: dict[int, float | None] = {}
+        for percent in (50, 90):
+            at = (_PROBIT.eta_from_pod(percent / 100) - c0) / c1
+            found[percent], note = size_in_range(
+                at, smallest=smallest, largest=largest, log_size=log_size, percent=percent
+            )
+            if note:
+                notes.append(note)
+        a50, a90 = found[50], found[90]
+    else:
+        notes.append("the response does not rise with size: no a50 and no a90")
+    if a90 is not None:
+        x90 = (_PROBIT.eta_from_pod(0.9) - c0) / c1
+        toward = np.array([1.0, x90])
+        variance = float(toward @ covariance @ toward)
+        error = math.sqrt(variance) / c1
+        divisor = variance / float(toward @ matrix @ parameter_covariance @ matrix.T @ toward)
+        bounds = [
+            Bounds(
+                likelihood_ratio=size_from_x(
+                    _bound(line, threshold, x90, side * z * error, z * z * divisor), log_size=log_size
+                ),
+                wald=size_from_x(x90 + side * z * error, log_size=log_size),
+            )
+            for z, side in ((Z_ONE_SIDED, 1.0), (Z_TWO_SIDED, 1.0), (Z_TWO_SIDED, -1.0))
+        ]
+        one, two, low = bounds
+        if two.likelihood_ratio is None:
+            notes.append("the likelihood gives no upper bound on a90: more sizes above it would")
+    sizes = np.exp(x) if log_size else x
+    return ResponseFit(
+        log_size=log_size,
+        box_cox=box_cox,
+        decision=decision,
+        n=len(x),
+        n_above=int(np.sum(y > decision)),
+        n_left_censored=int(line.left.sum()),
+        n_right_censored=int(line.right.sum()),
+        smallest_size=float(sizes.min()),
+        largest_size=float(sizes.max()),
+        intercept=float(line.q[0] / h),
+        slope=float(line.q[1] / h),
+        scatter=1.0 / h,
+        c0=c0,
+        c1=c1,
+        se0=math.sqrt(covariance[0, 0]),
+        se1=math.sqrt(covariance[1, 1]),
+        mu=-c0 / c1 if c1 > 0 else None,
+        sigma=1 / c1 if c1 > 0 else None,
+        covariance=covariance,
+        log_likelihood=line.log_likelihood,
+        a50=a50,
+        a90=a90,
+        a90_95=one,
+        a90_95_two_sided=two,
+        a90_low_two_sided=low,
+        reaches_90=bool(c1 > 0 and (_PROBIT.eta_from_pod(0.9) - c0) / c1 <= largest),
+        repeats=repeats,
+        warnings=tuple(notes),
+    )
+
+
+def transformed(response: Array, box_cox: float) -> Array:
+    """Box and Cox's transform of responses, of their shape: (r^lambda - 1) / lambda, ln r at 0, r itself at 1."""
+    if box_cox == 1:
+        return np.asarray(response, dtype=float)
+    if abs(box_cox) < 1e-12:
+        return np.asarray(np.log(response))
+    return np.asarray((np.power(response, box_cox) - 1) / box_cox)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Line:
+    """The censored regression in Olsen's parameters q = (b0 / tau, b1 / tau, 1 / tau): z = h y - gamma' x."""
+
+    rows: Array  # (row, 3): z = rows @ q
+    exact: NDArray[np.bool_]
+    left: NDArray[np.bool_]
+    right: NDArray[np.bool_]
+    jacobian: float
+    q: Array
+    log_likelihood: float
+
+    def terms(self, q: Array) -> tuple[float, Array, Array]:
+        """Log-likelihood, and its first and second derivatives by z (row,); without the logarithm of h."""
+        z = self.rows @ q
+        parts = _PROBIT.log_parts(z)
+        value = -0.5 * float((z[self.exact] ** 2).sum()) + float(parts.log_hit[self.left].sum())
+        value += float(parts.log_miss[self.right].sum())
+        first = np.where(self.exact, -z, np.where(self.left, parts.log_hit_1, parts.log_miss_1))
+        second = np.where(self.exact, -1.0, np.where(self.left, parts.log_hit_2, parts.log_miss_2))
+        count = int(self.exact.sum())
+        value += count * (math.log(q[2]) - 0.5 * math.log(2 * math.pi)) if q[2] > 0 else -math.inf
+        return value + self.jacobian, first, second
+
+    def information(self, q: Array) -> Array:
+        _, _, second = self.terms(q)
+        matrix = (self.rows * -second[:, None]).T @ self.rows
+        matrix[2, 2] += self.exact.sum() / q[2] ** 2
+        return np.asarray(matrix)
+
+    def score_rows(self, q: Array) -> Array:
+        _, first, _ = self.terms(q)
+        rows = self.rows * first[:, None]
+        rows[:, 2] += self.exact / q[2]
+        return np.asarray(rows)
+
+    def maximise(self, start: Array, basis: Array, origin: Array) -> tuple[Array, float]:
+        """Newton's method over free parameters p with q = origin + basis p; the log-likelihood is concave."""
+        p = start.copy()
+        value = self.terms(origin + basis @ p)[0]
+        for _ in range(200):
+            q = origin + basis @ p
+            gradient = basis.T @ self.score_rows(q).sum(axis=0)
+            step = np.linalg.solve(basis.T @ self.information(q) @ basis, gradient)
+            gain = float(gradient @ step)
+            if gain < 1e-14 * (1 + abs(value)):
+                return p, value
+            length = 1.0
+            for _ in range(60):
+                trial_q = origin + basis @ (p + length * step)
+                trial = self.terms(trial_q)[0] if trial_q[2] > 0 else -math.inf
+                if trial >= value - 1e-12 * abs(value):
+                    break
+                length *= 0.5
+            else:
+                return p, value
+            p, value = p + length * step, trial
+        raise FitError("the fit of response against size did not converge; try another transform")
+
+
+def _fit(x: Array, response: Array, box_cox: float, left: float | None, right: float | None) -> _Line:
+    is_left = np.zeros(len(x), bool) if left is None else response <= left
+    is_right = np.zeros(len(x), bool) if right is None else response >= right
+    exact = ~(is_left | is_right)
+    if exact.sum() < 3 or np.ptp(x[exact]) == 0:
+        raise FitError("a response curve needs at least three responses between the limits, at two sizes or more")
+    clipped = np.clip(response, left, right) if left is not None or right is not None else response
+    if box_cox != 1 and not np.all(clipped > 0):
+        raise InputError(
+            "response",
+            received=f"{float(clipped.min()):g}",
+            expected="values above 0 where the response is transformed",
+            remedy="give a left limit above 0, or fit the response as it is (Box-Cox 1)",
+        )
+    y = transformed(clipped, box_cox)
+    jacobian = float((box_cox - 1) * np.log(response[exact]).sum()) if box_cox != 1 else 0.0
+    rows = np.stack((-np.ones_like(x), -x, y), axis=1)
+    design = np.stack((np.ones(int(exact.sum())), x[exact]), axis=1)
+    beta, *_ = np.linalg.lstsq(design, y[exact], rcond=None)
+    scatter = float(np.std(y[exact] - design @ beta))
+    if not scatter > 1e-12 * max(1.0, float(np.abs(y).max())):
+        raise FitError("the responses lie on a line without any scatter: there is nothing to infer POD from")
+    line = _Line(
+        rows=rows,
+        exact=exact,
+        left=is_left,
+        right=is_right & ~is_left,
+        jacobian=jacobian,
+        q=np.zeros(3),
+        log_likelihood=0.0,
+    )
+    start = np.array([beta[0] / scatter, beta[1] / scatter, 1 / scatter])
+    q, value = line.maximise(start, np.eye(3), np.zeros(3))
+    return replace(line, q=q, log_likelihood=value)
+
+
+def _bound(line: _Line, threshold: float, x90: float, first: float, allowed: float) -> float | None:
+    """The x beside x90, on the side of `first`, where holding POD 90 % there costs `allowed` in twice the
+    likelihood.
+    """
+    from scipy.optimize import brentq
+
+    eta = _PROBIT.eta_from_pod(0.9)
+    state = line.q[1:].copy()
+
+    def excess(at: float) -> float:
+        nonlocal state
+        # gamma0 = eta - gamma1 at + h threshold
+        basis = np.array([[-at, threshold], [1.0, 0.0], [0.0, 1.0]])
+        state, value = line.maximise(state, basis, np.array([eta, 0.0, 0.0]))
+        return 2 * (line.log_likelihood - value) - allowed
+
+    inside, outside = x90, x90 + first
+    for _ in range(40):
+        if excess(outside) > 0:
+            return float(brentq(excess, inside, outside, xtol=1e-12 * (1 + abs(x90))))
+        inside, outside = outside, outside + 1.6 * (outside - inside)
+    return None
+
+
+def _checked(size: ArrayLike, response: ArrayLike, *, log_size: bool) -> tuple[Array, Array]:
+    columns: dict[str, Any] = {}
+    for name, values in (("size", size), ("response", response)):
+        column = np.asarray(values, dtype=float)
+        if column.ndim != 1 or not np.all(np.isfinite(column)):
+            raise InputError(name, received="missing or infinite values", expected="one column of finite numbers")
+        columns[name] = column
+    x, y = columns["size"], columns["response"]
+    if len(x) != len(y) or len(x) < 3:
+        raise InputError(
+            "response", received=f"{len(y)} rows for {len(x)} sizes", expected="three or more, as many each"
+        )
+    if log_size:
+        if not np.all(x > 0):
+            raise InputError("size", received=f"{float(x.min()):g}", expected="sizes above 0 on log size")
+        x = np.log(x)
+    return x, y

@@ -33,13 +33,14 @@ _TO_UNIT_32 = 2.0**-32
 @lru_cache(maxsize=1)
 def poisson_tables() -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Walker tables (keep probability, alias) of the Poisson law at means 0, 0.5, ... 64; shape (129, 256) each."""
-    from scipy.stats import poisson
+    from scipy.special import gammaln, xlogy
 
     means = np.arange(int(TABLE_MEAN / TABLE_STEP) + 1) * TABLE_STEP
+    counts = np.arange(_ENTRIES, dtype=np.float64)
     keep = np.ones((means.size, _ENTRIES), dtype=np.float32)
     alias = np.zeros((means.size, _ENTRIES), dtype=np.uint8)
     for row, mean in enumerate(means):
-        share = poisson.pmf(np.arange(_ENTRIES), mean)
+        share = np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0))
         share *= _ENTRIES / share.sum()
         poor = [i for i in range(_ENTRIES) if share[i] < 1]
         rich = [i for i in range(_ENTRIES) if share[i] >= 1]

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 PRODUCT_MATERIAL = "chicken_breast"
 BONE_MATERIAL = "rib_bone"
+TURN_DEGREES = 8.0  # how far a product may lie askew
 
 
 class Scene(Protocol):
@@ -188,6 +189,13 @@ def field_mm(system: LabSystem) -> tuple[float, float]:
     return system.rows * scale, system.columns * scale
 
 
+def clear_field_mm(system: LabSystem) -> tuple[float, float]:
+    """Height and width (mm) that a product may take: the field without two pixels at every border."""
+    height_mm, width_mm = field_mm(system)
+    border_mm = 2.0 * system.pixel_mm / system.magnification
+    return height_mm - 2.0 * border_mm, width_mm - 2.0 * border_mm
+
+
 def fine_shape(system: LabSystem) -> tuple[int, int]:
     """Rows and columns of the grid of sub-pixels, margins of the light's spread included."""
     margin = margin_px(system.psf_sigma_px)
@@ -263,19 +271,21 @@ def sample_bone(rng: np.random.Generator, *, name: str, size_mm: float) -> Bone:
     )
 
 
-def place_fillet(rng: np.random.Generator, *, fillet: Fillet, system: LabSystem, turn_degrees: float = 8.0) -> Product:
+def place_fillet(
+    rng: np.random.Generator, *, fillet: Fillet, system: LabSystem, turn_degrees: float = TURN_DEGREES
+) -> Product:
     """A fillet in a random pose that leaves it whole inside the field.
 
     Raises:
         InputError: a product larger than the field.
     """
-    height_mm, width_mm = field_mm(system)
+    height_mm, width_mm = clear_field_mm(system)
     for _ in range(50):
         rotation = math.radians(rng.uniform(-turn_degrees, turn_degrees))
         mirrored = bool(rng.random() < 0.5)
         # The mirror image turned by r is as large as the original turned by -r.
         half_y, half_x = fillet.extent_mm(-rotation if mirrored else rotation)
-        slack_y, slack_x = 0.49 * height_mm - half_y, 0.49 * width_mm - half_x
+        slack_y, slack_x = height_mm / 2.0 - half_y, width_mm / 2.0 - half_x
         if slack_y >= 0 and slack_x >= 0:
             return Product(
                 fillet=fillet,
@@ -294,17 +304,19 @@ def place_fillet(rng: np.random.Generator, *, fillet: Fillet, system: LabSystem,
 
 
 def place_bone(rng: np.random.Generator, *, product: Product, bone: Bone) -> Product:
-    """The same product with a bone in or on it, somewhere where the meat is a quarter of its peak or more."""
+    """The same product with a bone in or on it, all of it where the meat is a fifth of its peak or more."""
     fillet = product.fillet
     reach_mm = max(fillet.half_y_mm, fillet.half_x_mm) * 1.3
-    half = max(bone.size_mm / 2.0 - bone.width_mm / 2.0, 0.0)
+    sag_mm = (bone.size_mm / 2.0) ** 2 / (2.0 * bone.bend_mm)
+    corner_y, corner_x = np.meshgrid(
+        np.linspace(-bone.width_mm / 2.0 - sag_mm, bone.width_mm / 2.0, 3), np.linspace(-0.5, 0.5, 5) * bone.size_mm
+    )
     for _ in range(1000):
         y, x = rng.uniform(-reach_mm, reach_mm, size=2)
-        turn = rng.uniform(0.0, np.pi)
-        y_mm = product.shift_y_mm + y + np.array([0.0, half * math.sin(turn), -half * math.sin(turn)])
-        x_mm = product.shift_x_mm + x + np.array([0.0, half * math.cos(turn), -half * math.cos(turn)])
-        meat = product.meat_mm(y_mm, x_mm)
-        if meat.min() > 0.25 * fillet.peak_mm:
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        y_box, x_box = _turned(corner_y, corner_x, turn)
+        y_mm, x_mm = product.shift_y_mm + y, product.shift_x_mm + x
+        if product.meat_mm(y_mm + y_box, x_mm + x_box).min() > 0.2 * fillet.peak_mm:
             return Product(
                 fillet=fillet,
                 shift_y_mm=product.shift_y_mm,
@@ -312,8 +324,8 @@ def place_bone(rng: np.random.Generator, *, product: Product, bone: Bone) -> Pro
                 rotation=product.rotation,
                 mirrored=product.mirrored,
                 bone=bone,
-                bone_y_mm=float(y_mm[0]),
-                bone_x_mm=float(x_mm[0]),
+                bone_y_mm=float(y_mm),
+                bone_x_mm=float(x_mm),
                 bone_rotation=float(turn),
                 embedded=bool(rng.random() < 0.5),
             )

@@ -18,10 +18,11 @@ from ..files import sha256_of_file, whole_file
 from .bench import Bench, RenderedScene, render
 from .objects import (
     BONE_MATERIAL,
+    TURN_DEGREES,
     Bone,
     Fillet,
     Product,
-    field_mm,
+    clear_field_mm,
     pixel_means,
     place_bone,
     place_fillet,
@@ -151,23 +152,20 @@ def _correction_takes(exposures_ms: tuple[float, ...]) -> list[Take]:
 def _fillets(
     rng: np.random.Generator, system: LabSystem, *, count: int, product_mm: float | None, prefix: str
 ) -> list[Fillet]:
-    height_mm, width_mm = field_mm(system)
+    height_mm, width_mm = clear_field_mm(system)
+    turns = np.radians([-TURN_DEGREES, 0.0, TURN_DEGREES])
     fillets = []
     for number in range(count):
-        if product_mm is None:
-            half_y_mm = 0.43 * height_mm * rng.uniform(0.94, 1.0)
-            half_x_mm = 0.43 * width_mm * rng.uniform(0.94, 1.0)
-        else:
-            half_x_mm = product_mm / 2.0
-            half_y_mm = half_x_mm * rng.uniform(0.72, 0.85)
+        half_x_mm = 0.45 * width_mm if product_mm is None else product_mm / 2.0
+        half_y_mm = 0.45 * height_mm if product_mm is None else half_x_mm * rng.uniform(0.72, 0.85)
         name = f"{prefix}{number + 1:02d}"
         fillet = sample_fillet(rng, name=name, half_y_mm=half_y_mm, half_x_mm=half_x_mm)
-        # The outline's waves must not make the product longer than what was asked for.
-        full_y_mm, full_x_mm = fillet.extent_mm(0.0)
-        wanted_y_mm, wanted_x_mm = (
-            (half_y_mm, half_x_mm) if product_mm is not None else (0.45 * height_mm, 0.45 * width_mm)
-        )
-        shrink = min(1.0, wanted_y_mm / full_y_mm, wanted_x_mm / full_x_mm)
+        if product_mm is None:
+            # As large as the field allows, however the product lies, but for a little to move in.
+            extents = np.max([fillet.extent_mm(turn) for turn in turns], axis=0)
+            shrink = rng.uniform(0.90, 0.97) * min(height_mm / 2.0 / extents[0], width_mm / 2.0 / extents[1])
+        else:
+            shrink = half_x_mm / fillet.extent_mm(0.0)[1]
         fillets.append(replace(fillet, half_y_mm=half_y_mm * shrink, half_x_mm=half_x_mm * shrink))
     return fillets
 

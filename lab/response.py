@@ -316,7 +316,7 @@ def aperture_share(psf_sigma_px: float, lag_px: int = 0) -> float:
     """
 
     def primitive(n: float) -> float:
-        if psf_sigma_px == 0:
+        if psf_sigma_px < 1e-6:  # sharper than any sum could tell, and beyond it the squares overflow
             return abs(n) / 2.0
         return n / 2.0 * math.erf(n / (2.0 * psf_sigma_px)) + psf_sigma_px / math.sqrt(math.pi) * math.exp(
             -((n / (2.0 * psf_sigma_px)) ** 2)

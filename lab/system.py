@@ -178,7 +178,8 @@ def sample_system(rng: np.random.Generator) -> LabSystem:
     DN_per_keV = base.electrons_per_keV * base.DN_per_electron * math.exp(0.15 * rng.standard_normal())
     return replace(
         base,
-        kV_offset_percent=float(np.clip(rng.standard_normal(), -2.5, 2.5)),
+        # In steps of a quarter per cent: spectra take a second each and are kept by voltage.
+        kV_offset_percent=round(4.0 * float(np.clip(rng.standard_normal(), -2.5, 2.5))) / 4.0,
         tube_output=math.exp(0.10 * rng.standard_normal()),
         inherent_filtration=(Filter(material="Al", thickness_mm=round(rng.uniform(0.4, 1.4), 3)),),
         scintillator_mm=rng.uniform(0.40, 0.60),

@@ -28,7 +28,7 @@ class Beam:
     photons_per_mAs_mm2: Array
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _bare_spectrum(kV: float, anode_angle_deg: float) -> tuple[Array, Array]:
     import spekpy
 

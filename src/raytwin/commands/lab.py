@@ -112,10 +112,6 @@ def run(arguments: argparse.Namespace) -> int:
             begin=begin,
             advance=advance,
         )
-    except OSError as error:
-        raise InputError(
-            "--output", received=arguments.output, expected="a file that can be written", remedy=str(error)
-        ) from error
     finally:
         if bar is not None:
             bar.close()

@@ -182,8 +182,8 @@ def k_escape_fractions(
     Returns:
         One (line_keV, fraction (n,)) for each line group of each element whose K lines are above 5 keV.
 
-    Source: Chan and Doi (1983), Phys Med Biol 28:565, doi:10.1088/0031-9155/28/5/008, for the geometry; line data of
-        xraylib (JumpFactor, FluorYield, RadRate, LineEnergy).
+    Source: Chan and Doi (1983), Phys Med Biol 28:565, for the geometry; line data of xraylib (JumpFactor, FluorYield,
+        RadRate, LineEnergy).
     Checked against: photons followed one by one (tests/test_spectra_detector.py).
     """
     import xraylib

@@ -1,5 +1,6 @@
 """Tube spectra: the common grid, the kept spectra, and the interpolation in kV."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,22 @@ def test_the_signal_is_smooth_in_kV_through_whole_kV_and_the_edge_of_the_anode()
     assert np.all(slope > 0)
     # a step of 0.05 kV changes the slope by far less than itself: no jump, no kink
     assert np.max(np.abs(np.diff(slope))) < 0.01 * slope.mean()
+
+
+def test_a_kV_between_kept_spectra_takes_less_than_a_millisecond() -> None:
+    grid = energy_grid_keV(100.0)
+    times = []
+    for step in range(50):
+        start = time.perf_counter()
+        tube_fluence_interpolated(90.1 + 0.01 * step, energies_keV=grid)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 1e-3
+
+
+def test_energies_off_the_common_grid_are_refused() -> None:
+    for energies in (np.array([]), np.linspace(1.0, 60.0, 119), energy_grid_keV(60.0)[1:], np.ones((2, 2))):
+        with pytest.raises(InputError, match=r"energies_keV: got an array of shape .*; expected a piece of the common"):
+            tube_fluence_interpolated(40.3, energies_keV=energies)
 
 
 @pytest.mark.parametrize(("kV", "anode"), [(10.4, "W"), (299.7, "W"), (10.2, "Mo"), (49.6, "Mo")])

@@ -271,9 +271,7 @@ def sample_bone(rng: np.random.Generator, *, name: str, size_mm: float) -> Bone:
     )
 
 
-def place_fillet(
-    rng: np.random.Generator, *, fillet: Fillet, system: LabSystem, turn_degrees: float = TURN_DEGREES
-) -> Product:
+def place_fillet(rng: np.random.Generator, *, fillet: Fillet, system: LabSystem) -> Product:
     """A fillet in a random pose that leaves it whole inside the field.
 
     Raises:
@@ -281,7 +279,7 @@ def place_fillet(
     """
     height_mm, width_mm = clear_field_mm(system)
     for _ in range(50):
-        rotation = math.radians(rng.uniform(-turn_degrees, turn_degrees))
+        rotation = math.radians(rng.uniform(-TURN_DEGREES, TURN_DEGREES))
         mirrored = bool(rng.random() < 0.5)
         # The mirror image turned by r is as large as the original turned by -r.
         half_y, half_x = fillet.extent_mm(-rotation if mirrored else rotation)
@@ -298,7 +296,7 @@ def place_fillet(
     raise InputError(
         "product",
         received=f"a fillet of {2 * half_y:.0f} x {2 * half_x:.0f} mm",
-        expected=f"one that fits into the field of {height_mm:.0f} x {width_mm:.0f} mm",
+        expected=f"one that fits into {height_mm:.0f} x {width_mm:.0f} mm, the field without its borders",
         remedy="take a smaller --product-mm, or a larger --size or --pixel-mm",
     )
 

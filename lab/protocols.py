@@ -181,12 +181,12 @@ def plan_set_1(
 ) -> Plan:
     """The paper's first set: fillets with bones of 1.5 to 11 mm and boneless ones (163 to 91), each at 1 s.
 
-    The same few fillets are placed again and again, with other bones in other places. An image of 1 s is the mean of
-    ten frames of 100 ms. Darks and flats are means of 200 frames.
+    The same fillets (14 in 254, six at least) are placed again and again, with other bones in other places. An image
+    of 1 s is the mean of ten frames of 100 ms. Darks and flats are means of 200 frames.
     """
-    n_fillets = max(2, round(products * SET_1_FILLETS / SET_1_PRODUCTS))
     n_with_bone = round(products * SET_1_WITH_BONE / SET_1_PRODUCTS)
-    n_bones = max(2, round(products * SET_1_BONES / SET_1_PRODUCTS))
+    n_fillets = max(min(products, 6), round(products * SET_1_FILLETS / SET_1_PRODUCTS))
+    n_bones = max(min(n_with_bone, 12), round(products * SET_1_BONES / SET_1_PRODUCTS))
     fillets = _fillets(rng, system, count=n_fillets, product_mm=product_mm, prefix="fillet")
     # Sizes spread evenly over the logarithm of the range, so that a short set holds small and large bones alike.
     edges_mm = np.geomspace(1.5, 11.0, n_bones + 1)

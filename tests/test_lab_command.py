@@ -130,7 +130,7 @@ def test_the_command_prints_the_truth_as_json(tmp_path, capsys):
         (["--protocol", "tomography"], "protocol: got 'tomography'; expected one of calibration, set1, set2"),
         (["--protocol", "set1", "--size", "7"], "--size: got '7'; expected N or ROWSxCOLUMNS from 8 to 8192 pixels"),
         (["--protocol", "set1", "--size", "ax3"], "--size: got 'ax3'"),
-        (["--protocol", "set1", "--product-mm", "300"], "one that fits into the field of 54 x 67 mm"),
+        (["--protocol", "set1", "--product-mm", "300"], "one that fits into 52 x 66 mm, the field without its borders"),
         (["--protocol", "set2", "--bones-mm", "60"], "foreign object: got a bone of 60 mm"),
         (["--protocol", "set2", "--bones-mm", "x"], "--bones-mm: got 'x'"),
         (["--protocol", "calibration", "--frames", "1"], "frames: got 1; expected 2 or more"),

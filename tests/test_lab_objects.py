@@ -147,7 +147,8 @@ def test_bones_and_fillets_of_the_second_set_are_all_combined():
 def test_what_does_not_fit_is_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(
-        InputError, match=r"product: got a fillet of .* fits into the field of 27 x 34 mm; take a smaller"
+        InputError,
+        match=r"product: got a fillet of .* fits into 25 x 32 mm, the field without its borders; take a smaller",
     ):
         make_plan("set1", system=SYSTEM, rng=rng, products=4, product_mm=80.0)
     with pytest.raises(InputError, match="foreign object: got a bone of 40 mm"):

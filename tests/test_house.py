@@ -1,0 +1,228 @@
+"""The house: imports run downward, the package holds nothing else, commands are registered, help is quick to load."""
+
+import ast
+import io
+import json
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import pytest
+
+from raytwin.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[1]
+BASE = {"errors", "files"}
+# room -> the rooms below it; a new room is one line here and one in each table of pyproject.toml
+BELOW = {
+    "acquisition": set(),
+    "pod": set(),
+    "materials": {"acquisition"},  # for the words of a setting: Filter
+    "segmentation": {"acquisition"},
+    "lab": {"acquisition"},  # shares no physics with the twin, or agreement would prove nothing
+    "spectra": {"acquisition", "materials"},
+    "generator": {"acquisition", "materials", "spectra"},
+    "calibration": {"acquisition", "materials", "spectra", "generator"},
+    "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod"},
+}
+COMPOSERS = {"campaign", "commands"}  # may import every room
+MAY_IMPORT_LAB = {"lab", *COMPOSERS}
+HEAVY = (
+    "torch",
+    "matplotlib",
+    "scipy",
+    "h5py",
+    "numba",
+    "spekpy",
+    "xraylib",
+    "xraydb",
+    "dask",
+    "statsmodels",
+    "pandas",
+)
+HEAVY_AT_HELP = (*HEAVY, "numpy")
+
+
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def rooms_on_disk():
+    return {
+        path.parent.name
+        for path in ROOT.glob("*/__init__.py")
+        if path.parent.name not in ("tests", "validation", "benchmarks")
+    }
+
+
+def python_files():
+    for room in sorted(rooms_on_disk()):
+        yield from ((room, path) for path in sorted((ROOT / room).rglob("*.py")))
+    yield from (("commands", path) for path in sorted((ROOT / "src" / "raytwin" / "commands").glob("*.py")))
+
+
+def imported_rooms(path, depth):
+    """(line, target) of every import that leaves the room; target is the first name after the dots, or `raytwin`."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [node.module or ""]
+        else:
+            names = []
+        if any(name.split(".")[0] == "raytwin" for name in names):
+            yield node.lineno, "raytwin"
+        if isinstance(node, ast.ImportFrom) and node.level == depth + 1:
+            if node.module:
+                yield node.lineno, node.module.split(".")[0]
+            else:
+                yield from ((node.lineno, alias.name) for alias in node.names)
+
+
+def test_imports_run_downward_only():
+    wrong = []
+    for room, path in python_files():
+        depth = len(path.relative_to(ROOT / room).parts) if room != "commands" else 1
+        for line, target in imported_rooms(path, depth):
+            place = f"{path.relative_to(ROOT)}:{line} imports {target}"
+            if target == "raytwin":
+                wrong.append(f"{place} (absolute import of its own package: two copies of a class)")
+            elif target == room or target in BASE or target.startswith("__"):
+                continue
+            elif room in COMPOSERS:
+                if room == "campaign" and target in ("commands", "cli"):
+                    wrong.append(f"{place} (commands are above campaign)")
+            elif target not in BELOW[room]:
+                wrong.append(f"{place} (not below {room})")
+            if target == "lab" and room not in MAY_IMPORT_LAB:
+                wrong.append(f"{place} (nobody but commands and campaign may know the lab)")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_room_has_its_place_in_the_order():
+    assert rooms_on_disk() <= set(BELOW) | COMPOSERS
+    for room, below in BELOW.items():
+        for lower in below:
+            assert room not in BELOW[lower], f"{room} and {lower} lie below each other"
+
+
+def test_the_upward_import_check_sees_a_planted_fault(tmp_path):
+    module = tmp_path / "bad.py"
+    module.write_text("from ..calibration import x\nimport raytwin.pod\nfrom .. import lab\nfrom . import fine\n")
+    assert sorted(imported_rooms(module, 1)) == [(1, "calibration"), (2, "raytwin"), (3, "lab")]
+
+
+def test_packages_on_disk_and_in_pyproject_agree():
+    setuptools = project()["tool"]["setuptools"]
+    listed = set(setuptools["packages"])
+    on_disk = {"raytwin", "raytwin.commands"} | {f"raytwin.{room}" for room in rooms_on_disk()}
+    assert listed == on_disk
+    places = setuptools["package-dir"]
+    assert places.pop("raytwin") == "src/raytwin"
+    assert places == {f"raytwin.{room}": room for room in rooms_on_disk()}
+
+
+def test_check_and_format_of_the_makefile_cover_every_room():
+    line = re.search(r"^ROOMS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert line is not None
+    assert set(line[1].split()) == rooms_on_disk()
+
+
+def test_the_wheel_holds_nothing_but_raytwin(tmp_path):
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from setuptools import build_meta; print(build_meta.build_wheel(sys.argv[1]))",
+        str(tmp_path),
+    ]
+    # built from a copy, so that no build folder is left in the repository and nothing unlisted can slip in unseen
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        (copy / name).write_bytes((ROOT / name).read_bytes())
+    for folder in ["src", *rooms_on_disk(), "tests"]:
+        for path in (ROOT / folder).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts and ".numba_cache" not in path.parts:
+                target = copy / path.relative_to(ROOT)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(path.read_bytes())
+    subprocess.run(command, cwd=copy, check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    outside = [name for name in names if not name.startswith("raytwin/") and ".dist-info/" not in name]
+    assert outside == []
+    inside = set(names)
+    for room, path in python_files():
+        relative = path.relative_to(ROOT / "src") if room == "commands" else Path("raytwin") / path.relative_to(ROOT)
+        assert relative.as_posix() in inside
+    assert "raytwin/py.typed" in inside
+    data = [path for room in rooms_on_disk() for path in (ROOT / room).rglob("*.toml")]
+    for path in data:
+        assert f"raytwin/{path.relative_to(ROOT).as_posix()}" in inside
+
+
+def loaded_modules(code):
+    result = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys, json; sys.stderr.write(json.dumps(sorted(sys.modules)))"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    return {name.split(".")[0] for name in json.loads(result.stderr)}
+
+
+def test_importing_raytwin_loads_nothing_heavy():
+    assert not loaded_modules("import raytwin") & HEAVY
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import contextlib\nfrom raytwin.cli import main\nwith contextlib.suppress(SystemExit):\n    main(['--help'])"
+    )
+    assert not loaded_modules(code) & HEAVY
+
+
+@pytest.mark.parametrize("room", ["segmentation", "pod", "lab", "generator", "calibration", "spectra", "materials"])
+def test_importing_a_room_loads_neither_torch_nor_matplotlib(room):
+    assert not loaded_modules(f"import raytwin.{room}") & {"torch", "matplotlib", "dask", "spekpy"}
+
+
+def test_every_command_module_is_registered():
+    modules = {
+        path.stem for path in (ROOT / "src" / "raytwin" / "commands").glob("*.py") if not path.stem.startswith("_")
+    }
+    assert modules == {module for module, _ in COMMANDS.values()}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example_of_itself(name):
+    output = io.StringIO()
+    with redirect_stdout(output), pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    assert re.search(rf"example.*\n(.*\n)*? *raytwin {name} ", output.getvalue()), output.getvalue()
+
+
+def test_every_command_that_answers_takes_json():
+    without = [
+        name
+        for name, (module, _) in COMMANDS.items()
+        if "--json" not in (ROOT / "src" / "raytwin" / "commands" / f"{module}.py").read_text(encoding="utf-8")
+    ]
+    assert without == []
+
+
+def test_public_names_of_every_room_exist():
+    code = (
+        "import importlib, raytwin\n"
+        f"for room in {sorted(rooms_on_disk())!r}:\n"
+        "    module = importlib.import_module('raytwin.' + room)\n"
+        "    for name in getattr(module, '__all__', ()):\n"
+        "        getattr(module, name)\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)

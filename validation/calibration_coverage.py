@@ -1,0 +1,136 @@
+"""Calibration against the truth of the virtual lab: errors, and how often the stated 95 % intervals hold the truth.
+
+    python validation/calibration_coverage.py [--seeds 40] [--first 0] [--size 64] [--frames 20] [--json FILE]
+
+Each seed is another hidden system. `z` is (answer - truth) over the interval's half width / 1.96: its spread should be
+1 where only sampling noise is at work and below 1 where the interval carries systematic uncertainty. `predicted` rows
+compare predictions at settings that the calibration never saw with the lab's noise-free expectation, `validate` rows
+compare with measured frames as `raytwin validate` does.
+"""
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+from tqdm import tqdm
+
+from raytwin.acquisition import open_acquisition
+from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
+from raytwin.calibration.validate import validate_twin
+from raytwin.generator.predict import predict_flatfield
+from raytwin.lab.protocols import run_protocol
+
+
+def measure_seed(seed: int, *, size: int, frames: int) -> list[dict[str, Any]]:
+    """Rows `{quantity, seed, truth, value, low, high}` of one hidden system."""
+    rows: list[dict[str, Any]] = []
+
+    def add(quantity: str, truth: float, estimate: dict[str, float] | None, label: str = "") -> None:
+        if estimate is not None:
+            rows.append({"quantity": quantity, "seed": seed, "label": label, "truth": truth, **estimate})
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.h5"
+        truth = run_protocol(path, protocol="calibration", seed=seed, rows=size, columns=size, frames=frames)
+        with open_acquisition(path) as acquisition:
+            twin = calibrate_twin(acquisition, rng=np.random.default_rng(seed))
+            validation = validate_twin(twin, acquisition)
+            settings = {item.name: item.setting for item in acquisition.series}
+    answer = calibration_answer(twin)
+    add("psf_sigma_px", truth["psf_sigma_px"], answer["psf_sigma_px"])
+    add("read_noise_DN", truth["read_noise_DN"], answer["read_noise_DN"])
+    dark = {entry["exposure_ms"]: entry["dark_DN"] for entry in truth["dark_DN_at"]}
+    add("dark_DN", dark[twin.maps.dark_exposure_ms], answer["dark_DN"])
+    add("inherent_filtration_mm_Al", truth["inherent_filtration_mm_Al"], answer["inherent_filtration_mm_Al"])
+    add("flux_scale", truth["flux_scale"], answer["flux_scale"])
+    exact = {(level["kV"], level["filter"]): level for level in truth["levels"]}
+    for level in answer["levels"]:
+        true_level = exact[level["kV"], level["filter"]]
+        for name in ("gain_DN", "photon_transfer_slope_DN"):
+            estimate = {"value": level[name], "low": level[f"{name}_low"], "high": level[f"{name}_high"]}
+            add(name, true_level[name], estimate, f"{level['kV']:g} kV")
+    for row in validation.rows:
+        expected = truth["series"][row.series]
+        prediction = predict_flatfield(twin, settings[row.series])
+        new = "measured beam" if prediction.measured_level else "new beam"
+        for name in ("mean_DN", "sd_DN", "gain_DN", "photons_absorbed"):
+            estimate = getattr(prediction, name)
+            add(f"predicted {name}, {new}", expected[name], estimate.as_dict(), row.series)
+        add(f"validate mean_DN, {new}", row.measured_mean_DN, row.predicted_mean_DN.as_dict(), row.series)
+        add(f"validate sd_DN, {new}", row.measured_sd_DN, row.predicted_sd_DN.as_dict(), row.series)
+    return rows
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Per quantity: number, bias and rms error (%), coverage (%) with its 95 % interval, mean width, spread of z."""
+    table = []
+    for quantity in dict.fromkeys(row["quantity"] for row in rows):
+        chosen = [row for row in rows if row["quantity"] == quantity]
+        truth, value, low, high = (np.array([row[key] for row in chosen]) for key in ("truth", "value", "low", "high"))
+        relative = value / truth - 1.0
+        inside = int(np.sum((low <= truth) & (truth <= high)))
+        n = len(chosen)
+        z = (value - truth) / np.maximum((high - low) / (2 * 1.959964), 1e-300)
+        table.append(
+            {
+                "quantity": quantity,
+                "n": n,
+                "bias_percent": 100 * float(np.mean(relative)),
+                "rms_percent": 100 * math.sqrt(float(np.mean(relative**2))),
+                "coverage_percent": 100 * inside / n,
+                "coverage_low": 100 * float(beta.ppf(0.025, inside, n - inside + 1)) if inside else 0.0,
+                "coverage_high": 100 * float(beta.ppf(0.975, inside + 1, n - inside)) if inside < n else 100.0,
+                "half_width_percent": 100 * float(np.mean((high - low) / 2 / truth)),
+                "z_mean": float(np.mean(z)),
+                "z_sd": float(np.std(z)),
+            }
+        )
+    return table
+
+
+def print_table(table: list[dict[str, Any]]) -> None:
+    """The summary for people."""
+    print(
+        f"{'quantity':<42} {'n':>4} {'bias %':>8} {'rms %':>7} {'half width %':>12} {'coverage % (95 %)':>22} {'z':>13}"
+    )
+    for row in table:
+        coverage = f"{row['coverage_percent']:.1f} ({row['coverage_low']:.0f}-{row['coverage_high']:.0f})"
+        print(
+            f"{row['quantity']:<42} {row['n']:>4} {row['bias_percent']:>8.3f} {row['rms_percent']:>7.3f}"
+            f" {row['half_width_percent']:>12.3f} {coverage:>22} {row['z_mean']:>6.2f} +-{row['z_sd']:.2f}"
+        )
+
+
+def main() -> int:
+    """Run the seeds and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    started = time.perf_counter()
+    for seed in tqdm(range(arguments.first, arguments.first + arguments.seeds), disable=None, file=sys.stderr):
+        rows += measure_seed(seed, size=arguments.size, frames=arguments.frames)
+    table = summarise(rows)
+    print(
+        f"{arguments.seeds} hidden systems, {arguments.size} x {arguments.size} pixels, {arguments.frames} frames a"
+        f" series, {time.perf_counter() - started:.0f} s"
+    )
+    print_table(table)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({"table": table, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

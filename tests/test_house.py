@@ -31,20 +31,22 @@ BELOW = {
 }
 COMPOSERS = {"campaign", "commands"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
-HEAVY = (
-    "torch",
-    "matplotlib",
-    "scipy",
-    "h5py",
-    "numba",
-    "spekpy",
-    "xraylib",
-    "xraydb",
-    "dask",
-    "statsmodels",
-    "pandas",
-)
-HEAVY_AT_HELP = (*HEAVY, "numpy")
+HEAVY = {
+    *[
+        "torch",
+        "matplotlib",
+        "numpy",
+        "scipy",
+        "h5py",
+        "numba",
+        "spekpy",
+        "xraylib",
+        "xraydb",
+        "dask",
+        "statsmodels",
+        "pandas",
+    ]
+}
 
 
 def project():

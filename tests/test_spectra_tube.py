@@ -87,7 +87,7 @@ def _spekpy_at(kV: float, grid: FloatArray) -> FloatArray:
     return collected
 
 
-@pytest.mark.parametrize("kV", [40.3, 57.6, 69.7, 70.2, 99.8, 149.3])
+@pytest.mark.parametrize("kV", [40.3, 70.2, 99.8, 149.3])
 def test_interpolated_signal_and_gain_are_within_a_tenth_of_a_percent_of_spekpy_at_that_kV(kV: float) -> None:
     grid = energy_grid_keV(kV)
     truth, ours = _spekpy_at(kV, grid), tube_fluence_interpolated(kV, energies_keV=grid)

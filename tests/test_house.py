@@ -31,22 +31,8 @@ BELOW = {
 }
 COMPOSERS = {"campaign", "commands"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
-HEAVY = {
-    *[
-        "torch",
-        "matplotlib",
-        "numpy",
-        "scipy",
-        "h5py",
-        "numba",
-        "spekpy",
-        "xraylib",
-        "xraydb",
-        "dask",
-        "statsmodels",
-        "pandas",
-    ]
-}
+HEAVY = {"torch", "matplotlib", "numpy", "scipy", "h5py", "numba", "spekpy", "xraylib", "xraydb", "dask"}
+HEAVY |= {"statsmodels", "pandas"}
 
 
 def project():

@@ -101,7 +101,6 @@ def _poisson_large(state, mean):  # type: ignore[no-untyped-def]
     a = -0.059 + 0.02483 * b
     inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
     quick = 0.9277 - 3.6224 / (b - 2.0)
-    log_mean = math.log(mean)
     while True:
         u = uniform(state) - 0.5
         v = uniform(state)
@@ -111,7 +110,7 @@ def _poisson_large(state, mean):  # type: ignore[no-untyped-def]
             return k
         if k < 0.0 or (us < 0.013 and v > us):
             continue
-        if math.log(v * inverse_alpha / (a / (us * us) + b)) <= k * log_mean - mean - math.lgamma(k + 1.0):
+        if math.log(v * inverse_alpha / (a / (us * us) + b)) <= k * math.log(mean) - mean - math.lgamma(k + 1.0):
             return k
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting
+from ..acquisition.setting import Filter, Setting
 from .chain import BASE_STAGES, Arrivals, FrameContext, Stage, run_chain
 from .objects import Scene, fine_shape, thickness_on_fine_grid
 from .response import Incidence, compute_incidence, tube_load_mAs
@@ -51,6 +51,9 @@ class Bench:
         self._key = np.uint64(rng.integers(0, 2**64, dtype=np.uint64))
         self._next_frame = 0
         self._memory: dict[str, Any] = {}
+        # Rates behind the scene now in the beam, by kV and filters: other exposures of it need no new sum.
+        self._in_beam: RenderedScene | None = None
+        self._rates: dict[tuple[float, tuple[Filter, ...]], NDArray[np.float32]] = {}
 
     def arrivals(self, setting: Setting, *, scene: Scene | RenderedScene | None = None) -> Arrivals:
         """Photons that one exposure brings to every sub-pixel, behind a scene or the open field."""
@@ -67,7 +70,12 @@ class Bench:
             rates = _rates_behind(incidence, {})
         else:
             rendered = scene if isinstance(scene, RenderedScene) else render(system, scene)
-            cell, rates = rendered.cell, _rates_behind(incidence, rendered.covered_mm)
+            if rendered is not self._in_beam:
+                self._in_beam, self._rates = rendered, {}
+            beam_is = (setting.kV, setting.filters)
+            if beam_is not in self._rates:
+                self._rates[beam_is] = _rates_behind(incidence, rendered.covered_mm)
+            cell, rates = rendered.cell, self._rates[beam_is]
         return Arrivals(cell=cell, rates=rates, deposit_keV=incidence.deposit_keV, load_mAs=load_mAs)
 
     def expose(

@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-ROOMS := acquisition calibration generator lab materials pod segmentation spectra
+ROOMS := acquisition calibration campaign generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
 .PHONY: demo test test-slow check format clean

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter
 from ..errors import InputError
-from ..materials import material_from_name, mu_per_mm
-from ..spectra import detector_response, energy_grid_keV, tube_fluence_interpolated
+from ..materials import material_from_name, mu_per_mm, transmission
+from ..spectra import BIN_WIDTH_KEV, detector_response, energy_grid_keV, tube_fluence_interpolated
 
 REFERENCE_KV = 60.0
 REFERENCE_KEV = 50.0
@@ -112,16 +112,21 @@ class SpectralModel:
 
         # keV / cm2 -> uGy: 1.602e-16 J / 1e-3 kg; fluence is per cm2
         self._kerma = energies * mass_energy_absorption_cm2_g(air, energies) * 1.602176634e-13 * 1e6
-        inherent_mu = sum(
-            (self.mu(layer.material) * layer.thickness_mm for layer in self.inherent), start=0.0 * energies
-        )
-        self._inherent = np.exp(-inherent_mu)
+        self._inherent = transmission(self.inherent, energies, bin_width_keV=BIN_WIDTH_KEV)
+        self._depth: dict[Filter, NDArray[np.float64]] = {}
 
     def mu(self, material: str) -> NDArray[np.float64]:
         """Linear attenuation (energy,), 1/mm."""
         if material not in self._mu:
             self._mu[material] = mu_per_mm(material_from_name(material), self.energies_keV)
         return self._mu[material]
+
+    def depth(self, layer: Filter) -> NDArray[np.float64]:
+        """Optical depth of a layer (energy,); a bin that an absorption edge cuts has that of its mean transmission."""
+        if layer not in self._depth:
+            passed = transmission([layer], self.energies_keV, bin_width_keV=BIN_WIDTH_KEV)
+            self._depth[layer] = -np.log(np.maximum(passed, 1e-300))
+        return self._depth[layer]
 
     def fluence(self, kV: float) -> NDArray[np.float64]:
         """Unfiltered fluence at the nodes of the kV error (node, energy), photons / keV / cm2 / mAs at 1 m."""
@@ -159,7 +164,7 @@ class SpectralModel:
         for layer in beam.filters:
             name = attenuation_scale_name(layer.material)
             scale = np.exp(self._column(samples, name)) if name in self._index else np.ones(len(samples))
-            exponent = exponent - (layer.thickness_mm * scale)[:, None] * self.mu(layer.material)[:top]
+            exponent = exponent - scale[:, None] * self.depth(layer)[:top]
         exponent = exponent + self._column(samples, "hardness_exponent")[:, None] * np.log(energies / REFERENCE_KEV)
         exponent = (
             exponent

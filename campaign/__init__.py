@@ -1,0 +1,1 @@
+"""Chains of commands over settings, and the report that gathers what they answered."""

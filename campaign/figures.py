@@ -1,0 +1,223 @@
+"""The demo report's figures; each returns a PNG. Matplotlib is imported only here, without touching its global state."""
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..acquisition.dataset_io import read_dataset
+from ..errors import RaytwinError
+from ..generator.twin import Twin
+from ..pod.hit_miss import fit_pod
+
+REAL, GENERATED, PUBLISHED = "#1b7f3b", "#c23b22", "#7a7a7a"
+_DPI = 110
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def plot_noise_maps(twin: Twin) -> bytes:
+    """Gain, electronic variance and dark of each pixel: the paper's figure of noise parameters. PNG."""
+    level = twin.levels[0]
+    good = twin.maps.bad_pixels == 0
+    maps = (
+        (level.gain_DN.value * twin.maps.gain_relative, f"gain at {level.name}, DN"),
+        (twin.maps.read_variance_DN2, "electronic and rounding variance, DN$^2$"),
+        (twin.maps.dark_DN, "dark, DN"),
+    )
+    figure, axes = _figure(13, 6.2, 2, 3)
+    for column, (values, title) in enumerate(maps):
+        low, high = np.percentile(values[good], [1, 99])
+        shown = axes[0, column].imshow(values, vmin=low, vmax=high, cmap="viridis", interpolation="nearest")
+        figure.colorbar(shown, ax=axes[0, column], shrink=0.8)
+        rows, columns = np.nonzero(~good)
+        axes[0, column].plot(columns, rows, "rx", markersize=4)
+        axes[0, column].set(title=title, xlabel="column, px", ylabel="row, px")
+        axes[1, column].hist(values[good], bins=60, color="#446688")
+        axes[1, column].set(xlabel=title, ylabel="pixels")
+    return _png(figure)
+
+
+def plot_photon_transfer(twin: Twin) -> bytes:
+    """Variance of one pixel against signal for every flat, with the fitted lines, and the residuals. PNG."""
+    figure, axes = _figure(12, 4.2, 1, 2)
+    read = twin.noise.read_variance_DN2
+    points = [point for point in twin.evidence["photon_transfer"] if point["signal_DN"] > 0]
+    for index, level in enumerate(twin.levels):
+        members = [point for point in points if point["series"] in level.series]
+        signal = np.array([point["signal_DN"] for point in members])
+        variance = np.array([point["pair_variance_DN2"] for point in members])
+        slope = level.photon_transfer_slope_DN.value
+        colour = f"C{index}"
+        line = np.geomspace(signal.min() * 0.8, signal.max() * 1.2, 100)
+        axes[0, 0].loglog(line, slope * line + read, color=colour, linewidth=1)
+        axes[0, 0].loglog(line, level.gain_DN.value * line + read, color=colour, linewidth=1, linestyle=":")
+        axes[0, 0].loglog(signal, variance, "o", color=colour, label=f"{level.name}")
+        axes[0, 1].semilogx(signal, 100 * (variance / (slope * signal + read) - 1), "o", color=colour)
+    axes[0, 0].axhline(read, color="grey", linewidth=0.8)
+    axes[0, 0].set(
+        xlabel="signal above dark, DN",
+        ylabel="variance, DN$^2$",
+        title="photon transfer (dotted: with the blur's share restored)",
+    )
+    axes[0, 0].legend()
+    axes[0, 1].axhline(0, color="grey", linewidth=0.8)
+    axes[0, 1].set(xlabel="signal above dark, DN", ylabel="measured over fitted variance - 1, %", title="residuals")
+    return _png(figure)
+
+
+def plot_validation(rows: Sequence[dict[str, Any]]) -> bytes:
+    """Predicted over measured mean and noise of flats that calibration did not see, with 95 % intervals. PNG."""
+    figure, axes = _figure(12, 0.45 * len(rows) + 1.6, 1, 2)
+    height = np.arange(len(rows))[::-1]
+    for column, (key, title) in enumerate((("mean_DN", "mean"), ("sd_DN", "noise (sd)"))):
+        axis = axes[0, column]
+        measured = np.array([row[f"measured_{key}"] for row in rows])
+        value, low, high = (np.array([row[key][name] for row in rows]) / measured for name in ("value", "low", "high"))
+        axis.errorbar(
+            100 * (value - 1),
+            height,
+            xerr=100 * np.array([value - low, high - value]),
+            fmt="o",
+            color="#335588",
+            capsize=3,
+        )
+        axis.axvline(0, color="grey", linewidth=0.8)
+        axis.set(xlabel="predicted over measured - 1, %", title=title, yticks=height)
+        axis.set_yticklabels([row["setting"].replace(",", ", ") for row in rows] if column == 0 else [], fontsize=8)
+    return _png(figure)
+
+
+def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
+    """One product at low kV: 1 s reference, then measured, generated and as published at each exposure. PNG."""
+    with read_dataset(directory / "real_1000ms.h5") as reference:
+        contrasts = reference.column("contrast")
+        order = np.argsort(np.where(np.isfinite(contrasts), contrasts, -np.inf))
+        index = int(order[-max(1, len(order) // 4)])
+        name = reference.rows[index].image
+        image = reference.images(index)[0]
+        mask = reference.foreign_object_masks(index)
+        contrast = float(contrasts[index])
+        size = reference.rows[index].size_mm
+    low, high = float(np.percentile(image, 2)) - 0.1, float(np.percentile(image, 99)) + 0.25
+    figure, axes = _figure(3.3 * len(exposures) + 3.3, 8.2, 3, len(exposures) + 1)
+    axes[0, 0].imshow(image, vmin=low, vmax=high, cmap="gray")
+    axes[0, 0].contour(mask, [0.5], colors="red", linewidths=0.8)
+    axes[0, 0].set_title(f"reference, 1 s; bone of {size:.2g} mm,\ncontrast {contrast:.3f} (outlined)", fontsize=9)
+    for axis in axes[1:, 0]:
+        axis.axis("off")
+    for column, exposure in enumerate(exposures, start=1):
+        for row, (kind, title) in enumerate(
+            (("real", "measured"), ("test", "generated"), ("published", "as published"))
+        ):
+            axis = axes[row, column]
+            with read_dataset(directory / f"{kind}_{exposure:g}ms.h5") as dataset:
+                found = [i for i, one in enumerate(dataset.rows) if name in (one.image, one.image.rpartition("-")[0])]
+                axis.imshow(dataset.images(found[0])[0], vmin=low, vmax=high, cmap="gray")
+            axis.set_title(f"{title}, {exposure:g} ms", fontsize=9)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    return _png(figure)
+
+
+def plot_training(training: dict[str, Any]) -> bytes:
+    """Training and validation loss of the shared network and of the networks of every exposure. PNG."""
+    names = list(training)
+    figure, axes = _figure(3.2 * len(names), 3.2, 1, len(names))
+    for column, name in enumerate(names):
+        axis = axes[0, column]
+        for index, network in enumerate(training[name]["networks"]):
+            losses = network["losses"]
+            axis.plot(np.arange(1, len(losses) + 1), losses, color=f"C{index}", linewidth=1)
+            axis.plot(network["validation_epochs"], network["validation_losses"], ".--", color=f"C{index}", linewidth=1)
+        axis.set(title=f"{name}", xlabel="epoch", ylabel="loss (dashed: validation)" if column == 0 else "")
+    return _png(figure)
+
+
+def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exposures: Sequence[float]) -> bytes:
+    """POD against contrast: a thin curve a network, a thick one for all; hits and misses as ticks; a90 intervals. PNG."""
+    figure, axes = _figure(4.1 * len(exposures), 4.0, 1, len(exposures))
+    for column, exposure in enumerate(exposures):
+        axis = axes[0, column]
+        for kind, colour, label, offset in (("real", REAL, "measured", 0.0), ("test", GENERATED, "generated", 0.025)):
+            name = f"{kind}_{exposure:g}ms"
+            if name not in hits:
+                continue
+            rows = [row for row in hits[name] if row["contrast"] != "" and row["hit"] != ""]
+            contrast = np.array([float(row["contrast"]) for row in rows])
+            hit = np.array([int(row["hit"]) for row in rows])
+            network = np.array([row["network"] for row in rows])
+            grid = np.linspace(0.0, float(contrast.max()) * 1.05, 200)
+            for one in np.unique(network):
+                _curve(
+                    axis, grid, contrast[network == one], hit[network == one], color=colour, linewidth=0.7, alpha=0.6
+                )
+            _curve(axis, grid, contrast, hit, color=colour, linewidth=2.4, label=label)
+            axis.plot(
+                contrast, np.where(hit > 0, 1.02 + offset, -0.02 - offset), "|", color=colour, markersize=6, alpha=0.5
+            )
+            answer = answers.get(name, {})
+            a90 = answer.get("a90")
+            if a90 is not None:
+                low = (answer.get("a90_low_two_sided") or {}).get("likelihood_ratio")
+                high = (answer.get("a90_95_two_sided") or {}).get("likelihood_ratio")
+                axis.plot([a90], [0.9 - offset], "o", color=colour)
+                if low is not None and high is not None:
+                    axis.plot([low, high], [0.9 - offset] * 2, color=colour, linewidth=1.4)
+        axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
+        axis.set(title=f"{exposure:g} ms", xlabel="contrast $\\Delta R$", ylim=(-0.1, 1.12))
+        axis.legend(loc="lower right", fontsize=8)
+    axes[0, 0].set_ylabel("probability of detection")
+    return _png(figure)
+
+
+def _curve(axis: Any, grid: Any, contrast: Any, hit: Any, **style: Any) -> None:
+    """The cloglog curve of these trials, drawn over the tested range; nothing where it cannot be fitted."""
+    try:
+        fit = fit_pod(contrast, hit, repeats="pooled")
+    except RaytwinError:
+        return
+    if fit.c0 is None or fit.c1 is None or not (math.isfinite(fit.c0) and math.isfinite(fit.c1)):
+        return
+    inside = grid <= contrast.max()
+    axis.plot(grid[inside], -np.expm1(-np.exp(np.clip(fit.c0 + fit.c1 * grid[inside], -50, 50))), **style)
+
+
+def plot_a90(table: Sequence[dict[str, Any]]) -> bytes:
+    """Contrast at POD 90 % against exposure, measured and generated, with two-sided 95 % intervals. PNG."""
+    figure, axes = _figure(6.4, 4.2)
+    axis = axes[0, 0]
+    for kind, colour, label, shift in (("real", REAL, "measured", 0.97), ("generated", GENERATED, "generated", 1.03)):
+        rows = [(row["exposure_ms"], row[kind]) for row in table if row[kind] and row[kind]["a90"] is not None]
+        if not rows:
+            continue
+        exposure = np.array([one for one, _ in rows]) * shift
+        a90 = np.array([entry["a90"] for _, entry in rows])
+        below = np.array(
+            [a90[i] - (entry["low"] if entry["low"] is not None else a90[i]) for i, (_, entry) in enumerate(rows)]
+        )
+        above = np.array(
+            [(entry["high"] if entry["high"] is not None else a90[i]) - a90[i] for i, (_, entry) in enumerate(rows)]
+        )
+        axis.errorbar(exposure, a90, yerr=[below, above], fmt="o-", color=colour, capsize=3, label=label)
+    axis.set_xscale("log")
+    axis.set(xlabel="exposure, ms", ylabel="contrast at POD 90 %", title="a90 against exposure")
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend()
+    return _png(figure)

@@ -1,0 +1,93 @@
+"""The main job end to end on the virtual lab: calibrate, validate, generate, train, detect, POD, one report.
+
+Small but honest by default (minutes on two cores); --paper-size is the paper's detector, image and network numbers. A
+run that was stopped goes on where it stopped.
+"""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+
+from ._answer import answer, say
+
+EXAMPLE = """example:
+  raytwin demo -o demo
+  raytwin demo -o demo_large --size 192x256 --products 150 --networks 10
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `raytwin demo`."""
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, default=Path("demo"), help="folder (default demo)")
+    parser.add_argument("--paper-size", action="store_true", help="start from the paper's sizes instead of small ones")
+    parser.add_argument("--size", metavar="ROWSxCOLUMNS", help="detector, pixels")
+    parser.add_argument("--pixel-mm", type=float, help="pixel pitch, mm")
+    parser.add_argument("--products", type=int, help="images to learn from")
+    parser.add_argument("--test-products", type=int, help="images to test on")
+    parser.add_argument("--generated", type=int, help="training pairs generated for each exposure")
+    parser.add_argument("--networks", type=int, help="networks for each exposure")
+    parser.add_argument("--shared-steps", type=int, help="training steps of the network that all start from")
+    parser.add_argument("--steps", type=int, help="training steps of each network after that")
+    parser.add_argument("--batch", type=int, help="images a step")
+    parser.add_argument("--seed", type=int, help="seed of everything (default 1)")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run `raytwin demo`."""
+    from .. import __version__
+    from ..campaign.demo import PAPER_PLAN, DemoPlan, gap_summary, run_demo
+    from ..campaign.report import summary_text, write_report
+    from ..cli import main
+    from ..errors import InputError
+    from ..segmentation import choose_device
+
+    choose_device("auto")  # says at once how to install torch where it is missing
+    changes = {
+        name: value
+        for name in (
+            "pixel_mm",
+            "products",
+            "test_products",
+            "generated",
+            "networks",
+            "shared_steps",
+            "steps",
+            "batch",
+            "seed",
+        )
+        if (value := getattr(arguments, name)) is not None
+    }
+    if arguments.size is not None:
+        rows, cross, columns = arguments.size.lower().partition("x")
+        if not (cross and rows.isdigit() and columns.isdigit()):
+            raise InputError("--size", received=arguments.size, expected="ROWSxCOLUMNS, for example 96x128")
+        changes["size"] = (int(rows), int(columns))
+    plan = dataclasses.replace(PAPER_PLAN if arguments.paper_size else DemoPlan(), **changes)
+    started = time.monotonic()
+    result = run_demo(
+        plan, arguments.output, run=main, tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}")
+    )
+    report = write_report(result, arguments.output, version=__version__)
+    summary = summary_text(result)
+    answer(
+        {
+            "paths": {
+                "report": report,
+                "twin": arguments.output / "twin.h5",
+                "directory": arguments.output,
+            },
+            "a90_table": result["a90_table"],
+            "validation": {
+                "median_abs_error_percent": result["validation"]["median_abs_error_percent"],
+                "coverage": result["validation"]["coverage"],
+            },
+            "diagnosis": gap_summary(result["validation"]),
+            "summary": summary,
+            "seconds": round(time.monotonic() - started, 1),
+        },
+        as_json=arguments.json,
+        text=f"{summary}\nreport: {report}",
+    )
+    return 0

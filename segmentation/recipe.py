@@ -86,6 +86,8 @@ class Recipe:
         return len(self.classes) - 1
 
 
+# The paper does not say so, but the authors' code starts its encoder from ImageNet, its library's default: the option
+# `--encoder-weights imagenet` does the same.
 RECIPES: MappingProxyType[str, Recipe] = MappingProxyType(
     {
         "raytwin": Recipe(

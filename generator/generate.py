@@ -81,7 +81,7 @@ class ChannelModel:
             )
         predicted = predict_flatfield(self.twin, replace(self.target, averaged=1))
         self.level = level
-        # bad pixels were replaced by their neighbours in the references, so flat, dark and noise are those of a good pixel
+        # bad pixels took their neighbours' place in the references, so flat, dark and noise are those of a good pixel
         bad = self.twin.maps.bad_pixels > 0
         shape = replace_bad_pixels(level.flat_shape.astype(np.float64), bad)
         self.open_signal_DN = predicted.mean_DN.value * shape
@@ -205,10 +205,16 @@ def generate_dataset(
         raise InputError("reference", received=f"no image of split {split}", expected="at least one reference image")
     channels = [ChannelModel(twin, low, product_material), ChannelModel(twin, high, product_material)]
     settings = [reference_settings(reference.rows[int(index)], reference_setting) for index in chosen]
+    warnings = []
     for pair in sorted(set(settings), key=str):
         for own, target in zip(pair, (low, high), strict=True):
-            plan_top_up(reference=own, target=target)
-    warnings = []
+            plan = plan_top_up(reference=own, target=target)
+            if plan.read < -1e-9:
+                excess = math.sqrt(-plan.read) * twin.noise.read_noise_DN.value
+                warnings.append(
+                    f"references at {own} carry {excess:.3g} DN rms more electronic noise than {target} would: their"
+                    " frames are too many and too dim for it"
+                )
     if twin.spectral is None:
         warnings.append("the twin has no spectral part: the gain behind the product is that of the open beam")
     setting_text = f"{low};{high}"

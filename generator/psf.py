@@ -107,8 +107,21 @@ def noise_kernel_1d(model: str, sigma_px: float) -> NDArray[np.float64]:
     drawn per pixel and convolved with it has the covariance of quanta that land anywhere in the pixel.
     """
     _check(model, sigma_px)
-    radius = max(4, math.ceil(5 * sigma_px) + 2)
+    radius = max(7, math.ceil(5 * sigma_px) + 4)
     return _noise_kernel_1d(model, float(sigma_px), radius)
+
+
+@lru_cache(maxsize=64)
+def noise_coupling(model: str, sigma_px: float) -> float:
+    """sum(h^2 rho) / sum(h^3), h the noise kernel and rho its autocovariance: 1 without spread; no unit.
+
+    By this factor the third moment grows when noise is drawn in proportion to a signal that carries noise of the same
+    spread: E[r n^2] = gain x Var(r before the spread) x sum(h^2 rho).
+    """
+    kernel = noise_kernel_1d(model, sigma_px)
+    half = noise_autocovariance_1d(model, sigma_px, len(kernel) // 2)
+    rho = np.concatenate([half[:0:-1], half])
+    return float((np.sum(kernel**2 * rho) / np.sum(kernel**3)) ** 2)
 
 
 def optical_kernel_1d(model: str, sigma_px: float) -> NDArray[np.float64]:

@@ -4,14 +4,16 @@ A reference is itself a measurement. Scaled to the target it already carries a s
 the same detector, so the signal is not blurred again and only the rest is drawn.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting
+from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from .noise import digitise, sample_frame_noise
+from .psf import noise_coupling
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,14 +21,22 @@ class TopUp:
     """Shares of the target's single-frame noise that a reference does not hold.
 
     Fields: scale (target over reference signal, one frame each); quantum (variance), third_cumulant, read (electronic
-    variance), each over that of one target frame; averaged: frames averaged in the target.
+    variance), each over that of one target frame; held: quantum variance that the reference brings, over the same;
+    averaged: frames averaged in the target. A negative `read` is electronic noise of the reference beyond the target's,
+    which nothing can take away.
     """
 
     scale: float
     quantum: float
     third_cumulant: float
     read: float
+    held: float
     averaged: int
+
+
+def same_layers(first: Sequence[Filter], second: Sequence[Filter]) -> bool:
+    """Whether two stacks hold the same layers, in any order."""
+    return sorted(str(layer) for layer in first) == sorted(str(layer) for layer in second)
 
 
 def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
@@ -39,7 +49,7 @@ def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
     Raises:
         InputError: different kV, filters or distance, unknown load, or a reference noisier than the target.
     """
-    if abs(reference.kV - target.kV) > 1e-6 * target.kV or set(reference.filters) != set(target.filters):
+    if abs(reference.kV - target.kV) > 1e-6 * target.kV or not same_layers(reference.filters, target.filters):
         raise InputError(
             "target setting",
             received=f"{target}",
@@ -79,6 +89,7 @@ def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
         quantum=quantum,
         third_cumulant=1.0 / frames_t**2 - scale**2 / frames_r**2,
         read=1.0 / frames_t - scale**2 / frames_r,
+        held=scale / frames_r,
         averaged=frames_t,
     )
 
@@ -111,6 +122,9 @@ def apply_top_up(
         rng: source of randomness.
     """
     signal = np.asarray(open_signal_DN, dtype=np.float64) * transmission
+    # where the reference's noise is up, more noise is drawn: this couples them in the third moment; it is taken off
+    coupling = 3.0 * plan.quantum * plan.held * noise_coupling(psf_model, psf_sigma_px)
+    third_cumulant = max(plan.third_cumulant - coupling, 0.01 * plan.quantum)
     rounding = 1.0 / 12.0 / plan.averaged if quantised else 0.0
     # rounding comes with digitising below; what the electronics still lack excludes it
     electronic = np.clip(plan.read * np.asarray(read_variance_DN2, dtype=np.float64) - rounding, 0.0, None)
@@ -124,6 +138,6 @@ def apply_top_up(
         psf_sigma_px=psf_sigma_px,
         rng=rng,
         quantum_share=plan.quantum,
-        third_cumulant_share=plan.third_cumulant,
+        third_cumulant_share=third_cumulant,
     )
     return digitise(signal + noise + dark_DN, bits=bits, quantised=quantised, averaged=plan.averaged)

@@ -160,6 +160,26 @@ def reading(where: str) -> Iterator[None]:
         ) from None
 
 
+def check_stored(dataset: Any, *, where: str) -> None:
+    """Refuse a dataset that was never written to its end: HDF5 would hand out zeros in the gaps without a word."""
+    if dataset.is_virtual or dataset.external:
+        return
+    with reading(where):
+        if dataset.chunks is None:
+            there, whole = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize
+            unit = "bytes"
+        else:
+            there, unit = dataset.id.get_num_chunks(), "chunks"
+            whole = math.prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    if there < whole:
+        raise FileFormatError(
+            where,
+            received=f"{there} of {whole} {unit}",
+            expected="data that were written to the end",
+            remedy="the recording was cut off: measure or export again",
+        )
+
+
 def frames_per_piece(*, chunk_frames: int | None, frame_bytes: int, maximum_bytes: int) -> int:
     """How many frames to read at once: whole chunks of the file, within the memory allowed where possible."""
     fitting = max(1, maximum_bytes // max(1, frame_bytes))

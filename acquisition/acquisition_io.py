@@ -16,6 +16,7 @@ from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from ._hdf5 import (
     check_format,
+    check_stored,
     child,
     frames_per_piece,
     number_attribute,
@@ -248,7 +249,8 @@ def open_acquisition(path: str | os.PathLike[str]) -> AcquisitionFile:
     """
     file = open_hdf5(path, what="an acquisition file")
     try:
-        return _acquisition(file, path=str(path))
+        with reading(str(path)):
+            return _acquisition(file, path=str(path))
     except BaseException:
         file.close()
         raise
@@ -304,6 +306,7 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         raise FileFormatError(
             f"{where}/frames", received=f"values of type {frames.dtype}", expected="uint16 or float32 detector numbers"
         )
+    check_stored(frames, where=f"{where}/frames")
     kind = text_attribute(node, "kind", where=where)
     if kind not in KINDS:
         raise FileFormatError(
@@ -685,7 +688,7 @@ class AcquisitionWriter:
             shape=(0, *shape),
             maxshape=(None, *shape),
             dtype=dtype,
-            chunks=(chunk_frames or _chunk_frames(shape, np.dtype(dtype)), *shape),
+            chunks=(chunk_frames or _chunk_frames(shape, np.dtype(dtype), frames), *shape),
             compression=self._compression,
             shuffle=self._compression is not None,
         )
@@ -796,8 +799,9 @@ def _attributes_of(setting: Setting) -> dict[str, Any]:
     return attributes
 
 
-def _chunk_frames(pixels: Sequence[int], dtype: np.dtype[Any]) -> int:
-    return max(1, _CHUNK_BYTES // max(1, math.prod(pixels) * dtype.itemsize))
+def _chunk_frames(shape: Sequence[int], dtype: np.dtype[Any], frames: object) -> int:
+    fitting = max(1, _CHUNK_BYTES // max(1, math.prod(shape) * dtype.itemsize))
+    return min(fitting, len(frames)) if isinstance(frames, np.ndarray) and frames.ndim == 3 else fitting
 
 
 def _pieces(frames: NDArray[Any] | Iterable[NDArray[Any]] | None) -> Iterator[NDArray[Any]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
-from ._hdf5 import check_format, child, open_hdf5, plain_attributes, reading
+from ._hdf5 import check_format, check_stored, child, open_hdf5, plain_attributes, reading
 
 FORMAT = "raytwin-dataset"
 VERSION = 1
@@ -200,7 +200,8 @@ def read_dataset(path: str | os.PathLike[str]) -> Dataset:
     """
     file = open_hdf5(path, what="a dataset file")
     try:
-        return _dataset(file, path=str(path))
+        with reading(str(path)):
+            return _dataset(file, path=str(path))
     except BaseException:
         file.close()
         raise
@@ -228,6 +229,9 @@ def _dataset(file: Any, *, path: str) -> Dataset:
             raise FileFormatError(
                 f"{path}, {name}", received=f"shape {getattr(dataset, 'shape', 'absent')}", expected=f"shape {shape}"
             )
+    for name in ("images", "counts", "foreign_object_masks", "product_masks"):
+        if name in file:
+            check_stored(file[name], where=f"{path}, {name}")
     return Dataset(
         path=path,
         rows=_rows(child(file, "rows"), n=n, path=path),

@@ -283,6 +283,17 @@ def test_series_without_frames_are_refused(path):
     assert "got no series" in fails(path)
 
 
+@pytest.mark.parametrize("chunks", [(1, 6, 5), (2, 6, 5), None])
+def test_a_recording_that_was_cut_off_is_refused_not_read_as_zeros(path, chunks):
+    small(path)
+    with h5py.File(path, "a") as file:
+        del file["series/flat/frames"]
+        frames = file["series/flat"].create_dataset("frames", (9, 6, 5), np.uint16, chunks=chunks)
+        if chunks is not None:
+            frames[:4] = 7
+    assert "series flat/frames: got" in fails(path) and "the recording was cut off" in fails(path)
+
+
 def test_frames_that_are_not_finite_are_named_when_they_are_read(path):
     with write_acquisition(path) as writer:
         writer.add_series("flat", kind="flat", frames=np.ones((3, 4, 5)))

@@ -85,8 +85,7 @@ def spread_taps(psf_sigma_px: float) -> NDArray[np.float32]:
 
 def _photons(arrivals: Arrivals, context: FrameContext) -> NDArray[np.float32]:
     """Photons drawn, absorbed, turned into light (keV) at the sub-pixel where they landed."""
-    from ._loops import light_of_photons
-    from ._random import poisson_tables
+    from ._loops import light_of_photons, poisson_tables
 
     keep, alias = poisson_tables()
     light = np.empty(arrivals.cell.shape, dtype=np.float32)
@@ -122,8 +121,7 @@ def _spread(light: NDArray[np.float32], context: FrameContext) -> NDArray[np.flo
 
 def _electrons(light_keV: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
     """Electrons of light and dark current, Poisson in each pixel."""
-    from ._loops import electrons_of_light
-    from ._random import poisson_tables
+    from ._loops import electrons_of_light, poisson_tables
 
     keep, alias = poisson_tables()
     dark = context.maps.dark_current_DN_per_ms * (context.exposure_ms * context.summed / context.system.DN_per_electron)

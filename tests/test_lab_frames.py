@@ -240,3 +240,23 @@ def test_the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two():
         )
         hashes.add(done.stdout.strip())
     assert len(hashes) == 1 and len(hashes.pop()) == 64
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", [0.35, 0.7])
+@pytest.mark.parametrize(("kV", "power_W"), [(40.0, 40.0), (90.0, 45.0)])
+def test_many_frames_have_the_moments_of_the_closed_form_within_half_a_per_cent(sigma, kV, power_W):
+    system = replace(UNIFORM, rows=128, columns=160, psf_sigma_px=sigma)
+    wanted, count = setting(kV, power_W), 150
+    frames = frames_of(system, wanted, count)
+    truth = flat_truth(system, detector_maps(system), wanted)
+    dark_DN = system.dark_DN + system.dark_current_DN_per_ms * wanted.exposure_ms
+    assert frames.mean() - dark_DN == pytest.approx(truth["mean_DN"], rel=5e-4)
+    secondary = system.DN_per_electron * truth["mean_DN"]
+    quantum = truth["gain_DN"] * truth["mean_DN"] - secondary
+    white = system.read_noise_DN**2 + 1 / 12 + secondary
+    variance = covariance(frames, 0, 0)
+    assert variance == pytest.approx(quantum * aperture_share(sigma) ** 2 + white, rel=5e-3)
+    for row, column in ((0, 1), (1, 0), (1, 1)):
+        expected = quantum * aperture_share(sigma, row) * aperture_share(sigma, column)
+        assert abs(covariance(frames, row, column) - expected) < 5e-3 * variance

@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 from scipy import stats
 
-from raytwin.lab._random import gamma, normal, poisson, poisson_tables, seed_stream, uniform
+from raytwin.lab._loops import gamma, normal, poisson, poisson_tables, seed_stream, uniform
 
 DRAWS = 200_000
 # A test statistic this improbable is a fault, not bad luck; seeds are fixed, so a pass stays a pass.

@@ -327,41 +327,41 @@ def a90_table(pod: dict[str, Any], compared: dict[str, Any], exposures: Sequence
 
 
 def noise_comparison(directory: Path, number: str) -> dict[str, dict[str, list[float]]]:
-    """Noise of the log images inside the products: rms of the difference to the 1 s image, real, generated, as published.
+    """Noise of the log images inside the products: standard deviation, and correlation of neighbours along a row.
 
-    Per channel (low kV, high kV). The generated image shares its reference's noise, the real one does not, so the
-    reference's own share is taken out of the real difference and put into none.
+    Taken from differences to the same product's 1 s image. With v the variance of the image's noise and r its share of the
+    1 s exposure, the 1 s image holds about r v of its own: a measured difference has v (1 + r), a topped-up one, which shares
+    its reference's noise, v (1 - r), and one with full noise on top v - r v again. Per channel (low kV, high kV).
     """
     from ..acquisition.dataset_io import read_dataset
 
+    share = float(number.removesuffix("ms")) / 1000.0
     result: dict[str, dict[str, list[float]]] = {}
     with read_dataset(directory / "real_1000ms.h5") as reference:
         position = {row.image: index for index, row in enumerate(reference.rows)}
-        # a pair-free estimate of correlation: neighbours one pixel apart along a row
-        for kind, name in (
-            ("real", f"real_{number}"),
-            ("raytwin", f"test_{number}"),
-            ("as_published", f"published_{number}"),
+        for kind, name, factor in (
+            ("real", f"real_{number}", 1.0 / (1.0 + share)),
+            ("raytwin", f"test_{number}", 1.0 / (1.0 - share)),
+            ("as_published", f"published_{number}", 1.0),
         ):
-            rms: list[list[float]] = [[], []]
-            correlation: list[list[float]] = [[], []]
+            variances: list[list[float]] = [[], []]
+            correlations: list[list[float]] = [[], []]
             with read_dataset(directory / f"{name}.h5") as dataset:
                 for index, row in enumerate(dataset.rows):
                     original = row.image if row.image in position else row.image.rpartition("-")[0]
-                    if original not in position:
-                        continue
                     inside = dataset.product_masks(index)
                     difference = dataset.images(index) - reference.images(position[original])
                     both = inside[:, 1:] & inside[:, :-1]
                     for channel in range(2):
                         plane = difference[channel] - difference[channel][inside].mean()
                         variance = float(np.mean(plane[inside] ** 2))
-                        rms[channel].append(variance)
+                        variances[channel].append(variance * factor)
                         neighbours = float(np.mean((plane[:, 1:] * plane[:, :-1])[both]))
-                        correlation[channel].append(neighbours / variance)
+                        correlations[channel].append(neighbours / variance)
+            held = [share * value**2 for value in result["real"]["rms"]] if kind == "as_published" else [0.0, 0.0]
             result[kind] = {
-                "rms": [math.sqrt(float(np.mean(values))) for values in rms],
-                "neighbour_correlation": [float(np.mean(values)) for values in correlation],
+                "rms": [math.sqrt(float(np.mean(v)) + extra) for v, extra in zip(variances, held, strict=True)],
+                "neighbour_correlation": [float(np.mean(values)) for values in correlations],
             }
     return result
 

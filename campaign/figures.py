@@ -182,7 +182,8 @@ def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exp
                     axis.plot([low, high], [0.9 - offset] * 2, color=colour, linewidth=1.4)
         axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
         axis.set(title=f"{exposure:g} ms", xlabel="contrast $\\Delta R$", ylim=(-0.1, 1.12))
-        axis.legend(loc="lower right", fontsize=8)
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(loc="lower right", fontsize=8)
     axes[0, 0].set_ylabel("probability of detection")
     return _png(figure)
 

@@ -72,10 +72,10 @@ def _interval(entry: Mapping[str, Any] | None) -> str:
 
 
 def _difference(compare: Mapping[str, Any] | None) -> str:
-    difference = (compare or {}).get("difference") or (compare or {}).get("a90_difference")
-    if isinstance(difference, Mapping) and difference.get("value") is not None:
-        return f"{difference['value']:+.3f} ({_number(difference.get('low'))} to {_number(difference.get('high'))})"
-    return _DASH
+    difference = (compare or {}).get("difference_a90") or {}
+    if difference.get("value") is None:
+        return _DASH
+    return f"{difference['value']:+.3f} ({_number(difference.get('low'))} to {_number(difference.get('high'))})"
 
 
 def _table_row(row: Mapping[str, Any]) -> dict[str, str]:
@@ -93,13 +93,13 @@ def _table_row(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _pod_notes(table: Sequence[Mapping[str, Any]]) -> list[str]:
-    notes = []
+    """The curves' warnings, each once, with the curves it belongs to."""
+    where: dict[str, list[str]] = {}
     for row in table:
         for kind, label in (("real", "measured"), ("generated", "generated")):
-            entry = row[kind]
-            if entry:
-                notes += [f"{row['exposure_ms']:g} ms, {label}: {line}" for line in entry["warnings"]]
-    return notes
+            for line in (row[kind] or {}).get("warnings", []):
+                where.setdefault(line, []).append(f"{row['exposure_ms']:g} ms {label}")
+    return [f"{', '.join(curves)}: {line}" for line, curves in where.items()]
 
 
 def summary_text(result: Mapping[str, Any]) -> str:

@@ -254,7 +254,10 @@ def generate_dataset(
                 counts=counts if with_counts else None,
                 foreign_object_mask=foreign,
                 product_mask=reference.product_masks(index),
-                row=replace(row, image=f"{row.image}-{number:05d}", setting=setting_text),
+                # the first image of a reference keeps its name, so that it pairs with the measured one
+                row=replace(
+                    row, image=row.image if number < len(chosen) else f"{row.image}-{number:05d}", setting=setting_text
+                ),
             )
             if progress is not None:
                 progress(number + 1)

@@ -120,6 +120,8 @@ def compute_truth(system: LabSystem, *, settings: Iterable[Setting], exposures_m
         "DN_per_electron": float(np.median(maps.DN_per_electron[good])),
         "psf_sigma_px": system.psf_sigma_px,
         "read_noise_DN": float(np.median(maps.read_noise_DN[good])),
+        # What a dark series shows: electronic noise and the rounding of the ADC.
+        "dark_sd_DN": math.sqrt(float(np.median(maps.read_noise_DN[good])) ** 2 + 1.0 / 12.0),
         "dark_DN": float(np.median(maps.dark_DN[good])),
         "dark_current_DN_per_ms": float(np.median(maps.dark_current_DN_per_ms[good])),
         "dark_DN_at": [

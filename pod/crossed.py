@@ -359,6 +359,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             n_images=0 if table.image is None else int(table.image.max()) + 1,
             a50_conditional=conditional[50],
             a90_conditional=conditional[90],
+            covariance=mixed.covariance,
         ),
         naive=naive,
     )

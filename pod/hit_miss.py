@@ -50,7 +50,8 @@ NO_BOUNDS = Bounds()
 class CrossedEffects:
     """Random effects on the scale of eta: standard deviations between networks and between images (None: not fitted).
 
-    `a50_conditional` and `a90_conditional` are the sizes of an average network at an average image.
+    `a50_conditional` and `a90_conditional` are the sizes of an average network at an average image. covariance: of
+    (c0, c1, sd_network, sd_image), those that were fitted.
     """
 
     sd_network: float | None
@@ -59,6 +60,7 @@ class CrossedEffects:
     n_images: int
     a50_conditional: float | None
     a90_conditional: float | None
+    covariance: Array = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,7 +42,8 @@ class PodTable:
 
     size (row,) in the column's own unit, or None; hits (row,), trials (row,) or None; response (row,) or None;
     other: every remaining column as text, for the rows with an object. false_alarm (product,): 1 where a product
-    without object was marked; its labels beside it. notes: what was read in another way than one might think.
+    without object was marked; its labels beside it; noise_response: their
+    responses. notes: what was read in another way than one might think.
     """
 
     size_name: str
@@ -57,6 +58,7 @@ class PodTable:
     false_alarm: Array = field(default_factory=lambda: np.zeros(0))
     false_alarm_network: tuple[str, ...] | None = None
     false_alarm_image: tuple[str, ...] | None = None
+    noise_response: Array = field(default_factory=lambda: np.zeros(0))
     notes: tuple[str, ...] = ()
 
     def numbers(self, name: str) -> Array:
@@ -174,6 +176,10 @@ def read_pod_table(
             if len(alarms) < len(without):
                 notes.append(f"{len(without) - len(alarms)} rows without foreign object say nothing of a false alarm")
                 without = [i for t, i in zip(texts, without, strict=True) if t != ""]
+    noise = np.zeros(0)
+    if response_name and without:
+        told = [i for i in without if rows[i][header.index(response_name)].strip()]
+        noise = numbers(response_name, told)
     own = {size_name, *hit_names, *(n for n in (trials_name, response_name) if n)}
     return PodTable(
         size_name=size_name,
@@ -186,6 +192,7 @@ def read_pod_table(
         false_alarm=alarms,
         false_alarm_network=column(named["network"], without) if named["network"] and len(alarms) else None,
         false_alarm_image=column(named["image"], without) if named["image"] and len(alarms) else None,
+        noise_response=noise,
         notes=tuple(notes),
     )
 

@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "detect": ("detect", "hit or miss of every network on every image"),
     "pod": ("pod", "probability-of-detection curve with a90 and its bounds"),
     "compare": ("compare", "are two POD curves the same?"),
+    "plan": ("plan", "how many images and networks a POD study needs"),
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
 }

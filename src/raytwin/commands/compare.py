@@ -6,12 +6,14 @@ margin` when both hold, else `inconclusive`. Images and networks of the same nam
 """
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import whole_file
 from ..pod import PodTable, Trials, check_trials, compare_pod, read_pod_table
 from ._answer import answer, say
-from .pod import default_repeats, fit_answer, where_from_options
+from ._pod_answer import default_repeats, fit_answer, shown, where_from_options
 
 EXAMPLE = """examples:
   raytwin compare REAL.csv GENERATED.csv --margin 0.1 --json
@@ -33,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--site", metavar="COLUMN", help="the inspected site")
     parser.add_argument("--where", metavar="COLUMN=VALUE", action="append", default=[], help="only these rows of both")
     parser.add_argument("--unpaired", action="store_true", help="take equal names of images and networks as chance")
+    parser.add_argument("--plots", metavar="DIR", help="write the figure of both curves")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
@@ -94,6 +97,15 @@ def run(arguments: argparse.Namespace) -> int:
         "repeats": repeats,
         "warnings": [*(note for table in tables for note in table.notes), *comparison.warnings],
     }
+    if arguments.plots:
+        from ..pod.plots import plot_comparison
+
+        names = Path(arguments.first).stem, Path(arguments.second).stem
+        figure = plot_comparison(comparison, size_label=tables[0].size_name, names=names)
+        path = Path(arguments.plots) / "compare.png"
+        with whole_file(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=150)
+        result["plots"] = [str(path)]
     for line in result["warnings"]:
         say(f"warning: {line}")
     answer(result, as_json=arguments.json, text=_text(result))
@@ -146,17 +158,13 @@ def _interval(interval: Any) -> dict[str, float | None]:
     return {"value": interval.value, "low": interval.low, "high": interval.high}
 
 
-def _shown(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
-
-
 def _text(result: dict[str, Any]) -> str:
     lines = [
-        f"a90 {_shown(result['first']['a90'])} (first), {_shown(result['second']['a90'])} (second), {result['size']}",
+        f"a90 {shown(result['first']['a90'])} (first), {shown(result['second']['a90'])} (second), {result['size']}",
     ]
     for label, key in (("difference, second - first", "difference_a90"), ("ratio, second / first", "ratio_a90")):
         found = result[key]
-        lines.append(f"{label}: {_shown(found['value'])} ({_shown(found['low'])} to {_shown(found['high'])}, 95 %)")
+        lines.append(f"{label}: {shown(found['value'])} ({shown(found['low'])} to {shown(found['high'])}, 95 %)")
     test = result["curve_test"]
     if test is not None:
         lines.append(
@@ -165,7 +173,7 @@ def _text(result: dict[str, Any]) -> str:
     equal = result["equivalence"]
     lines.append(
         f"at a margin of {100 * equal['margin']:g} % on a90: {equal['verdict']}"
-        f" (90 % interval of the ratio {_shown(equal['low'])} to {_shown(equal['high'])}, p {_shown(equal['p'])})"
+        f" (90 % interval of the ratio {shown(equal['low'])} to {shown(equal['high'])}, p {shown(equal['p'])})"
     )
     lines.append(f"paired by {result['paired']}; correlation of the two a90 {result['correlation']:.2f}")
     return "\n".join(lines)

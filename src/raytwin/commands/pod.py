@@ -2,42 +2,100 @@
 
 Sizes that the data cannot support are null, with the reason in the warnings. With repeated looks (columns network and
 image) the intervals carry both; what they would be if every look were independent stands beside them as `naive`.
+Bounds: likelihood_ratio and wald as the handbook's, modified = likelihood ratio corrected for few trials (the one to
+trust below some 400). Rows with an empty size are products without foreign object: they count as false alarms or not.
 """
 
 import argparse
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import InputError
-from ..pod import PodFit, PodTable, Trials, check_trials, compare_models, false_alarm_rate, fit_pod, read_pod_table
+from ..files import whole_file
+from ..pod import (
+    PodFit,
+    PodTable,
+    bootstrap_pod,
+    compare_models,
+    compute_roc,
+    explain_detection,
+    false_alarm_rate,
+    fit_as_published,
+    fit_covariates,
+    fit_lapse_pod,
+    fit_pod,
+    fit_response_pod,
+    read_pod_table,
+    size_at,
+    write_curve_table,
+)
 from ._answer import answer, say
+from ._pod_answer import (
+    default_repeats,
+    fit_answer,
+    notes_on_table,
+    response_answer,
+    text_from_answer,
+    trials_from_table,
+    where_from_options,
+)
 
 EXAMPLE = """examples:
   raytwin pod HITS.csv --json
-  raytwin pod HITS.csv --size size_mm --log-size --where setting=20ms
+  raytwin pod HITS.csv --size size_mm --log-size --where setting=20ms --plots figures
+  raytwin pod HITS.csv --explain contrast,size_mm,thickness_mm
   raytwin pod beetles.csv --size log10_dose --hit killed --trials n --link logit
+  raytwin pod sites.csv --link logit --log-size --repeats scaled --site target
+  raytwin pod echoes.csv --response ahat --decision 200 --left-censored 50 --right-censored 1375 --log-size
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("table", metavar="TABLE.csv", help="a row per trial, or per size with --trials")
-    parser.add_argument("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
-    parser.add_argument("--hit", metavar="COLUMN", help="0 or 1; A,B,C = one inspection each; default: hit")
-    parser.add_argument("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
-    parser.add_argument("--link", default="cloglog", choices=("cloglog", "loglog", "logit", "probit"))
-    parser.add_argument("--log-size", action="store_true", help="curve on the logarithm of the size")
-    parser.add_argument(
-        "--method", choices=("ml", "firth"), help="default: ml, and firth where hits and misses do not overlap"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("table", metavar="TABLE.csv", help="a row per trial, or per size with --trials")
+    add("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
+    add("--hit", metavar="COLUMN", help="0 or 1; A,B,C = one inspection each; default: hit")
+    add("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
+    add("--link", default="cloglog", choices=("cloglog", "loglog", "logit", "probit"))
+    add("--log-size", action="store_true", help="curve on the logarithm of the size")
+    add("--method", choices=("ml", "firth"), help="default: ml, and firth where hits and misses do not overlap")
+    add(
         "--repeats",
         choices=("crossed", "scaled", "cluster", "pooled"),
         help="repeated looks; default: crossed where columns network and image exist, else pooled",
     )
-    parser.add_argument("--site", metavar="COLUMN", help="the inspected site (for --repeats scaled and cluster)")
-    parser.add_argument(
-        "--where", metavar="COLUMN=VALUE", action="append", default=[], help="only these rows; repeatable"
+    add("--site", metavar="COLUMN", help="the inspected site (for --repeats scaled and cluster)")
+    add("--network", metavar="COLUMN", help="who looked; default: network")
+    add("--image", metavar="COLUMN", help="at what; default: image")
+    add("--where", metavar="COLUMN=VALUE", action="append", default=[], help="only these rows; repeatable")
+    response = parser.add_argument_group("continuous response (a-hat against a)")
+    add = response.add_argument
+    add("--response", metavar="COLUMN", help="a continuous response in the place of hits")
+    add("--decision", type=float, metavar="R", help="responses above R are detections")
+    add("--left-censored", type=float, metavar="R", help="responses at or below R say only that")
+    add("--right-censored", type=float, metavar="R", help="responses at or above R say only that")
+    add("--log-response", action="store_true", help="line on the logarithm of the response")
+    add("--box-cox", metavar="LAMBDA", help="power of the response, or auto for the most likely one")
+    more = parser.add_argument_group("more about the curve")
+    add = more.add_argument
+    add("--ceiling", action="store_true", help="let the curve end below 1 (lapses)")
+    add("--floor", action="store_true", help="let the curve begin above 0 (false calls)")
+    add("--bootstrap", type=int, metavar="N", help="N refits to resampled data")
+    add(
+        "--by",
+        choices=("row", "image", "network", "both"),
+        help="what to resample; default: both where known, else row",
     )
+    add("--covariate", action="append", default=[], metavar="COLUMN[=VALUE]", help="held at VALUE (median); repeatable")
+    add("--explain", metavar="COLUMN,...", help="which of these properties explains detection best")
+    add("--as-published", action="store_true", help="the paper's average of one curve per network beside the answer")
+    add("--seed", type=int, default=1, help="for --bootstrap and --explain (default 1)")
+    files = parser.add_argument_group("files")
+    files.add_argument("--export", metavar="CURVE.csv", help="write the curve with its 95 %% band")
+    files.add_argument("--plots", metavar="DIR", help="write the figures")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
@@ -47,154 +105,235 @@ def run(arguments: argparse.Namespace) -> int:
         size=arguments.size,
         hit=arguments.hit,
         trials=arguments.trials,
+        response=arguments.response,
         site=arguments.site,
+        network=arguments.network,
+        image=arguments.image,
         where=where_from_options(arguments.where),
     )
-    repeats = arguments.repeats or default_repeats(table)
-    result, _ = hit_miss_answer(
-        table,
-        link=arguments.link,
-        log_size=arguments.log_size,
-        method=arguments.method or "auto",
-        repeats=repeats,
-    )
+    result = _response(table, arguments) if arguments.response else _hit_miss(table, arguments)
+    if len(table.false_alarm):
+        result["false_alarms"] = asdict(
+            false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
+        )
     for line in result["warnings"]:
         say(f"warning: {line}")
     answer(result, as_json=arguments.json, text=text_from_answer(result, table.size_name))
     return 0
 
 
-def where_from_options(options: list[str]) -> dict[str, str]:
-    """Column -> value from COLUMN=VALUE texts."""
-    chosen = {}
-    for option in options:
-        name, equals, value = option.partition("=")
-        if not equals or not name.strip():
-            raise InputError("--where", received=repr(option), expected="COLUMN=VALUE, for example setting=20ms")
-        chosen[name.strip()] = value.strip()
-    return chosen
-
-
-def default_repeats(table: PodTable) -> str:
-    """`crossed` where both a network and an image are known, else `pooled`."""
-    return "crossed" if table.network is not None and table.image is not None else "pooled"
-
-
-def trials_from_table(table: PodTable, *, log_size: bool) -> Trials:
-    """The table's rows as checked trials."""
-    return check_trials(
-        table.size,
-        table.hits if table.hits is not None else [],
-        trials=table.trials,
-        network=table.network,
-        image=table.image,
-        site=table.site,
-        log_size=log_size,
-    )
-
-
-def hit_miss_answer(
-    table: PodTable, *, link: str, log_size: bool, method: str, repeats: str
-) -> tuple[dict[str, Any], PodFit]:
-    """The POD answer of a table of hits and misses, and the fit behind it."""
+def _hit_miss(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
+    for name in ("decision", "left_censored", "right_censored", "box_cox"):
+        if getattr(arguments, name) is not None:
+            raise InputError("--" + name.replace("_", "-"), received="without --response", expected="--response COLUMN")
+    repeats = arguments.repeats or default_repeats(table)
     fit = fit_pod(
         table.size,
         table.hits if table.hits is not None else [],
         trials=table.trials,
-        link=link,
-        log_size=log_size,
-        method=method,
+        link=arguments.link,
+        log_size=arguments.log_size,
+        method=arguments.method or "auto",
         repeats=repeats,
         network=table.network,
         image=table.image,
         site=table.site,
     )
-    notes = [*table.notes, *fit.warnings]
-    settings = set(table.other.get("setting", ()))
-    if len(settings) > 1:
-        notes.append(f"{len(settings)} settings in one curve; choose one with --where setting=...")
     result = fit_answer(fit)
     result["size"] = table.size_name
-    result["warnings"] = notes
-    if fit.naive is not None:
-        result["naive"] = {
-            key: value
-            for key, value in fit_answer(fit.naive).items()
-            if key in ("a50", "a90", "a90_95", "a90_95_two_sided")
-        }
-    if len(table.false_alarm):
-        result["false_alarms"] = asdict(
-            false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
+    result["warnings"] = [*notes_on_table(table, repeats), *fit.warnings]
+    trials = trials_from_table(table, log_size=arguments.log_size)
+    result["alternatives"] = [asdict(one) for one in compare_models(trials)]
+    if arguments.ceiling or arguments.floor:
+        lapse = fit_lapse_pod(
+            trials, link=arguments.link, log_size=arguments.log_size, ceiling=arguments.ceiling, floor=arguments.floor
         )
-    result["alternatives"] = [asdict(one) for one in compare_models(trials_from_table(table, log_size=log_size))]
-    return result, fit
-
-
-def fit_answer(fit: PodFit) -> dict[str, Any]:
-    """A fit as the POD answer."""
-    result: dict[str, Any] = {
-        "link": fit.link,
-        "method": fit.method,
-        "variant": fit.variant,
-        "repeats": fit.repeats,
-        "log_size": fit.log_size,
-        "n": fit.n,
-        "n_hits": fit.n_hits,
-        "c0": fit.c0,
-        "c1": fit.c1,
-        "se0": fit.se0,
-        "se1": fit.se1,
-        "log_likelihood": fit.log_likelihood,
-        "deviance": fit.deviance,
-        "aic": fit.aic,
-        "a50": fit.a50,
-        "a90": fit.a90,
-        "a90_95": asdict(fit.a90_95),
-        "a90_95_two_sided": asdict(fit.a90_95_two_sided),
-        "a90_low_two_sided": asdict(fit.a90_low_two_sided),
-        "separated": fit.separated,
-        "reaches_90": fit.reaches_90,
-        "warnings": list(fit.warnings),
-    }
-    if fit.crossed is not None:
-        result |= asdict(fit.crossed)
+        result["lapse"] = asdict(lapse)
+        if repeats != "pooled":
+            result["warnings"].append("ceiling and floor take all looks as independent: their intervals are too narrow")
+        result["warnings"] += [f"with ceiling or floor: {note}" for note in lapse.warnings]
+    if arguments.bootstrap is not None:
+        result["bootstrap"] = _bootstrap(table, arguments)
+    if arguments.covariate:
+        result["covariates"] = _covariates(table, arguments, result)
+    if arguments.explain:
+        result["explanation"] = _explanation(table, arguments, repeats)
+    if arguments.as_published:
+        result["as_published"] = asdict(fit_as_published(trials))
+    if arguments.export:
+        write_curve_table(arguments.export, fit, size_name=table.size_name)
+        result["export"] = arguments.export
+    if arguments.plots:
+        result["plots"] = _plots(fit, table, arguments)
     return result
 
 
-def _shown(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
+def _bootstrap(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
+    if arguments.bootstrap < 20:
+        raise InputError("--bootstrap", received=arguments.bootstrap, expected="20 refits or more (1000 is usual)")
+    by = arguments.by
+    if by is None:
+        known = table.network is not None, table.image is not None
+        by = {(True, True): "both", (True, False): "network", (False, True): "image"}.get(known, "row")
+    if by == "row" and table.trials is not None:
+        raise InputError("--bootstrap", received="grouped trials", expected="one trial a row, or a column of images")
+    found = bootstrap_pod(
+        trials_from_table(table, log_size=arguments.log_size),
+        link=arguments.link,
+        log_size=arguments.log_size,
+        by=by,
+        replicates=arguments.bootstrap,
+        rng=np.random.default_rng(arguments.seed),
+    )
+    return {
+        "by": by,
+        "replicates": arguments.bootstrap,
+        "a90_95": found.a90_95,
+        "a90_low": found.a90_low,
+        "a90_high": found.a90_high,
+        "unknown": found.unknown,
+    }
 
 
-def text_from_answer(result: dict[str, Any], size_name: str) -> str:
-    """The POD answer for people; sizes in the unit of the size column."""
-    lines = [
-        f"{result['n_hits']} hits of {result['n']} trials; link {result['link']} on"
-        f" {'ln ' if result['log_size'] else ''}{size_name}; {result['variant']}; repeats {result['repeats']}",
-        f"c0 {_shown(result['c0'])} +- {_shown(result['se0'])}, c1 {_shown(result['c1'])} +- {_shown(result['se1'])},"
-        f" deviance {_shown(result['deviance'])}",
-        f"a50 {_shown(result['a50'])}   a90 {_shown(result['a90'])}",
+def _covariates(table: PodTable, arguments: argparse.Namespace, result: dict[str, Any]) -> dict[str, Any]:
+    columns = {table.size_name: table.size}
+    held: dict[str, float] = {}
+    for option in arguments.covariate:
+        name, equals, value = option.partition("=")
+        columns[name] = table.numbers(name)
+        try:
+            held[name] = float(value) if equals else float(np.median(columns[name]))
+        except ValueError:
+            raise InputError("--covariate", received=repr(option), expected="COLUMN or COLUMN=NUMBER") from None
+    trials = trials_from_table(table, log_size=arguments.log_size)
+    logs = (table.size_name,) if arguments.log_size else ()
+    fit = fit_covariates(trials, columns, link=arguments.link, logs=logs, method=arguments.method or "auto")
+    at = size_at(fit, trials, columns, name=table.size_name, held=held)
+    result["warnings"] += [f"with covariates: {note}" for note in at.warnings]
+    names = ("constant", *fit.names)
+    scales = (False, *fit.logs)
+    return {
+        "coefficients": [
+            {"name": name, "log": log, "value": value, "error": error, "p": p}
+            for name, log, value, error, p in zip(
+                names, scales, fit.coefficients.tolist(), fit.errors.tolist(), fit.p.tolist(), strict=True
+            )
+        ],
+        "method": fit.method,
+        "deviance": fit.deviance,
+        "aic": fit.aic,
+        "held": dict(at.held),
+        "a50": at.a50,
+        "a90": at.a90,
+        "a90_95": asdict(at.a90_95),
+    }
+
+
+def _explanation(table: PodTable, arguments: argparse.Namespace, repeats: str) -> list[dict[str, Any]]:
+    names = [name.strip() for name in arguments.explain.split(",") if name.strip()]
+    columns = {name: table.numbers(name) for name in names}
+    found, _ = explain_detection(
+        trials_from_table(table, log_size=False),
+        columns,
+        rng=np.random.default_rng(arguments.seed),
+        link=arguments.link,
+        repeats=repeats,
+    )
+    return [
+        {
+            "name": one.name,
+            "log": one.log,
+            "gain": one.gain,
+            "behind": one.behind,
+            "behind_error": one.behind_error,
+            "area": one.area,
+            "rising": one.rising,
+            "aic": one.aic,
+            "a50": one.fit.a50,
+            "a90": one.fit.a90,
+            "a90_95": asdict(one.fit.a90_95),
+            "p_beyond": one.p_beyond,
+        }
+        for one in found
     ]
-    for label, key in (("a90/95, one-sided", "a90_95"), ("a90, upper end of two-sided 95 %", "a90_95_two_sided")):
-        bound = result[key]
-        line = f"{label}: {_shown(bound['likelihood_ratio'])} (likelihood ratio), {_shown(bound['wald'])} (Wald)"
-        if "naive" in result:
-            line += f"; if looks were independent {_shown(result['naive'][key]['likelihood_ratio'])}"
-        lines.append(line)
-    if "sd_network" in result:
-        lines.append(
-            f"spread on the link's scale: networks {_shown(result['sd_network'])}, images {_shown(result['sd_image'])};"
-            f" average network and image: a90 {_shown(result['a90_conditional'])}"
+
+
+def _plots(fit: PodFit, table: PodTable, arguments: argparse.Namespace) -> list[str]:
+    from ..pod.plots import plot_joint_region, plot_models, plot_pod
+
+    trials = trials_from_table(table, log_size=arguments.log_size)
+    figures = {"pod.png": plot_pod(fit, trials, size_label=table.size_name)}
+    if fit.curve is not None and not fit.separated and fit.curve.at_maximum:
+        figures["region.png"] = plot_joint_region(fit)
+    alternatives = compare_models(trials)
+    if any(one.aic is not None for one in alternatives):
+        figures["models.png"] = plot_models(alternatives)
+    return [_saved(figure, Path(arguments.plots) / name) for name, figure in figures.items()]
+
+
+def _saved(figure: Any, path: Path) -> str:
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=150)
+    return str(path)
+
+
+def _response(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
+    if arguments.decision is None:
+        raise InputError(
+            "--decision",
+            received="none",
+            expected="the response above which an object counts as detected",
+            remedy="for example --decision 200",
         )
-    if "false_alarms" in result:
-        alarm = result["false_alarms"]
-        lines.append(
-            f"false alarms: {alarm['false_alarms']} of {alarm['n']}, {100 * alarm['rate']:.3g} %"
-            f" ({100 * alarm['low']:.3g} to {100 * alarm['high']:.3g} %, 95 %)"
+    power: float | None = 0.0 if arguments.log_response else 1.0
+    if arguments.box_cox is not None:
+        try:
+            power = None if arguments.box_cox == "auto" else float(arguments.box_cox)
+        except ValueError:
+            raise InputError("--box-cox", received=repr(arguments.box_cox), expected="a number or auto") from None
+    repeats = arguments.repeats
+    notes: list[str] = []
+    if repeats is None:
+        repeats = "cluster" if table.network is not None and table.image is not None else "pooled"
+    elif repeats in ("crossed", "scaled"):
+        notes.append(f"repeats {repeats} is not there for a response: bounds robust to networks and images instead")
+        repeats = "cluster"
+    response = table.response if table.response is not None else np.zeros(0)
+    fit = fit_response_pod(
+        table.size,
+        response,
+        decision=arguments.decision,
+        left=arguments.left_censored,
+        right=arguments.right_censored,
+        log_size=arguments.log_size,
+        box_cox=power,
+        network=table.network,
+        image=table.image,
+        repeats=repeats,
+    )
+    result = response_answer(fit)
+    result["size"] = table.size_name
+    result["warnings"] = [*notes, *notes_on_table(table, repeats), *fit.warnings]
+    roc = None
+    if len(table.noise_response) > 1:
+        roc = compute_roc(table.noise_response, response)
+        alarms = (table.noise_response > arguments.decision).astype(float)
+        result["roc"] = {"area": roc.area, "low": roc.area_low, "high": roc.area_high}
+        result["false_alarms"] = asdict(false_alarm_rate(alarms))
+    if arguments.plots:
+        from ..pod.plots import plot_response, plot_roc
+
+        folder = Path(arguments.plots)
+        figure = plot_response(
+            fit,
+            table.size,
+            response,
+            size_label=table.size_name,
+            response_label=arguments.response,
+            left=arguments.left_censored,
+            right=arguments.right_censored,
         )
-    lines.append("link        size  deviance      AIC      a90   p(link)  p(fit)")
-    for one in result["alternatives"]:
-        lines.append(
-            f"{one['link']:<10}{'ln' if one['log_size'] else '':>6}{_shown(one['deviance']):>10}{_shown(one['aic']):>9}"
-            f"{_shown(one['a90']):>9}{_shown(one['p_link']):>10}{_shown(one['p_fit']):>8}"
-        )
-    return "\n".join(lines)
+        result["plots"] = [_saved(figure, folder / "response.png")]
+        if roc is not None:
+            result["plots"].append(_saved(plot_roc(roc), folder / "roc.png"))
+    return result

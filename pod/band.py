@@ -1,0 +1,92 @@
+"""The curve at any size, with its band; rows to export."""
+
+import csv
+import math
+import os
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FitError
+from ..files import whole_file
+from .crossed import averaged_pod
+from .hit_miss import PodFit
+from .likelihood import eta_band
+from .links import link_from_name
+
+Array = NDArray[np.float64]
+
+CHI2_95 = {1: 3.841458820694124, 2: 5.991464547107979}
+
+
+def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False) -> tuple[Array, Array, Array]:
+    """POD with the ends of its two-sided 95 % band at each size, three arrays of the shape of `size`, 0 to 1.
+
+    Likelihood-ratio band, each size for itself or (`simultaneous`) the whole curve at once, from the joint region. With
+    crossed random effects the population-averaged curve, its band by the delta method on the link's scale (two degrees
+    of freedom where simultaneous). For `cluster` the pooled curve, the band widened by the inflation of its variance.
+
+    Args:
+        fit: a fit that has a curve.
+        size: (size,), in the data's unit; above 0 on log size.
+
+    Raises:
+        FitError: the fit has no curve.
+    """
+    if fit.curve is None or fit.c0 is None or fit.c1 is None:
+        raise FitError("there is no curve to draw: " + "; ".join(fit.warnings))
+    link = link_from_name(fit.link)
+    sizes = np.asarray(size, dtype=float)
+    x = np.log(sizes) if fit.log_size else sizes
+    quantile = CHI2_95[2 if simultaneous else 1]
+    if fit.crossed is None:
+        curve = fit.curve
+        if fit.repeats == "cluster" and fit.se0 and fit.se1:
+            from dataclasses import replace
+
+            inflation = max(fit.se0**2 / curve.covariance[0, 0], fit.se1**2 / curve.covariance[1, 1])
+            curve = replace(curve, divisor=curve.divisor * float(inflation))
+        low, high = eta_band(curve, x.ravel(), quantile=quantile)
+        eta = curve.coefficients[0] + curve.coefficients[1] * x
+        ends = (link.pod_from_eta(np.asarray(np.clip(end, -1e3, 1e3))).reshape(x.shape) for end in (low, high))
+        return (np.asarray(link.pod_from_eta(eta)), *ends)  # type: ignore[return-value]
+    parameters = np.array(
+        [fit.c0, fit.c1, *(sd for sd in (fit.crossed.sd_network, fit.crossed.sd_image) if sd is not None)]
+    )
+
+    def pod_at(p: Array) -> Array:
+        return averaged_pod(p[0] + p[1] * x, math.hypot(*p[2:]), link=link)
+
+    pod = pod_at(parameters)
+    odds = np.log(pod) - np.log1p(-pod)
+    rise = []
+    for index, value in enumerate(parameters):
+        width = 1e-5 * max(abs(value), 1e-2)
+        ahead, behind = parameters.copy(), parameters.copy()
+        ahead[index] += width
+        behind[index] -= width
+        rise.append((pod_at(ahead) - pod_at(behind)) / (2 * width) / np.maximum(pod * (1 - pod), 1e-300))
+    gradient = np.stack(rise, axis=-1)
+    spread = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", gradient, fit.crossed.covariance, gradient), 0.0))
+    spread = math.sqrt(quantile) * spread
+    low, high = (1 / (1 + np.exp(-np.clip(odds + side * spread, -700, 700))) for side in (-1, 1))
+    return pod, np.asarray(low), np.asarray(high)
+
+
+def curve_rows(fit: PodFit, *, points: int = 101) -> dict[str, Array]:
+    """The curve over the tested sizes: columns size (data's unit), pod, low, high (two-sided 95 %, each size for
+    itself).
+    """
+    ends = fit.smallest_size, fit.largest_size
+    size = np.geomspace(*ends, points) if fit.log_size else np.linspace(*ends, points)
+    pod, low, high = curve_with_band(fit, size)
+    return {"size": size, "pod": pod, "low": low, "high": high}
+
+
+def write_curve_table(path: str | os.PathLike[str], fit: PodFit, *, size_name: str = "size", points: int = 101) -> None:
+    """Write `curve_rows` as comma-separated values, whole or not at all; the first column bears `size_name`."""
+    rows = curve_rows(fit, points=points)
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow([size_name, "pod", "pod_low_95", "pod_high_95"])
+        writer.writerows([f"{value:.9g}" for value in row] for row in zip(*rows.values(), strict=True))

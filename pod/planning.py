@@ -1,0 +1,257 @@
+"""Planning: how many foreign objects, images and networks for a wanted interval, and which sizes to make.
+
+With an assumed curve and spread of networks and images, the expected covariance of the population-averaged curve is
+
+V = A^-1 B A^-1,  A = sum d^2 x x' / (m (1 - m)),  B = var of sum d x (hit - m) / (m (1 - m))
+
+with m the averaged POD and d its slope by eta; B holds the covariances of looks that share a network or an image, by
+quadrature. The expected bound follows from the spread of a90: a90_95 / a90 = exp(1.645 sd(ln a90)) (on the size's own
+scale 1 + 1.645 sd(a90) / a90). Without repeats it is the usual Fisher information.
+Validity: large-sample; below some 40 informative trials the bounds met in practice are longer and skewed upward.
+Source: Liang & Zeger, Biometrika 73 (1986) 13 (the estimating equation); MIL-HDBK-1823A (2009) 4.5.2 (sizes).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from .crossed import averaged_eta, averaged_pod
+from .links import Link, link_from_name
+
+Array = NDArray[np.float64]
+
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AssumedCurve:
+    """What one expects to find: averaged a50 and a90 (any unit), link, spread of networks and images on eta's scale."""
+
+    a50: float
+    a90: float
+    link: str = "cloglog"
+    log_size: bool = False
+    sd_network: float = 0.0
+    sd_image: float = 0.0
+
+    def __post_init__(self) -> None:
+        link_from_name(self.link)
+        if not (math.isfinite(self.a50) and math.isfinite(self.a90) and self.a90 > self.a50):
+            raise InputError("a50 and a90", received=f"{self.a50:g} and {self.a90:g}", expected="an a90 above the a50")
+        if self.log_size and not self.a50 > 0:
+            raise InputError("a50", received=self.a50, expected="a size above 0 on log size")
+        for name in ("sd_network", "sd_image"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(name, received=value, expected="a finite spread of 0 or more")
+
+    def coefficients(self) -> tuple[float, float]:
+        """c0 and c1 of an average network and image, per unit of size (of ln size)."""
+        total = math.hypot(self.sd_network, self.sd_image)
+        shape = link_from_name(self.link)
+        low, high = (averaged_eta(p, total, link=shape) for p in (0.5, 0.9))
+        a50, a90 = (math.log(a) if self.log_size else a for a in (self.a50, self.a90))
+        c1 = (high - low) / (a90 - a50)
+        return low - c1 * a50, c1
+
+    def size_at(self, pod: float) -> float:
+        """The size at which the averaged curve reaches `pod`."""
+        c0, c1 = self.coefficients()
+        total = math.hypot(self.sd_network, self.sd_image)
+        x = (averaged_eta(pod, total, link=link_from_name(self.link)) - c0) / c1
+        return math.exp(x) if self.log_size else x
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Precision:
+    """What a design may expect: sd of a90 in its unit, one-sided bound over a90, two-sided interval over a90."""
+
+    networks: int
+    images: int
+    sd_a90: float
+    bound_over_a90: float
+    low_over_a90: float
+    high_over_a90: float
+
+
+def expected_precision(curve: AssumedCurve, sizes: ArrayLike, *, networks: int = 1) -> Precision:
+    """Expected precision of a90 when `networks` networks look at one image of each of the sizes.
+
+    Args:
+        curve: what is assumed.
+        sizes: (image,), one foreign object an image, in the curve's unit.
+        networks: number of networks, each looking at all images.
+
+    Raises:
+        InputError: sizes that cannot make a curve, or no network.
+    """
+    size = np.asarray(sizes, dtype=float)
+    if size.ndim != 1 or len(size) < 2 or not np.all(np.isfinite(size)) or np.ptp(size) == 0:
+        raise InputError("sizes", received=f"{size.size} sizes", expected="two or more different, finite sizes")
+    if curve.log_size and not np.all(size > 0):
+        raise InputError("sizes", received=f"{size.min():g}", expected="sizes above 0 on log size")
+    if networks < 1:
+        raise InputError("networks", received=networks, expected="1 or more")
+    x = np.log(size) if curve.log_size else size
+    unit_image, unit_network, information = _pieces(curve, x)
+    bread = np.linalg.inv(networks * information)
+    # looks at one image covary through it, looks by one network at all images through that network
+    meat = networks * information + networks * (networks - 1) * unit_image + networks * unit_network
+    covariance = bread @ meat @ bread
+    c0, c1 = curve.coefficients()
+    total = math.hypot(curve.sd_network, curve.sd_image)
+    x90 = (averaged_eta(0.9, total, link=link_from_name(curve.link)) - c0) / c1
+    toward = np.array([1.0, x90])
+    error = math.sqrt(float(toward @ covariance @ toward)) / c1
+    a90 = math.exp(x90) if curve.log_size else x90
+
+    def over(z: float) -> float:
+        return math.exp(z * error) if curve.log_size else 1 + z * error / a90
+
+    return Precision(
+        networks=networks,
+        images=len(size),
+        sd_a90=error * (a90 if curve.log_size else 1.0),
+        bound_over_a90=over(1.6448536269514722),
+        low_over_a90=over(-1.959963984540054),
+        high_over_a90=over(1.959963984540054),
+    )
+
+
+def recommended_sizes(curve: AssumedCurve, images: int, *, networks: int = 1) -> Array:
+    """Sizes to make, (image,) rising, in the curve's unit: even on the fit's scale over the most informative range.
+
+    The range runs from POD p to POD q, p within 2-30 % and q within 95-99.5 %, whichever pair makes the spread of a90
+    smallest: sizes at both ends keep the slope, and the choice of link, checkable.
+    """
+    if images < 2:
+        raise InputError("images", received=images, expected="2 or more")
+    best, least = np.zeros(0), math.inf
+    for low in (0.02, 0.05, 0.1, 0.2, 0.3):
+        for high in (0.95, 0.97, 0.99, 0.995):
+            ends = curve.size_at(low), curve.size_at(high)
+            if ends[0] <= 0 and curve.a50 > 0:
+                ends = max(ends[0], 0.02 * curve.a50), ends[1]
+            sizes = np.geomspace(*ends, images) if curve.log_size else np.linspace(*ends, images)
+            spread = expected_precision(curve, sizes, networks=networks).sd_a90
+            if spread < least:
+                best, least = sizes, spread
+    return np.asarray(best)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The smallest design that is expected to reach the wanted bound; `images` None where no number of images does.
+
+    limit_over_a90: the bound over a90 with images without end, set by the number of networks alone.
+    fewest_networks: networks needed for the wanted bound with images without end.
+    """
+
+    wanted_over_a90: float
+    networks: int
+    images: int | None
+    sizes: Array
+    expected: Precision | None
+    limit_over_a90: float
+    fewest_networks: int
+
+
+def plan_pod(curve: AssumedCurve, *, wanted_over_a90: float, networks: int = 1, most_images: int = 100_000) -> Plan:
+    """Number of images for an expected one-sided 95 % bound of `wanted_over_a90` times a90.
+
+    Args:
+        curve: what is assumed.
+        wanted_over_a90: bound over a90, above 1 (1.2: a90_95 some 20 % above a90).
+        networks: number of networks, each looking at all images.
+        most_images: where the search ends.
+
+    Raises:
+        InputError: a wanted bound that is not above 1.
+    """
+    if not (math.isfinite(wanted_over_a90) and wanted_over_a90 > 1):
+        raise InputError("wanted_over_a90", received=wanted_over_a90, expected="a ratio above 1, for example 1.2")
+    pattern = recommended_sizes(curve, 40, networks=networks)
+    low, high = float(pattern[0]), float(pattern[-1])
+
+    fine = np.asarray(np.geomspace(low, high, 200) if curve.log_size else np.linspace(low, high, 200))
+    pieces = _pieces(curve, np.log(fine) if curve.log_size else fine)
+
+    def bound(images: float, looks: int) -> float:
+        # what an image tells does not depend on their number, so one fine pattern serves every number
+        return _scaled(curve, pieces, len(fine), images, looks)
+
+    limit = bound(math.inf, networks)
+    fewest = _smallest(lambda n: bound(math.inf, n) <= wanted_over_a90, 1_000_000) or 1_000_000
+    images = (
+        _smallest(lambda n: bound(n, networks) <= wanted_over_a90, most_images) if limit < wanted_over_a90 else None
+    )
+    images = None if images is None else max(images, 4)
+    chosen = recommended_sizes(curve, min(images, 2000), networks=networks) if images is not None else np.zeros(0)
+    return Plan(
+        wanted_over_a90=wanted_over_a90,
+        networks=networks,
+        images=images,
+        sizes=chosen,
+        expected=expected_precision(curve, chosen, networks=networks) if len(chosen) == images else None,
+        limit_over_a90=limit,
+        fewest_networks=fewest,
+    )
+
+
+def _smallest(reached: Callable[[int], bool], most: int) -> int | None:
+    """Smallest number from 1 to `most` for which a condition that stays true once it is true holds."""
+    if not reached(most):
+        return None
+    low, high = 0, most
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
+
+
+def _scaled(
+    curve: AssumedCurve, pieces: tuple[Array, Array, Array], pattern: int, images: float, networks: int
+) -> float:
+    """Expected bound over a90 for `images` images spread like the pattern of sizes that the pieces are of."""
+    unit_image, unit_network, information = (piece / pattern for piece in pieces)
+    # the network's piece sums over pairs of images: it grows with their square
+    unit_network = unit_network / pattern
+    bread = np.linalg.inv(information)
+    per_image = bread @ (information / networks + (networks - 1) / networks * unit_image) @ bread
+    per_network = bread @ unit_network @ bread / networks
+    covariance = per_network + (per_image / images if math.isfinite(images) else 0.0)
+    c0, c1 = curve.coefficients()
+    total = math.hypot(curve.sd_network, curve.sd_image)
+    x90 = (averaged_eta(0.9, total, link=link_from_name(curve.link)) - c0) / c1
+    toward = np.array([1.0, x90])
+    error = math.sqrt(max(float(toward @ covariance @ toward), 0.0)) / c1
+    return math.exp(1.6448536269514722 * error) if curve.log_size else 1 + 1.6448536269514722 * error / x90
+
+
+def _pieces(curve: AssumedCurve, x: Array) -> tuple[Array, Array, Array]:
+    """Covariance of a pair of looks at one image, of a network's looks at different images, and information; (2, 2)."""
+    link: Link = link_from_name(curve.link)
+    c0, c1 = curve.coefficients()
+    total = math.hypot(curve.sd_network, curve.sd_image)
+    eta = c0 + c1 * x
+    mean = averaged_pod(eta, total, link=link)
+    width = 1e-4
+    slope = (averaged_pod(eta + width, total, link=link) - averaged_pod(eta - width, total, link=link)) / (2 * width)
+    variance = np.maximum(mean * (1 - mean), 1e-12)
+    design = np.stack((np.ones_like(x), x), axis=1)
+    information = (design * (slope**2 / variance)[:, None]).T @ design
+    weight = design * (slope / variance)[:, None]
+    # POD at each node of one effect, averaged over the other
+    by_image = averaged_pod(eta[:, None] + curve.sd_image * _NODES, curve.sd_network, link=link) - mean[:, None]
+    by_network = averaged_pod(eta[:, None] + curve.sd_network * _NODES, curve.sd_image, link=link) - mean[:, None]
+    same_image = (by_image**2) @ _WEIGHTS
+    unit_image = (weight * same_image[:, None]).T @ weight
+    sums = weight.T @ by_network
+    own = ((weight * ((by_network**2) @ _WEIGHTS)[:, None]).T) @ weight
+    unit_network = (sums * _WEIGHTS) @ sums.T - own
+    return unit_image, unit_network, information

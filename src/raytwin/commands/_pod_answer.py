@@ -1,0 +1,233 @@
+"""The POD answer, shared by the commands that give one."""
+
+from dataclasses import asdict
+from typing import Any
+
+from ..errors import InputError
+from ..pod import PodFit, PodTable, ResponseFit, Trials, check_trials
+
+
+def where_from_options(options: list[str]) -> dict[str, str]:
+    """Column -> value from COLUMN=VALUE texts."""
+    chosen = {}
+    for option in options:
+        name, equals, value = option.partition("=")
+        if not equals or not name.strip():
+            raise InputError("--where", received=repr(option), expected="COLUMN=VALUE, for example setting=20ms")
+        chosen[name.strip()] = value.strip()
+    return chosen
+
+
+def default_repeats(table: PodTable) -> str:
+    """`crossed` where both a network and an image are known, else `pooled`."""
+    return "crossed" if table.network is not None and table.image is not None else "pooled"
+
+
+def trials_from_table(table: PodTable, *, log_size: bool) -> Trials:
+    """The table's rows as checked trials."""
+    return check_trials(
+        table.size,
+        table.hits if table.hits is not None else [],
+        trials=table.trials,
+        network=table.network,
+        image=table.image,
+        site=table.site,
+        log_size=log_size,
+    )
+
+
+def notes_on_table(table: PodTable, repeats: str) -> list[str]:
+    """What a reader of the answer should know of how the table was taken."""
+    notes = list(table.notes)
+    settings = set(table.other.get("setting", ()))
+    if len(settings) > 1:
+        notes.append(f"{len(settings)} settings in one curve; choose one with --where setting=...")
+    if repeats == "pooled" and table.site is not None and len(set(table.site)) < len(table.site):
+        notes.append(
+            f"{len(table.site)} trials of {len(set(table.site))} sites taken as independent: repeats need --repeats scaled,"
+            " cluster or crossed"
+        )
+    return notes
+
+
+def fit_answer(fit: PodFit) -> dict[str, Any]:
+    """A fit as the POD answer."""
+    result: dict[str, Any] = {
+        "link": fit.link,
+        "method": fit.method,
+        "variant": fit.variant,
+        "repeats": fit.repeats,
+        "log_size": fit.log_size,
+        "n": fit.n,
+        "n_hits": fit.n_hits,
+        "c0": fit.c0,
+        "c1": fit.c1,
+        "se0": fit.se0,
+        "se1": fit.se1,
+        "log_likelihood": fit.log_likelihood,
+        "deviance": fit.deviance,
+        "aic": fit.aic,
+        "a50": fit.a50,
+        "a90": fit.a90,
+        "a90_95": asdict(fit.a90_95),
+        "a90_95_two_sided": asdict(fit.a90_95_two_sided),
+        "a90_low_two_sided": asdict(fit.a90_low_two_sided),
+        "separated": fit.separated,
+        "reaches_90": fit.reaches_90,
+        "warnings": list(fit.warnings),
+    }
+    if fit.crossed is not None:
+        for name in ("sd_network", "sd_image", "n_networks", "n_images", "a50_conditional", "a90_conditional"):
+            result[name] = getattr(fit.crossed, name)
+    if fit.naive is not None:
+        naive = fit.naive
+        result["naive"] = {
+            "a50": naive.a50,
+            "a90": naive.a90,
+            "a90_95": asdict(naive.a90_95),
+            "a90_95_two_sided": asdict(naive.a90_95_two_sided),
+        }
+    return result
+
+
+def response_answer(fit: ResponseFit) -> dict[str, Any]:
+    """A fit of a continuous response as the POD answer."""
+    return {
+        "link": "probit",
+        "method": "ml",
+        "variant": "censored regression of the response on size",
+        "repeats": fit.repeats,
+        "log_size": fit.log_size,
+        "n": fit.n,
+        "n_hits": fit.n_above,
+        "c0": fit.c0,
+        "c1": fit.c1,
+        "se0": fit.se0,
+        "se1": fit.se1,
+        "log_likelihood": fit.log_likelihood,
+        "deviance": -2 * fit.log_likelihood,
+        "aic": 6 - 2 * fit.log_likelihood,
+        "a50": fit.a50,
+        "a90": fit.a90,
+        "a90_95": asdict(fit.a90_95),
+        "a90_95_two_sided": asdict(fit.a90_95_two_sided),
+        "a90_low_two_sided": asdict(fit.a90_low_two_sided),
+        "separated": False,
+        "reaches_90": fit.reaches_90,
+        "warnings": list(fit.warnings),
+        "response": {
+            name: getattr(fit, name)
+            for name in (
+                "decision",
+                "box_cox",
+                "intercept",
+                "slope",
+                "scatter",
+                "mu",
+                "sigma",
+                "n_left_censored",
+                "n_right_censored",
+            )
+        },
+    }
+
+
+def shown(value: float | None) -> str:
+    """A number for people, `none` where there is none."""
+    return "none" if value is None else f"{value:.4g}"
+
+
+def text_from_answer(result: dict[str, Any], size_name: str) -> str:
+    """The POD answer for people; sizes in the unit of the size column."""
+    lines = [
+        f"{result['n_hits']} hits of {result['n']} trials; link {result['link']} on"
+        f" {'ln ' if result['log_size'] else ''}{size_name}; {result['variant']}; repeats {result['repeats']}",
+        f"c0 {shown(result['c0'])} +- {shown(result['se0'])}, c1 {shown(result['c1'])} +- {shown(result['se1'])},"
+        f" deviance {shown(result['deviance'])}",
+        f"a50 {shown(result['a50'])}   a90 {shown(result['a90'])}",
+    ]
+    for label, key in (("a90/95, one-sided", "a90_95"), ("a90, upper end of two-sided 95 %", "a90_95_two_sided")):
+        bound = result[key]
+        line = f"{label}: {shown(bound['likelihood_ratio'])} (likelihood ratio), {shown(bound['wald'])} (Wald)"
+        if bound["modified"] is not None:
+            line += f", {shown(bound['modified'])} (modified likelihood ratio)"
+        if "naive" in result:
+            line += f"; if looks were independent {shown(result['naive'][key]['likelihood_ratio'])}"
+        lines.append(line)
+    if "sd_network" in result:
+        lines.append(
+            f"spread on the link's scale: networks {shown(result['sd_network'])}, images {shown(result['sd_image'])};"
+            f" average network and image: a90 {shown(result['a90_conditional'])}"
+        )
+    if "response" in result:
+        line = result["response"]
+        lines.append(
+            f"response = {shown(line['intercept'])} + {shown(line['slope'])} x, scatter {shown(line['scatter'])}"
+            f" (Box-Cox {line['box_cox']:.3g}); decision {shown(line['decision'])}; censored {line['n_left_censored']} below,"
+            f" {line['n_right_censored']} above; mu {shown(line['mu'])}, sigma {shown(line['sigma'])}"
+        )
+    if "false_alarms" in result:
+        alarm = result["false_alarms"]
+        lines.append(
+            f"false alarms: {alarm['false_alarms']} of {alarm['n']}, {100 * alarm['rate']:.3g} %"
+            f" ({100 * alarm['low']:.3g} to {100 * alarm['high']:.3g} %, 95 %)"
+        )
+    lines += _further_lines(result)
+    if result.get("alternatives"):
+        lines.append("other links and scales" + (", looks taken as independent:" if "naive" in result else ":"))
+        lines.append(f"{'link':<9}{'size':>5}{'deviance':>11}{'AIC':>10}{'a90':>10}{'p(link)':>11}{'p(fit)':>11}")
+        for one in result["alternatives"]:
+            lines.append(
+                f"{one['link']:<9}{'ln' if one['log_size'] else '':>5}{shown(one['deviance']):>11}{shown(one['aic']):>10}"
+                f"{shown(one['a90']):>10}{_p(one['p_link']):>11}{_p(one['p_fit']):>11}"
+            )
+    return "\n".join(lines)
+
+
+def _p(value: float | None) -> str:
+    return "none" if value is None else f"{value:.3g}"
+
+
+def _further_lines(result: dict[str, Any]) -> list[str]:
+    lines = []
+    if "lapse" in result:
+        lapse = result["lapse"]
+        words = [
+            f"{name} {shown(lapse[name]['value'])} ({shown(lapse[name]['low'])} to {shown(lapse[name]['high'])})"
+            for name in ("ceiling", "floor")
+        ]
+        lines.append(
+            f"with {' and '.join(words)}: a90 {shown(lapse['a90'])}, a90/95 {shown(lapse['a90_95'])};"
+            f" p that 0 and 1 are enough: {_p(lapse['p_plain'])}"
+        )
+    if "bootstrap" in result:
+        boot = result["bootstrap"]
+        lines.append(
+            f"bootstrap by {boot['by']}, {boot['replicates']} refits: a90/95 {shown(boot['a90_95'])}, two-sided"
+            f" {shown(boot['a90_low'])} to {shown(boot['a90_high'])}; without a90: {100 * boot['unknown']:.3g} %"
+        )
+    if "covariates" in result:
+        fit = result["covariates"]
+        for one in fit["coefficients"]:
+            scale = "ln " if one["log"] else ""
+            lines.append(f"  {scale}{one['name']}: {shown(one['value'])} +- {shown(one['error'])}, p {_p(one['p'])}")
+        at = ", ".join(f"{name} {shown(value)}" for name, value in fit["held"].items())
+        lines.append(
+            f"  at {at}: a90 {shown(fit['a90'])}, a90/95 {shown(fit['a90_95']['likelihood_ratio'])} (likelihood ratio),"
+            f" {shown(fit['a90_95']['wald'])} (Wald)"
+        )
+    if "explanation" in result:
+        lines.append(f"{'property':<22}{'gain/trial':>11}{'behind':>10}{'+-':>9}{'area':>8}{'a90':>10}{'p beyond':>10}")
+        for one in result["explanation"]:
+            name = ("ln " if one["log"] else "") + one["name"] + ("" if one["rising"] else " (falling)")
+            lines.append(
+                f"{name:<22}{one['gain']:>11.4f}{one['behind']:>10.4f}{one['behind_error']:>9.4f}{one['area']:>8.3f}"
+                f"{shown(one['a90']):>10}{_p(one['p_beyond']):>10}"
+            )
+    if "as_published" in result:
+        paper = result["as_published"]
+        lines.append(
+            f"as published ({paper['link']}, a curve per network): a90 {shown(paper['a90_mean'])} +- {shown(paper['a90_sd'])}"
+            f" over {paper['n_fitted']} networks; {paper['n_failed']} without a curve"
+        )
+    return lines

@@ -151,7 +151,7 @@ def reading(where: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:  # h5py raises ValueError at types that no file should hold
         raise FileFormatError(
             where,
             received=f"data that cannot be read ({_reason(error)})",

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,7 +27,12 @@ class _Level:
     files: list[Path] = field(default_factory=list)
 
 
-def import_emva1288(source: str | os.PathLike[str], out: str | os.PathLike[str]) -> ImportReport:
+def import_emva1288(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> ImportReport:
     """Turn an EMVA 1288 set into an acquisition file: a flat or dark series a level, in the order of the list.
 
     Lines of the list: `n BITS WIDTH HEIGHT` holds for what follows, `b EXPOSURE_NS PHOTONS` opens a bright level,
@@ -36,6 +42,7 @@ def import_emva1288(source: str | os.PathLike[str], out: str | os.PathLike[str])
     Args:
         source: the list, or the folder that holds it.
         out: acquisition file to write.
+        progress: called with (images done, images in all).
 
     Raises:
         FileFormatError: no list, a line that cannot be read, an image that is missing, damaged or of another size.
@@ -51,7 +58,8 @@ def import_emva1288(source: str | os.PathLike[str], out: str | os.PathLike[str])
     if len(bits) > 1:
         notes.append(f"levels of {', '.join(f'{one} bits' for one in sorted(bits))}: the instrument's bits stay open")
     read = []
-    frames = highest = 0
+    frames = highest = done = 0
+    total = sum(len(level.files) for level in levels)
     with write_acquisition(out, Instrument(bits=bits.pop() if len(bits) == 1 else None, detector="area")) as writer:
         writer.attributes["source"] = data_file.name
         for number, level in enumerate(levels):
@@ -77,6 +85,9 @@ def import_emva1288(source: str | os.PathLike[str], out: str | os.PathLike[str])
                         )
                     series.append(image)
                     highest = max(highest, int(np.max(image)))
+                done += 1
+                if progress is not None:
+                    progress(done, total)
             if series is not None:
                 frames += series.n_frames
                 entry = {"name": name, "kind": kind, "frames": series.n_frames, "exposure_ms": level.exposure_ms}

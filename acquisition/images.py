@@ -50,7 +50,7 @@ belt_speed_mm_s, panel_rotation_deg, source_object_mm, source_detector_mm, photo
 """
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,11 @@ _SCENE_WORDS = ("name", "kind", "for_each", *_MASKS, "thickness_mm", "product", 
 
 
 def import_images(
-    source: str | os.PathLike[str], out: str | os.PathLike[str], *, sidecar: str | os.PathLike[str] | None = None
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    sidecar: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Turn a folder of images into an acquisition file, as its sidecar says (see the module's text for its words).
 
@@ -105,6 +109,7 @@ def import_images(
         source: the folder.
         out: acquisition file to write.
         sidecar: TOML file; None = `raytwin.toml` in the folder.
+        progress: called with (images used, images in the folder).
 
     Raises:
         InputError: no sidecar, a word that means nothing, a pattern without files, images of mixed shapes, damaged.
@@ -116,13 +121,14 @@ def import_images(
         known=("instrument", "raw", "series", "scene"),
         minimal=MINIMAL,
     )
-    used: set[Path] = set()
+    images = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_ENDINGS and path.is_file()]
+    used = _Used(len(images), progress)
     with write_acquisition(out, instrument_of(tables, where=NAME)) as writer:
         read, notes = _write(writer, folder, tables, used)
     skipped = [
         Skipped(what=path.relative_to(folder).as_posix(), reason="no series or scene of the sidecar names it")
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS and path not in used
+        for path in images
+        if path not in used
     ]
     return ImportReport(
         layout="images",
@@ -136,8 +142,25 @@ def import_images(
     )
 
 
+class _Used:
+    """The files that the sidecar named so far."""
+
+    def __init__(self, total: int, progress: Callable[[int, int], None] | None) -> None:
+        self._total = total
+        self._progress = progress
+        self._paths: set[Path] = set()
+
+    def __contains__(self, path: Path) -> bool:
+        return path in self._paths
+
+    def add(self, path: Path) -> None:
+        self._paths.add(path)
+        if self._progress is not None:
+            self._progress(len(self._paths), max(self._total, len(self._paths)))
+
+
 def _write(
-    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], used: set[Path]
+    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], used: _Used
 ) -> tuple[list[dict[str, Any]], list[str]]:
     raw = raw_layout_of(tables, where=NAME)
     series = tables_of(tables, "series", where=NAME)
@@ -180,7 +203,7 @@ def _write_series(
     place: Path,
     table: Mapping[str, Any],
     raw: RawLayout | None,
-    used: set[Path],
+    used: _Used,
     *,
     scene: str,
     name: str,
@@ -240,7 +263,7 @@ def _write_series(
 
 
 def _write_scene(
-    writer: AcquisitionWriter, place: Path, table: Mapping[str, Any], used: set[Path], *, name: str, where: str
+    writer: AcquisitionWriter, place: Path, table: Mapping[str, Any], used: _Used, *, name: str, where: str
 ) -> None:
     def file_of(pattern: object, word: str) -> Path:
         found = files_matching(place, [pattern] if isinstance(pattern, str) else [], where=f"{where}, {word}")

@@ -2,7 +2,7 @@
 
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,11 @@ class _Detector:
 
 
 def import_nxtomo(
-    source: str | os.PathLike[str], out: str | os.PathLike[str], *, detector: str | None = None
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    detector: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Turn an NXtomo file into an acquisition file: a series for each unbroken run of one kind of frame.
 
@@ -46,6 +50,7 @@ def import_nxtomo(
         source: NeXus file, or a folder that holds one (`.nxs`).
         out: acquisition file to write.
         detector: name of the detector group, needed where several hold frames.
+        progress: called with (frames done, frames in all).
 
     Raises:
         FileFormatError: no image_key, no frames that can be reached, or a different number of the two.
@@ -54,7 +59,7 @@ def import_nxtomo(
     opened: list[Any] = [open_hdf5(path, what="a NeXus file")]
     try:
         chosen, notes = _choose(opened, path, detector)
-        return _write(chosen, notes, source=str(source), path=path, out=out)
+        return _write(chosen, notes, source=str(source), path=path, out=out, progress=progress)
     finally:
         for file in reversed(opened):
             file.close()
@@ -152,7 +157,13 @@ def _frames(opened: list[Any], path: Path, group: Any) -> Any:
 
 
 def _write(
-    detector: _Detector, notes: list[str], *, source: str, path: Path, out: str | os.PathLike[str]
+    detector: _Detector,
+    notes: list[str],
+    *,
+    source: str,
+    path: Path,
+    out: str | os.PathLike[str],
+    progress: Callable[[int, int], None] | None,
 ) -> ImportReport:
     frames = detector.frames
     exposures_ms = _exposures_ms(detector, notes)
@@ -183,6 +194,8 @@ def _write(
             )
             for piece in _pieces(frames, start, stop, path=path):
                 series.append(piece)
+                if progress is not None:
+                    progress(start + series.n_frames, len(detector.image_key))
             total += stop - start
             read.append({"name": name, "kind": kind, "frames": stop - start, "first_frame": start})
             if exposure_ms is not None:

@@ -91,19 +91,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _import(arguments: argparse.Namespace) -> Any:
     source, out = arguments.source, arguments.out
-    if arguments.layout == "images":
-        from ..acquisition.images import import_images
-
-        return import_images(source, out, sidecar=arguments.sidecar)
-    if arguments.layout == "nxtomo":
-        from ..acquisition.nxtomo import import_nxtomo
-
-        return import_nxtomo(source, out, detector=arguments.detector)
-    if arguments.layout == "emva1288":
-        from ..acquisition.emva1288 import import_emva1288
-
-        return import_emva1288(source, out)
     with _Bar() as progress:
+        if arguments.layout == "images":
+            from ..acquisition.images import import_images
+
+            return import_images(source, out, sidecar=arguments.sidecar, progress=progress)
+        if arguments.layout == "nxtomo":
+            from ..acquisition.nxtomo import import_nxtomo
+
+            return import_nxtomo(source, out, detector=arguments.detector, progress=progress)
+        if arguments.layout == "emva1288":
+            from ..acquisition.emva1288 import import_emva1288
+
+            return import_emva1288(source, out, progress=progress)
         if arguments.layout == "zenodo":
             from ..acquisition.zenodo import import_zenodo
 

@@ -1,5 +1,6 @@
 """Reading a sidecar (TOML) that a person wrote: unknown words are found out, not passed over."""
 
+import csv
 import difflib
 import re
 import tomllib
@@ -127,6 +128,22 @@ def raw_layout_of(tables: Mapping[str, Any], *, where: str) -> RawLayout | None:
     if not isinstance(table.get("header_bytes", 0), int):
         raise InputError(f"{where}, header_bytes", received=repr(table["header_bytes"]), expected="a whole number")
     return RawLayout(**table)
+
+
+def rows_of(folder: Path, table: Mapping[str, Any], key: str, *, where: str) -> dict[str, dict[str, str]]:
+    """Rows of the csv file that the word `rows` names, by their column `key`; empty where the word is absent."""
+    name = text_of(table, "rows", where=where)
+    if name is None:
+        return {}
+    path = folder / name
+    if not path.is_file():
+        raise InputError(f"{where}, rows", received=name, expected="a csv file in the folder")
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        reader = csv.DictReader(stream, skipinitialspace=True)
+        if key not in (reader.fieldnames or []):
+            there = ", ".join(reader.fieldnames or []) or "none"
+            raise FileFormatError(str(path), received=f"columns {there}", expected=f"a column {key} among them")
+        return {row[key]: {word: value for word, value in row.items() if value} for row in reader}
 
 
 def files_matching(folder: Path, patterns: str | list[str], *, where: str) -> list[Path]:

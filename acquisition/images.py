@@ -43,6 +43,7 @@ The sidecar is `raytwin.toml` in the folder:
     product = "fillet"
     foreign_object = "rib bone"
     size_mm = 3.5
+    rows = "rows.csv"                 # where these differ: columns scene, product, foreign_object, size_mm, split
 
 Further words of a series: name, index, kV, current_mA, power_W, exposure_ms, filter, averaged, frame_interval_ms,
 belt_speed_mm_s, panel_rotation_deg, source_object_mm, source_detector_mm, photons_per_pixel, scene, corrected
@@ -55,7 +56,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FileFormatError, InputError
-from ._image_files import IMAGE_ENDINGS, RawLayout, frame_dtype, iter_images, read_image, read_mask
+from ._image_files import IMAGE_ENDINGS, RawLayout, frame_dtype, iter_images, number_or_nan, read_image, read_mask
 from ._sidecar import (
     NAME,
     check_words,
@@ -65,6 +66,7 @@ from ._sidecar import (
     number_of,
     raw_layout_of,
     read_sidecar,
+    rows_of,
     tables_of,
     text_of,
 )
@@ -93,7 +95,18 @@ _SERIES_WORDS = (
     *_WHOLE,
 )
 _MASKS = ("foreign_object_mask", "product_mask")
-_SCENE_WORDS = ("name", "kind", "for_each", *_MASKS, "thickness_mm", "product", "foreign_object", "size_mm", "split")
+_SCENE_WORDS = (
+    "name",
+    "kind",
+    "for_each",
+    *_MASKS,
+    "thickness_mm",
+    "product",
+    "foreign_object",
+    "size_mm",
+    "split",
+    "rows",
+)
 
 
 def import_images(
@@ -175,10 +188,11 @@ def _write(
     for number, table in enumerate(tables_of(tables, "scene", where=NAME), start=1):
         where = f"{NAME}, scene {table.get('name', number)}"
         check_words(table, _SCENE_WORDS, where=where)
+        rows = rows_of(folder, table, "scene", where=where)
         for place, scene, _ in _places(folder, table, number, where=where):
             if not scene:
                 raise InputError(where, received="no name", expected="name or for_each")
-            _write_scene(writer, place, table, used, name=scene, where=where)
+            _write_scene(writer, place, table, used, known=rows.get(scene, {}), name=scene, where=where)
     named = {entry["scene"] for entry in read if entry["scene"]}
     return read, [f"scene {scene}: nothing is said about it" for scene in sorted(named - set(writer.scene_names))]
 
@@ -263,7 +277,14 @@ def _write_series(
 
 
 def _write_scene(
-    writer: AcquisitionWriter, place: Path, table: Mapping[str, Any], used: _Used, *, name: str, where: str
+    writer: AcquisitionWriter,
+    place: Path,
+    table: Mapping[str, Any],
+    used: _Used,
+    *,
+    known: Mapping[str, str],
+    name: str,
+    where: str,
 ) -> None:
     def file_of(pattern: object, word: str) -> Path:
         found = files_matching(place, [pattern] if isinstance(pattern, str) else [], where=f"{where}, {word}")
@@ -281,15 +302,20 @@ def _write_scene(
     thickness_mm = {
         material: read_image(file_of(pattern, f"thickness_mm of {material}")) for material, pattern in maps.items()
     }
-    split = text_of(table, "split", where=where)
+    told = {
+        word: known.get(word) or text_of(table, word, where=where) for word in ("product", "foreign_object", "split")
+    }
+    size_mm = number_of(table, "size_mm", where=where)
+    if "size_mm" in known:
+        size_mm = number_or_nan(known["size_mm"])
     writer.add_scene(
         name,
         kind=text_of(table, "kind", where=where) or "product",
         thickness_mm=thickness_mm,
-        product=text_of(table, "product", where=where) or "",
-        foreign_object=text_of(table, "foreign_object", where=where) or "",
-        size_mm=number_of(table, "size_mm", where=where),
-        attributes=None if split is None else {"split": split},
+        product=told["product"] or "",
+        foreign_object=told["foreign_object"] or "",
+        size_mm=size_mm,
+        attributes=None if told["split"] is None else {"split": told["split"]},
         foreign_object_mask=masks.get("foreign_object_mask"),
         product_mask=masks.get("product_mask"),
     )

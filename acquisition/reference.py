@@ -15,7 +15,6 @@ describes raw series as for `images` ([[series]], [[scene]]), or images that are
     rows = "rows.csv"                     # optional; columns image, product, foreign_object, size_mm, contrast, split
 """
 
-import csv
 import math
 import os
 import tempfile
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ._image_files import number_or_nan, read_image, read_mask
-from ._sidecar import NAME, check_words, instrument_of, raw_layout_of, read_sidecar, starred, text_of
+from ._sidecar import NAME, check_words, instrument_of, raw_layout_of, read_sidecar, rows_of, starred, text_of
 from .acquisition_io import open_acquisition
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r, dilations_for_pixel
 from .dataset_io import SPLITS, DatasetRow, write_dataset
@@ -198,7 +197,7 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
         for word in ("low", "high", "foreign_object_mask", "product_mask")
         if word in table
     }
-    rows = _rows(folder, text_of(table, "rows", where=where), where=where)
+    rows = rows_of(folder, table, "image", where=where)
     skipped: list[Skipped] = []
     names = []
     for name in sorted(patterns["low"].keys() | patterns["high"].keys(), key=lambda text: (len(text), text)):
@@ -274,20 +273,6 @@ def _choice(table: Mapping[str, Any], word: str, choices: tuple[str, ...], *, wh
     if value not in choices:
         raise InputError(f"{where}, {word}", received=repr(value), expected="one of " + ", ".join(choices))
     return value
-
-
-def _rows(folder: Path, name: str | None, *, where: str) -> dict[str, dict[str, str]]:
-    if name is None:
-        return {}
-    path = folder / name
-    if not path.is_file():
-        raise InputError(f"{where}, rows", received=name, expected="a csv file in the folder")
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True)
-        if "image" not in (reader.fieldnames or []):
-            there = ", ".join(reader.fieldnames or []) or "none"
-            raise FileFormatError(str(path), received=f"columns {there}", expected="a column image among them")
-        return {row["image"]: row for row in reader}
 
 
 def _mask(path: Path | None, shape: tuple[int, int]) -> NDArray[np.bool_] | None:

@@ -3,6 +3,8 @@
 import csv
 import json
 import shutil
+import tomllib
+from pathlib import Path
 
 import h5py
 import imageio.v3 as imageio
@@ -808,3 +810,22 @@ def test_bad_pixels_of_a_twin_are_replaced_in_every_image(pairs, tmp_path):
         images = np.stack(log_pair(2, bone=True)[:2])
         np.testing.assert_array_equal(dataset.images(1), replace_bad_pixels(images, bad))
         assert (dataset.images(1) != images).any()
+
+
+def test_the_sidecars_of_the_manual_are_read(folder, pairs, tmp_path):
+    manual = (Path(__file__).parents[1] / "docs" / "importing.md").read_text()
+    series, corrected = [part.split("```")[0] for part in manual.split("```toml\n")[1:]]
+    tables = tomllib.loads(series)
+    assert set(tables) == {"instrument", "raw", "series", "scene"}
+    (folder / "rows.csv").write_text("scene,product,size_mm,split\na,thigh,2.5,train\n")
+    (folder / "raytwin.toml").write_text(
+        series.replace("flat_40kV/*.tif", "flat/*.png").replace("product_mask", "# ").replace("thickness_pmma", "pmma")
+    )
+    assert import_images(folder, tmp_path / "o.h5").frames == 9
+    with open_acquisition(tmp_path / "o.h5") as acquisition:
+        a, b = (acquisition.scenes[name] for name in "ab")
+        assert (a.product, a.foreign_object, a.size_mm, a.attributes["split"]) == ("thigh", "rib bone", 2.5, "train")
+        assert (b.product, b.foreign_object, b.size_mm) == ("fillet", "rib bone", 3.5)
+    folders = corrected.replace("low/*.tif", "*/low.tif").replace("high/*.tif", "*/high.tif")
+    (pairs / "raytwin.toml").write_text(folders.replace("bone/*.png", "*/bone.png").replace("product/*.", "*/product."))
+    assert import_reference(pairs, tmp_path / "d.h5").frames == 3

@@ -19,6 +19,8 @@ from .frame_sums import effective_frames
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
 # quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
 WHITE_FRACTION_PRIOR = (0.003, 0.03)
+# In chi-square: light collected in square pixels is what detectors do, so quanta counted first must fit clearly better.
+MODEL_PENALTY = {"aperture": 0.0, "sampled": 4.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,8 +250,8 @@ def fit_spread(
     """Fit C_s(o) = I_s [A_g rho(o; sigma) + W_g delta(o)] + r^2 delta(o) to all series by generalised least squares.
 
     rho is the autocovariance of unit quanta after the spread (sums to 1), so gain_g = A_g + W_g and the slope of a
-    photon-transfer line is A_g rho(0) + W_g. Both descriptions of the spread are tried and the better kept; where the
-    data cannot tell them apart the width's standard deviation covers both.
+    photon-transfer line is A_g rho(0) + W_g. Both descriptions of the spread are tried; `sampled` is kept where it is
+    better by more than `MODEL_PENALTY`, and where the data leave it open the standard deviations cover both.
 
     Args:
         series: covariances, darks included (signal 0).
@@ -282,7 +284,7 @@ def fit_spread(
             options={"xatol": 1e-5},
         )
         found[model] = (float(result.fun), float(result.x))
-    model = min(found, key=lambda name: found[name][0])
+    model = min(found, key=lambda name: found[name][0] + MODEL_PENALTY[name])
     chi_square, sigma = found[model]
     _, coefficients, matrix = problem.solve(model, sigma)
     if not np.all(np.isfinite(coefficients)):
@@ -319,8 +321,12 @@ def fit_spread(
     other = next((name for name in found if name != model), model)
     # the descriptions' likelihood ratio says how much of their difference is left open
     if other != model:
-        weight = 1.0 / (1.0 + math.exp(min(0.5 * (found[other][0] - chi_square) / inflation, 50.0)))
+        behind = found[other][0] - chi_square + MODEL_PENALTY[other] - MODEL_PENALTY[model]
+        weight = 1.0 / (1.0 + math.exp(min(0.5 * behind / inflation, 50.0)))
         sigma_sd = math.hypot(sigma_sd, math.sqrt(weight) * (found[other][1] - sigma))
+        _, others, _ = problem.solve(other, found[other][1])
+        moved = others[:groups] + others[groups : 2 * groups] - quantum - white
+        gain_sd = [math.hypot(sd, math.sqrt(weight) * float(step)) for sd, step in zip(gain_sd, moved, strict=True)]
     return SpreadFit(
         model=model,
         sigma_px=sigma,

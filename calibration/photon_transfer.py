@@ -159,10 +159,14 @@ def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDA
     from scipy.ndimage import median_filter
 
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
-    for mean in darks.by_exposure.values():
+    for exposure, mean in darks.by_exposure.items():
         local = mean - median_filter(mean, size=5, mode="nearest")
         centre, spread = _robust_spread(local)
-        hot = np.abs(local - centre) > _DARK_NOISE_SIGMAS * max(spread, 0.5)
+        limit = _DARK_NOISE_SIGMAS * max(spread, 0.5)
+        frames = sum(total.frames * item.averaged for item, total in darks.sums if item.exposure_ms == exposure)
+        # the mean of a noisy pixel strays by its own noise; that alone does not make it hot
+        own = 4.0 * np.sqrt(np.nan_to_num(darks.variance) / max(frames, 1))
+        hot = np.abs(local - centre) > np.maximum(limit, own)
         code[hot & (code == 0)] = BAD_PIXEL_CODES["hot"]
     if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
         centre = float(np.median(darks.variance))
@@ -170,6 +174,8 @@ def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDA
         code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.at(brightest[0].exposure_ms)
+    if not np.median(signal) > 0:
+        return code  # no response to judge; the caller says so
     local = median_filter(signal, size=5, mode="nearest")
     ratio = signal / np.where(local > 0, local, np.nan)
     code[(~np.isfinite(ratio) | (ratio < 0.5)) & (code == 0)] = BAD_PIXEL_CODES["dead"]

@@ -226,10 +226,8 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def print_table(table: list[dict[str, Any]]) -> None:
     """The summary for people."""
     lags = "".join(f"{f'cov {dy},{dx}':>9}" for dy, dx in LAGS[1:])
-    print(
     heads = f"{'recipe':<13}{'kV':>4}{'ms':>5} {'band':<12}{'DN':>8}{'mean':>8}{'variance':>10}"
     print(f"{heads}{lags}  chance: mean, variance")
-    )
     for row in table:
         covariances = "".join(f"{row[f'covariance_{dy}{dx}_percent']:>9.2f}" for dy, dx in LAGS[1:])
         print(

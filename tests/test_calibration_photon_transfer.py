@@ -1,0 +1,296 @@
+"""Photon transfer of sessions with planted truths and faults: what is found, what is said, what is refused."""
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import Setting, open_acquisition, write_acquisition
+from raytwin.acquisition.instrument import Instrument
+from raytwin.calibration.calibrate import bad_pixel_counts, calibrate_twin, calibration_answer
+from raytwin.calibration.photon_transfer import compute_photon_transfer
+from raytwin.errors import InputError
+from raytwin.generator.noise import sample_frame_noise
+from raytwin.generator.psf import blur_variance_share
+from raytwin.generator.twin import BAD_PIXEL_CODES
+
+SHAPE = (40, 40)
+GAIN, SIGMA, READ_DN, DARK_DN = 9.0, 0.55, 11.0, 1200.0
+DN_PER_MAS = 200000.0
+WHITE = 0.01
+
+
+def flat_frames(level, *, count=24, rng, gain=GAIN, read_DN=READ_DN, dark=DARK_DN):
+    """Whole-number frames (count, row, column) of a mean level above dark, one number or (row, column)."""
+    mean = np.broadcast_to(np.asarray(level, dtype=np.float64), SHAPE)
+    frames = [
+        dark
+        + mean
+        + sample_frame_noise(
+            mean,
+            gain_DN=gain,
+            white_fraction=WHITE,
+            read_variance_DN2=read_DN**2,
+            psf_model="aperture",
+            psf_sigma_px=SIGMA,
+            rng=rng,
+        )
+        for _ in range(count)
+    ]
+    return np.array(frames)
+
+
+def as_adc(frames, bits=16):
+    return np.clip(np.rint(frames), 0, 2**bits - 1).astype(np.uint16)
+
+
+def write_session(
+    path,
+    *,
+    change=lambda frames, setting, rng: frames,
+    powers=(2.0, 5.0, 10.0, 20.0, 40.0),
+    with_darks=True,
+    kV=40.0,
+    bits=16,
+    count=24,
+    swap=False,
+    seed=0,
+):
+    """Darks and flats at 40 kV, 20 ms; `change` plants a fault in the frames of every series."""
+    rng = np.random.default_rng(seed)
+    instrument = Instrument(bits=bits, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0)
+    with write_acquisition(path, instrument) as writer:
+        if with_darks:
+            frames = change(flat_frames(0.0, rng=rng, count=count), None, rng)
+            kind = "flat" if swap else "dark"
+            writer.add_series("dark", kind=kind, frames=as_adc(frames, bits), setting=Setting(kV=kV, exposure_ms=20.0))
+        for power in powers:
+            setting = Setting(kV=kV, power_W=power, exposure_ms=20.0)
+            level = DN_PER_MAS * setting.tube_load_mAs
+            frames = change(flat_frames(level, rng=rng, count=count), setting, rng)
+            kind = "dark" if swap else "flat"
+            writer.add_series(f"flat_{power:g}W", kind=kind, frames=as_adc(frames, bits), setting=setting)
+    return path
+
+
+def transfer_of(path):
+    with open_acquisition(path) as acquisition:
+        return compute_photon_transfer(acquisition)
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory):
+    return transfer_of(write_session(tmp_path_factory.mktemp("session") / "clean.h5"))
+
+
+def test_a_clean_session_gives_its_truth_and_no_warning(clean):
+    assert clean.warnings == ()
+    (level,) = clean.levels
+    assert level.gain_DN.low < GAIN < level.gain_DN.high
+    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    slope = GAIN * (blur_variance_share("aperture", SIGMA) + WHITE) / (1 + WHITE)
+    assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.03)
+    assert clean.noise.psf_sigma_px.value == pytest.approx(SIGMA, rel=0.03)
+    assert clean.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.02)
+    assert clean.noise.quantised
+    assert clean.dark_DN.value == pytest.approx(DARK_DN, abs=0.3)
+    assert level.rate_DN_per_mAs.value == pytest.approx(DN_PER_MAS, rel=0.003)
+    assert level.saturation_DN is None
+    assert np.all(clean.maps.bad_pixels == 0)
+    assert all(point.used for point in clean.points)
+
+
+def test_evidence_of_a_clean_session_shows_nothing(clean):
+    evidence = clean.evidence
+    assert evidence["stack_over_pair_variance"] == pytest.approx(1.0, abs=0.01)
+    assert evidence["output_rms_percent"] < 0.1
+    assert evidence["linearity"]["largest_departure_percent"] < 0.3
+    assert max(abs(value) for value in evidence["drift_percent_per_series"].values()) < 0.5
+    assert abs(evidence["dark_neighbour_correlation"]["row_direction"]) < 0.03
+
+
+def planted(tmp_path, change, **options):
+    return transfer_of(write_session(tmp_path / "planted.h5", change=change, **options))
+
+
+def test_a_drifting_tube_shows_in_the_stack_variance_and_not_in_the_gain(tmp_path):
+    def drift(frames, setting, rng):
+        if setting is None:
+            return frames
+        ramp = 1 + 0.04 * np.linspace(-0.5, 0.5, len(frames))[:, None, None]
+        return DARK_DN + (frames - DARK_DN) * ramp
+
+    found = planted(tmp_path, drift)
+    assert found.evidence["stack_over_pair_variance"] > 1.02
+    assert any("drifts or frames are correlated" in line for line in found.warnings)
+    assert found.evidence["drift_percent_per_series"]["flat_40W"] == pytest.approx(4.0, abs=0.3)
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+
+
+def test_lag_shows_as_stack_variances_above_pair_variances(tmp_path):
+    def lag(frames, setting, rng):
+        result = frames.copy()
+        for k in range(1, len(frames)):
+            result[k] = 0.9 * frames[k] + 0.1 * result[k - 1]
+        return result
+
+    found = planted(tmp_path, lag)
+    # C0 (1 - rho) against C0, rho = the lag
+    assert found.evidence["stack_over_pair_variance"] == pytest.approx(1 / 0.9, rel=0.03)
+    assert any("frames are correlated" in line for line in found.warnings)
+
+
+def test_output_noise_from_frame_to_frame_is_named_with_its_size(tmp_path):
+    def flicker(frames, setting, rng):
+        if setting is None:
+            return frames
+        return DARK_DN + (frames - DARK_DN) * (1 + 0.01 * rng.standard_normal(len(frames)))[:, None, None]
+
+    found = planted(tmp_path, flicker)
+    assert 0.6 < found.evidence["output_rms_percent"] < 1.7
+    assert any("tube output varies by" in line for line in found.warnings)
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+
+
+def test_a_nonlinear_detector_departs_from_the_line_in_load(tmp_path):
+    def bend(frames, setting, rng):
+        signal = frames - DARK_DN
+        return DARK_DN + signal * (1 - 0.1 * signal / (DN_PER_MAS * 0.02))
+
+    found = planted(tmp_path, bend)
+    assert found.evidence["linearity"]["largest_departure_percent"] > 1.0
+    assert any("departs from a line" in line for line in found.warnings)
+
+
+def test_a_flat_above_full_well_is_left_out_and_named(tmp_path):
+    full_well = DN_PER_MAS * 0.0181
+
+    def clip(frames, setting, rng):
+        return np.minimum(frames, DARK_DN + full_well + 0.2 * np.maximum(frames - DARK_DN - full_well, 0))
+
+    found = planted(tmp_path, clip)
+    assert any("left out of the fit: flat_40W (its variance bends" in line for line in found.warnings)
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+
+
+def test_a_saturated_series_is_masked_with_a_warning_and_its_level(tmp_path):
+    found = planted(tmp_path, lambda frames, setting, rng: frames, powers=(0.5, 2.0, 5.0, 10.0, 45.0), bits=12)
+    assert any("left out of the fit: flat_45W (saturated at 4095 DN)" in line for line in found.warnings)
+    assert found.levels[0].saturation_DN == 4095.0
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.08)
+    assert [point.series for point in found.points if not point.used] == ["flat_45W"]
+
+
+def test_bad_pixels_are_found_with_their_reasons(tmp_path):
+    places = {"dead": (5, 7), "hot": (12, 30), "noisy": (20, 20), "nonlinear": (33, 9)}
+
+    def break_pixels(frames, setting, rng):
+        frames = frames.copy()
+        frames[:, *places["dead"]] = DARK_DN + READ_DN * rng.standard_normal(len(frames))
+        frames[:, *places["hot"]] += 900.0
+        frames[:, *places["noisy"]] += 150.0 * rng.standard_normal(len(frames))
+        frames[:, *places["nonlinear"]] = DARK_DN + 0.8 * (frames[:, *places["nonlinear"]] - DARK_DN)
+        return frames
+
+    found = planted(tmp_path, break_pixels)
+    for reason, place in places.items():
+        assert found.maps.bad_pixels[place] == BAD_PIXEL_CODES[reason], reason
+    assert int(np.sum(found.maps.bad_pixels > 0)) == 4
+    assert bad_pixel_counts(found)["dead"] == 1
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+
+
+def test_gain_map_of_a_uniform_detector_is_flat_and_of_two_halves_is_not(tmp_path, clean):
+    assert float(np.std(clean.maps.gain_relative)) < 0.04
+
+    def halves(frames, setting, rng):
+        scale = np.ones(SHAPE)
+        scale[:, 20:] = 1.3
+        return DARK_DN + (frames - DARK_DN) * scale
+
+    found = planted(tmp_path, halves)
+    ratio = found.maps.gain_relative[:, 22:].mean() / found.maps.gain_relative[:, :18].mean()
+    assert 1.1 < ratio < 1.4
+    flat = found.levels[0].flat_shape
+    assert flat[:, 22:].mean() / flat[:, :18].mean() == pytest.approx(1.3, rel=0.01)
+
+
+def test_held_back_series_are_not_looked_at(tmp_path):
+    path = tmp_path / "roles.h5"
+    rng = np.random.default_rng(1)
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=as_adc(flat_frames(0.0, rng=rng)), exposure_ms=20.0)
+        for role, level in (("calibration", 500.0), ("calibration", 2000.0), ("evaluation", 60000.0)):
+            writer.add_series(
+                f"{role}_{level:g}",
+                kind="flat",
+                frames=as_adc(flat_frames(level, rng=rng)),
+                exposure_ms=20.0,
+                role=role,
+            )
+    found = transfer_of(path)
+    assert {point.series for point in found.points} == {"calibration_500", "calibration_2000"}
+
+
+def test_without_kV_there_are_gain_and_noise_but_no_spectral_part(tmp_path):
+    path = tmp_path / "plain.h5"
+    rng = np.random.default_rng(2)
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=as_adc(flat_frames(0.0, rng=rng)))
+        for level in (300.0, 3000.0):
+            writer.add_series(f"flat_{level:g}", kind="flat", frames=as_adc(flat_frames(level, rng=rng)))
+    with open_acquisition(path) as acquisition:
+        answer = calibration_answer(calibrate_twin(acquisition, rng=np.random.default_rng(0)))
+    assert answer["levels"][0]["gain_DN"] == pytest.approx(GAIN, rel=0.04)
+    assert answer["inherent_filtration_mm_Al"] is None
+    assert answer["flux_scale"] is None
+    assert any("no series states its kV" in line for line in answer["warnings"])
+    assert answer["read_noise_DN"]["low"] < READ_DN < answer["read_noise_DN"]["high"]
+
+
+def test_averaged_frames_give_the_gain_of_single_ones(tmp_path):
+    path = tmp_path / "averaged.h5"
+    rng = np.random.default_rng(3)
+
+    def mean_of_four(level):
+        return flat_frames(level, rng=rng, count=96).reshape(24, 4, *SHAPE).mean(axis=1).astype(np.float32)
+
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=mean_of_four(0.0), exposure_ms=20.0, averaged=4)
+        for level in (300.0, 3000.0):
+            writer.add_series(f"f{level:g}", kind="flat", frames=mean_of_four(level), exposure_ms=20.0, averaged=4)
+    found = transfer_of(path)
+    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+    assert found.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.03)
+
+
+REFUSED = {
+    "no darks": ({"with_darks": False}, "flats without a dark series"),
+    "kinds swapped": ({"swap": True}, "kinds are not swapped"),
+    "all saturated": ({"powers": (400.0, 450.0), "bits": 12}, "no usable flat .flat_400W: saturated at 4095 DN"),
+    "single frames": ({"count": 1}, "a single frame has no noise"),
+    "no flats": ({"powers": ()}, "no flat series that may calibrate"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_session_that_cannot_calibrate_is_refused_with_the_reason(tmp_path, case):
+    options, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
+        transfer_of(write_session(tmp_path / "bad.h5", **options))
+
+
+def test_darks_and_flats_of_two_detectors_are_refused(tmp_path):
+    path = tmp_path / "two.h5"
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=np.ones((4, 20, 20), dtype=np.uint16))
+        writer.add_series("flat", kind="flat", frames=np.ones((4, 20, 24), dtype=np.uint16))
+    with pytest.raises(InputError, match="darks and flats of one shape"):
+        transfer_of(path)
+
+
+def test_flats_without_any_noise_are_refused(tmp_path):
+    path = tmp_path / "constant.h5"
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=np.full((4, 20, 20), 100, dtype=np.uint16))
+        writer.add_series("flat", kind="flat", frames=np.full((4, 20, 20), 900, dtype=np.uint16))
+    with pytest.raises(InputError, match="no usable flat"):
+        transfer_of(path)

@@ -4,9 +4,12 @@ g(POD) = c0 + c1 x + u_network + v_image,  u ~ N(0, sd_network^2),  v ~ N(0, sd_
 
 The likelihood is Laplace's. a50 and a90 are those of the population-averaged curve, POD(x) = E[g^-1(c0 + c1 x + s Z)]
 with s^2 = sd_network^2 + sd_image^2 and Z standard normal: the chance that a network drawn from the population finds
-the object in an image drawn from the population. Bounds come from the profile likelihood of the averaged a90 (or its
-Wald form). Validity: networks and images are samples of what the curve is to speak for; with fewer than five or so of
-either, its standard deviation is poorly known and the bounds are too low.
+the object in an image drawn from the population. Bounds come from the profile likelihood of the averaged a90, its Wald
+form, and a modified form that also averages over slope and spreads (see `_averaged_size.py`): the one to trust.
+
+Validity: networks and images are samples of what the curve is to speak for; with fewer than five or so of either, its
+standard deviation is poorly known and the bounds are too low.
+
 Source: Bates, Maechler, Bolker & Walker, J. Stat. Softw. 67 (2015) 1, doi:10.18637/jss.v067.i01.
 """
 
@@ -77,7 +80,14 @@ def averaged_eta(pod: float, sd: float, *, link: Link) -> float:
 
 
 def fit_mixed(
-    design: Array, hits: Array, misses: Array, *, factors: list[Codes], link: Link, start: Array | None = None
+    design: Array,
+    hits: Array,
+    misses: Array,
+    *,
+    factors: list[Codes],
+    link: Link,
+    start: Array | None = None,
+    expected: bool = True,
 ) -> MixedFit:
     """Maximum (Laplace) likelihood of a hit/miss regression with one or two crossed random intercepts; scale of eta.
 
@@ -87,6 +97,7 @@ def fit_mixed(
         factors: one or two arrays of codes (row,).
         link: the link function.
         start: coefficients (coefficient,) to start from.
+        expected: Laplace's method with the expected information, as lme4; else with the observed one.
 
     Raises:
         FitError: the search did not converge.
@@ -99,7 +110,12 @@ def fit_mixed(
     scale[1:] = np.where(spread > 0, spread, 1.0)
     columns = (design - centre) / scale
     laplace = Laplace(
-        hits=hits, misses=misses, first=factors[0], second=factors[1] if len(factors) > 1 else None, link=link
+        hits=hits,
+        misses=misses,
+        first=factors[0],
+        second=factors[1] if len(factors) > 1 else None,
+        link=link,
+        expected=expected,
     )
 
     def deviance(parameters: Array) -> float:
@@ -376,81 +392,33 @@ def _bounds(
     notes: list[str],
 ) -> tuple[Bounds, Bounds, Bounds]:
     """One-sided upper, two-sided upper and lower bounds on the averaged a90, in the data's unit."""
-    c0, c1 = mixed.coefficients
-    x90 = float((averaged_eta(0.9, math.hypot(*mixed.sd), link=link) - c0) / c1)
+    from ._averaged_size import AveragedSize
 
-    def of(parameters: Array) -> float:
-        return float((averaged_eta(0.9, math.hypot(*parameters[2:]), link=link) - parameters[0]) / parameters[1])
-
-    estimate = np.concatenate((mixed.coefficients, mixed.sd))
-    rise = np.array(
-        [
-            (of(estimate + step) - of(estimate - step)) / (2 * step.max())
-            for step in np.diag(1e-4 * np.maximum(np.abs(estimate), 1e-2))
-        ]
-    )
-    error = math.sqrt(max(float(rise @ mixed.covariance @ rise), 0.0))
-    x = design[:, 1]
-    laplace = Laplace(
-        hits=table.hits,
-        misses=table.misses,
-        first=factors[0],
-        second=factors[1] if len(factors) > 1 else None,
-        link=link,
-    )
-    # the free parameters (c1, sd...) in units in which the deviance is round
-    keep = np.concatenate(([True, True], mixed.sd > 0))
-    covariance = mixed.covariance[1:, 1:].copy()
-    covariance[~keep[1:], :] = 0.0
-    covariance[:, ~keep[1:]] = 0.0
-    covariance[~keep[1:], ~keep[1:]] = 0.05
-    root = np.linalg.cholesky(covariance)
-    centre = estimate[1:]
-    state: dict[str, Array] = {"point": np.zeros(len(centre)), "hessian": 2 * np.eye(len(centre))}
-
-    def drop(at: float) -> float:
-        """Rise of the deviance where the averaged a90 is held at x = at, above the minimum."""
-
-        def held(free: Array) -> float:
-            parameters = centre + root @ free
-            eta90 = averaged_eta(0.9, math.hypot(*parameters[1:]), link=link)
-            return laplace.deviance(eta90 + parameters[0] * (x - at), parameters[1:])
-
-        point, value, hessian, _ = minimise(held, state["point"], hessian=state["hessian"], tolerance=1e-8)
-        state["point"], state["hessian"] = point, hessian
-        return value - mixed.deviance
-
-    def bound(z: float, side: float) -> float | None:
-        state["point"] = np.zeros(len(centre))
-        state["hessian"] = 2 * np.eye(len(centre))
-        previous, root_previous = x90, 0.0
-        at = x90 + side * z * max(error, 1e-9)
-        span = float(np.ptp(x))
-        for _ in range(25):
-            now = math.sqrt(max(drop(at), 0.0))
-            if abs(now - z) < 1e-5:
-                return at
-            rate = (now - root_previous) / (at - previous)
-            if not rate * side > 0 or abs(at - x90) > 50 * span:
-                return None
-            previous, root_previous = at, now
-            step = (z - now) / rate
-            longest = 2 * abs(at - x90) + 1e-9
-            at += (
-                min(max(step, -0.9 * abs(at - x90)), longest)
-                if side > 0
-                else max(min(step, 0.9 * abs(at - x90)), -longest)
+    plain = AveragedSize(mixed=mixed, design=design, table=table, factors=factors, link=link, expected=True)
+    sharper = plain
+    if link.name != "logit":
+        try:
+            refit = fit_mixed(
+                design,
+                table.hits,
+                table.misses,
+                factors=factors,
+                link=link,
+                start=mixed.coefficients,
+                expected=False,
             )
-        return None
-
-    results = []
-    for z, side in ((Z_ONE_SIDED, 1.0), (Z_TWO_SIDED, 1.0), (Z_TWO_SIDED, -1.0)):
-        results.append(
-            Bounds(
-                likelihood_ratio=size_from_x(bound(z, side), log_size=log_size),
-                wald=size_from_x(x90 + side * z * error, log_size=log_size),
-            )
+            sharper = AveragedSize(mixed=refit, design=design, table=table, factors=factors, link=link, expected=False)
+        except FitError:
+            notes.append("the modified bounds rest on the plain Laplace likelihood: the sharper one did not converge")
+    asked = ((Z_ONE_SIDED, 1.0), (Z_TWO_SIDED, 1.0), (Z_TWO_SIDED, -1.0))
+    results = [
+        Bounds(
+            likelihood_ratio=size_from_x(plain.likelihood_bound(z, side), log_size=log_size),
+            wald=size_from_x(plain.estimate + side * z * plain.error, log_size=log_size),
+            modified=size_from_x(modified, log_size=log_size),
         )
+        for (z, side), modified in zip(asked, sharper.modified_bounds(asked), strict=True)
+    ]
     if results[0].likelihood_ratio is None or results[1].likelihood_ratio is None:
         notes.append(
             "the likelihood gives no upper bound on a90: more images, networks or a wider range of sizes would"

@@ -232,7 +232,8 @@ def write_finished(runs: Runs, network: int, state: TrainingState, *, notes: Map
     )
     record = dataclasses.asdict(result) | {"configuration_sha256": runs.sha256, **notes}
     _write_json(folder / "network.json", record)
-    (folder / "state.pt").unlink(missing_ok=True)
+    for leftover in (folder / "state.pt", *folder.glob(".*.part")):
+        leftover.unlink(missing_ok=True)
     return result
 
 

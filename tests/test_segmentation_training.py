@@ -439,6 +439,7 @@ def test_a_killed_run_goes_on_from_its_last_epoch_and_ends_as_if_nothing_had_hap
         assert read_state(open_runs(tmp_path / "r"), 1).epochs_done == 1
         again = train_networks(dataset, tmp_path / "r", recipe=QUICK, networks=2, seed=5)
     assert again == trained[1]
+    assert sorted(found.name for found in (tmp_path / "r" / "network_001").iterdir()) == ["network.json", "weights.pt"]
     _assert_same(_weights(tmp_path / "r", 1), _weights(trained[0], 1))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting
+from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
 from .psf import blur_variance_share
 from .spectral_signal import OpenBeam, SpectralModel
@@ -125,8 +125,6 @@ def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float, centre:
 
 
 def _is_extrapolated(posterior: SpectralPosterior, setting: Setting) -> bool:
-    from ..acquisition.setting import filters_from_text
-
     lowest, highest = posterior.calibrated_kV
     if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
         return True
@@ -208,6 +206,14 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     if posterior is not None:
         model = spectral_model_of(twin, highest_kV=setting.kV)
         signal = model.signal(posterior.samples, OpenBeam(kV=setting.kV, filters=setting.filters))
+        best = posterior.best[None, :]
+        bare = model.signal(best, OpenBeam(kV=setting.kV, filters=()))
+        left = model.signal(best, OpenBeam(kV=setting.kV, filters=setting.filters)).absorbed_per_mAs
+        # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
+        if not (np.all(signal.absorbed_per_mAs > 0) and left[0] > 1e-30 * bare.absorbed_per_mAs[0]):
+            raise InputError(
+                "filter", received=text_from_filters(setting.filters), expected="layers that let some photons through"
+            )
         extrapolated = _is_extrapolated(posterior, setting)
         widen = 2.0 if extrapolated else 1.0
         level_sd = widen * posterior.level_discrepancy

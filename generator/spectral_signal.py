@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter
 from ..errors import InputError
 from ..materials import material_from_name, mu_per_mm, transmission
-from ..spectra import BIN_WIDTH_KEV, detector_response, energy_grid_keV, tube_fluence_interpolated
+from ..spectra import (
+    BIN_WIDTH_KEV,
+    MAXIMUM_KV,
+    MAXIMUM_KV_OF_ANODE,
+    MINIMUM_KV,
+    detector_response,
+    energy_grid_keV,
+    tube_fluence_interpolated,
+)
 
 REFERENCE_KV = 60.0
 REFERENCE_KEV = 50.0
@@ -89,8 +97,8 @@ class SpectralModel:
         self.filter_materials = tuple(filter_materials)
         self.names = (*FIXED_PARAMETERS, *(attenuation_scale_name(name) for name in self.filter_materials))
         self._index = {name: position for position, name in enumerate(self.names)}
-        self.energies_keV = energy_grid_keV(1.07 * highest_kV)
-        self.highest_kV = highest_kV
+        self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
+        self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
         self._fluence: dict[float, NDArray[np.float64]] = {}
         energies = self.energies_keV
@@ -135,10 +143,14 @@ class SpectralModel:
                 raise InputError(
                     "kV", received=f"{kV:g} kV", expected=f"at most {self.highest_kV:g} kV, this model's range"
                 )
+            # beyond the tube's table the nodes stand still; a kV outside it is refused at the node without error
+            lowest, highest = MINIMUM_KV, MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
+            if kV < lowest:
+                lowest = 0.0
             self._fluence[kV] = np.array(
                 [
                     tube_fluence_interpolated(
-                        kV * (1.0 + float(error)),
+                        min(max(kV * (1.0 + float(error)), lowest), highest),
                         energies_keV=self.energies_keV,
                         anode=self.anode,
                         anode_angle_deg=self.anode_angle_deg,

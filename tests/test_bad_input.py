@@ -1,0 +1,314 @@
+"""Bad input through the command line: exit 2, one line on standard error, nothing on standard output, no file left."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from raytwin.acquisition import Setting, open_acquisition, write_acquisition
+from raytwin.acquisition.instrument import Instrument
+from raytwin.cli import main
+
+SHAPE = (24, 28)
+EXPOSURE_MS = 20.0
+
+
+def frames(level, *, count=6, rng, shape=SHAPE):
+    values = 1000.0 + level + np.sqrt(4.0 * level + 100.0) * rng.standard_normal((count, *shape))
+    return np.clip(np.rint(values), 0, 65535).astype(np.uint16)
+
+
+def write_session(path, *, darks=True, level_per_W=60.0, bits=16, top=None, shape=SHAPE):
+    rng = np.random.default_rng(0)
+    instrument = Instrument(bits=bits, pixel_mm=0.45, source_detector_mm=3177.0, source_object_mm=2970.0)
+    with write_acquisition(path, instrument) as writer:
+        if darks:
+            writer.add_series(
+                "dark", kind="dark", frames=frames(0.0, rng=rng, shape=shape), exposure_ms=EXPOSURE_MS, kV=40.0
+            )
+        for kV in (40.0, 90.0):
+            for power in (5.0, 20.0, 40.0):
+                values = frames(level_per_W * power * kV / 40.0, rng=rng, shape=shape)
+                if top is not None:
+                    values = np.full_like(values, top)
+                setting = Setting(kV=kV, power_W=power, exposure_ms=EXPOSURE_MS)
+                writer.add_series(f"flat_{kV:g}_{power:g}", kind="flat", frames=values, setting=setting)
+    return path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A good session, its twin, and a set of small products to go with them."""
+    folder = tmp_path_factory.mktemp("good")
+    session, twin = write_session(folder / "session.h5"), folder / "twin.h5"
+    assert main(["calibrate", str(session), "-o", str(twin), "--json"]) == 0
+    products = folder / "products.h5"
+    rng = np.random.default_rng(1)
+    with write_acquisition(products, Instrument(bits=16)) as writer:
+        for kV in (40.0, 90.0):
+            setting = Setting(kV=kV, power_W=40.0, exposure_ms=100.0, averaged=10)
+            writer.add_series(f"flat_{kV:g}", kind="flat", frames=frames(5000.0, rng=rng, count=1), setting=setting)
+            writer.add_series(
+                f"object_{kV:g}",
+                kind="object",
+                frames=frames(3000.0, rng=rng, count=1),
+                setting=setting,
+                scene="one",
+            )
+        writer.add_series("dark", kind="dark", frames=frames(0.0, rng=rng, count=1), exposure_ms=100.0)
+        mask = np.zeros(SHAPE, dtype=np.uint8)
+        mask[10:14, 10:14] = 1
+        writer.add_scene("one", kind="product", foreign_object_mask=mask, product_mask=np.ones(SHAPE))
+    return {"session": session, "twin": twin, "products": products}
+
+
+GENERATE = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=40,exposure_ms=20"]
+GENERATE = [*GENERATE, "-n", "2", "--seed", "1"]
+PREDICT = ["--power-w", "40", "--exposure-ms", "20"]
+
+
+def refused(capsys, folder, words, *, mentions):
+    """Run a command that must fail well; `mentions` stands in its one line."""
+    before = sorted(path.name for path in folder.iterdir())
+    capsys.readouterr()
+    code = main([str(word) for word in words])
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert code == 2, captured.err
+    assert captured.out == ""
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith(f"raytwin {words[0]}: error: ")
+    assert mentions in lines[0], lines[0]
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def damaged(path, folder, keep):
+    copy = folder / "damaged.h5"
+    copy.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    return copy
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.02, 0.5, 0.98])
+def test_a_truncated_acquisition(files, tmp_path, capsys, keep):
+    broken = damaged(files["session"], tmp_path, keep)
+    refused(capsys, tmp_path, ["calibrate", broken, "-o", tmp_path / "twin.h5", "--json"], mentions="damaged.h5")
+    refused(capsys, tmp_path, ["validate", files["twin"], broken, "--json"], mentions="damaged.h5")
+    refused(
+        capsys,
+        tmp_path,
+        ["generate", files["twin"], broken, *GENERATE, "-o", tmp_path / "data.h5", "--json"],
+        mentions="damaged.h5",
+    )
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.95])
+def test_a_truncated_twin(files, tmp_path, capsys, keep):
+    broken = damaged(files["twin"], tmp_path, keep)
+    refused(capsys, tmp_path, ["predict", broken, "--kv", 60, *PREDICT, "--json"], mentions="damaged.h5")
+    refused(capsys, tmp_path, ["validate", broken, files["session"], "--json"], mentions="damaged.h5")
+
+
+def test_a_file_that_is_not_there(files, tmp_path, capsys):
+    absent = tmp_path / "absent.h5"
+    refused(capsys, tmp_path, ["calibrate", absent, "-o", tmp_path / "twin.h5"], mentions="absent.h5")
+    refused(capsys, tmp_path, ["predict", absent, "--kv", 60, *PREDICT], mentions="absent.h5")
+
+
+def test_the_wrong_kind_of_file(files, tmp_path, capsys):
+    out = tmp_path / "out.h5"
+    refused(capsys, tmp_path, ["calibrate", files["twin"], "-o", out], mentions="raytwin-acquisition")
+    refused(capsys, tmp_path, ["predict", files["session"], "--kv", 60, *PREDICT], mentions="raytwin-twin")
+    refused(capsys, tmp_path, ["validate", files["session"], files["twin"]], mentions="raytwin-twin")
+    refused(
+        capsys,
+        tmp_path,
+        ["generate", files["twin"], files["twin"], *GENERATE, "-o", out],
+        mentions="raytwin-dataset or raytwin-acquisition",
+    )
+    text = tmp_path / "notes.txt"
+    text.write_text("not HDF5")
+    refused(capsys, tmp_path, ["calibrate", text, "-o", out], mentions="notes.txt")
+
+
+def test_flats_without_darks(tmp_path, capsys):
+    session = write_session(tmp_path / "session.h5", darks=False)
+    refused(capsys, tmp_path, ["calibrate", session, "-o", tmp_path / "twin.h5", "--json"], mentions="dark")
+
+
+def test_nothing_but_saturated_flats(tmp_path, capsys):
+    session = write_session(tmp_path / "session.h5", top=65535)
+    refused(capsys, tmp_path, ["calibrate", session, "-o", tmp_path / "twin.h5", "--json"], mentions="saturated")
+
+
+def edited(files, folder, edit):
+    copy = folder / "edited.h5"
+    shutil.copy(files["session"], copy)
+    with h5py.File(copy, "r+") as file:
+        edit(file)
+    return copy
+
+
+def put_nan(file):
+    values = file["series/flat_40_20/frames"][()].astype(np.float32)
+    values[2, 5, 6] = np.nan
+    del file["series/flat_40_20/frames"]
+    file["series/flat_40_20"].create_dataset("frames", data=values)
+
+
+EDITS = {
+    "NaN in a frame": (put_nan, "flat_40_20"),
+    "negative exposure": (lambda file: file["series/flat_40_20"].attrs.modify("exposure_ms", -20.0), "exposure_ms"),
+    "NaN exposure": (lambda file: file["series/flat_40_20"].attrs.modify("exposure_ms", np.nan), "exposure_ms"),
+    "zero kV": (lambda file: file["series/flat_40_20"].attrs.modify("kV", 0.0), "kV"),
+    "kV above the table": (lambda file: file["series/flat_40_20"].attrs.modify("kV", 900.0), "kV"),
+    "negative current": (lambda file: file["series/flat_40_20"].attrs.create("current_mA", -1.0), "current_mA"),
+    "unknown kind": (lambda file: file["series/flat_40_20"].attrs.modify("kind", "flaat"), "flaat"),
+    "unknown filter material": (
+        lambda file: file["series/flat_40_20"].attrs.modify("filter", "unobtanium:1"),
+        "unobtanium",
+    ),
+    "unknown anode": (lambda file: file["instrument"].attrs.create("anode", "Xx"), "Xx"),
+    "no series": (lambda file: [file["series"].pop(name) for name in list(file["series"])], "series"),
+    "newer version": (lambda file: file.attrs.modify("version", 99), "99"),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_a_session_with_a_wrong_value(files, tmp_path, capsys, case):
+    edit, word = EDITS[case]
+    session = edited(files, tmp_path, edit)
+    refused(capsys, tmp_path, ["calibrate", session, "-o", tmp_path / "twin.h5", "--json"], mentions=word)
+
+
+PREDICTIONS = {
+    "kV above the table": (["--kv", "500", *PREDICT], "kV"),
+    "kV of nothing": (["--kv", "nan", *PREDICT], "kV"),
+    "negative exposure": (["--kv", "60", "--power-w", "40", "--exposure-ms", "-20"], "exposure_ms"),
+    "no power": (["--kv", "60", "--power-w", "0", "--exposure-ms", "20"], "power_W"),
+    "unknown filter": (["--kv", "60", "--filter", "unobtanium:1", *PREDICT], "unobtanium"),
+    "filter without thickness": (["--kv", "60", "--filter", "Cu", *PREDICT], "MATERIAL:mm"),
+    "negative filter": (["--kv", "60", "--filter", "Cu:-1", *PREDICT], "thickness"),
+    "a filter that stops everything": (["--kv", "60", "--filter", "W:100", *PREDICT], "filter"),
+    "no frame": (["--kv", "60", "--averaged", "0", *PREDICT], "averaged"),
+}
+
+
+@pytest.mark.parametrize("case", PREDICTIONS)
+def test_a_prediction_that_makes_no_sense(files, tmp_path, capsys, case):
+    words, word = PREDICTIONS[case]
+    refused(capsys, tmp_path, ["predict", files["twin"], *words, "--json"], mentions=word)
+
+
+GENERATIONS = {
+    "no image": (["-n", "0"], "number of images"),
+    "kV of another tube": (["--low", "kv=50,power_w=40,exposure_ms=20"], "calibrated at"),
+    "negative exposure": (["--low", "kv=40,power_w=40,exposure_ms=-5"], "exposure_ms"),
+    "not a setting": (["--low", "forty"], "forty"),
+    "no load": (["--low", "kv=40,exposure_ms=20"], "tube load"),
+    "low above high": (
+        ["--low", "kv=90,power_w=40,exposure_ms=20", "--high", "kv=40,power_w=40,exposure_ms=20"],
+        "low",
+    ),
+    "more than the reference": (["--low", "kv=40,power_w=40,exposure_ms=5000"], "too noisy"),
+    "unknown product": (["--product-material", "unobtanium"], "unobtanium"),
+    "one reference setting": (["--reference-low", "kv=40,power_w=40,exposure_ms=100"], "both or neither"),
+}
+
+
+@pytest.mark.parametrize("case", GENERATIONS)
+def test_a_generation_that_cannot_be(files, tmp_path, capsys, case):
+    words, word = GENERATIONS[case]
+    refused(
+        capsys,
+        tmp_path,
+        ["generate", files["twin"], files["products"], *GENERATE, "-o", tmp_path / "data.h5", "--json", *words],
+        mentions=word,
+    )
+
+
+def test_generation_works_where_nothing_is_wrong(files, tmp_path, capsys):
+    out = tmp_path / "data.h5"
+    assert main(["generate", *map(str, (files["twin"], files["products"])), *GENERATE, "-o", str(out), "--json"]) == 0
+    assert out.exists()
+    capsys.readouterr()
+
+
+def test_another_detector_than_the_twin_s(files, tmp_path, capsys):
+    other = write_session(tmp_path / "other.h5", shape=(20, 20))
+    refused(capsys, tmp_path, ["validate", files["twin"], other, "--json"], mentions="24")
+
+
+def test_masks_of_another_shape(files, tmp_path, capsys):
+    copy = tmp_path / "masks.h5"
+    shutil.copy(files["products"], copy)
+    with h5py.File(copy, "r+") as file:
+        del file["scenes/one/foreign_object_mask"]
+        file["scenes/one"].create_dataset("foreign_object_mask", data=np.zeros((7, 9), dtype=np.uint8))
+    refused(
+        capsys,
+        tmp_path,
+        ["generate", files["twin"], copy, *GENERATE, "-o", tmp_path / "data.h5", "--json"],
+        mentions="foreign_object_mask",
+    )
+
+
+def test_a_product_larger_than_the_field(tmp_path, capsys):
+    refused(
+        capsys,
+        tmp_path,
+        ["lab", "-o", tmp_path / "a.h5", "--protocol", "set1", "--size", "32", "--product-mm", "500", "--json"],
+        mentions="field",
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "word"),
+    [
+        (["--protocol", "nonsense"], "protocol"),
+        (["--protocol", "calibration", "--size", "4"], "--size"),
+        (["--protocol", "calibration", "--frames", "1"], "frames"),
+        (["--protocol", "calibration", "--seed", "-1"], "seed"),
+    ],
+)
+def test_a_lab_session_that_cannot_be(tmp_path, capsys, words, word):
+    refused(capsys, tmp_path, ["lab", "-o", tmp_path / "a.h5", *words, "--json"], mentions=word)
+
+
+def test_an_output_that_cannot_be_written(files, tmp_path, capsys):
+    folder = tmp_path / "a_folder"
+    folder.mkdir()
+    refused(capsys, tmp_path, ["calibrate", files["session"], "-o", folder, "--json"], mentions="a_folder")
+
+
+def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
+    out = tmp_path / "twin.h5"
+    out.write_bytes(b"what was there")
+    broken = damaged(files["session"], tmp_path, 0.5)
+    refused(capsys, tmp_path, ["calibrate", broken, "-o", out, "--json"], mentions="damaged.h5")
+    assert out.read_bytes() == b"what was there"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["calibrate"],
+        ["predict", "twin.h5"],
+        ["predict", "twin.h5", "--kv", "sixty", "--power-w", "1", "--exposure-ms", "1"],
+        ["calibrate", "a.h5", "-o", "b.h5", "--unknown"],
+        ["nonsense"],
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    captured = capsys.readouterr()
+    assert stop.value.code == 2
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith("raytwin")
+
+
+def test_the_good_session_is_good(files):
+    with open_acquisition(files["session"]) as acquisition:
+        assert len(acquisition.series) == 7

@@ -38,7 +38,11 @@ PRIORS: dict[str, Prior] = {
     ),
     "log_DN_per_keV": Prior(centre=0.0, sd=20.0, reason="electronics unknown"),
     "log_swank": Prior(
-        centre=math.log(0.85), sd=0.08, low=math.log(0.3), high=0.0, reason="0.7-0.95 for CsI and Gd2O2S screens"
+        centre=math.log(0.9),
+        sd=0.07,
+        low=math.log(0.3),
+        high=0.0,
+        reason="light only, 0.8-1: escape of K photons, which takes CsI and Gd2O2S screens down to 0.7, is in the response",
     ),
     "yield_exponent": Prior(
         centre=0.0, sd=0.02, reason="spectrum models differ by 2 % in output from 40 to 120 kV (casim against kqp)"

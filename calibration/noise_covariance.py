@@ -63,6 +63,7 @@ def compute_noise_covariance(
         radius: largest lag, px.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
+    from scipy.special import chdtri
 
     rows, columns = good.shape
     size = (next_fast_len(rows + radius, real=True), next_fast_len(columns + radius, real=True))
@@ -108,10 +109,11 @@ def compute_noise_covariance(
     signal = float(signal_DN[good].mean()) if has_signal else 0.0
     common = 0.0
     if has_signal:
-        # the pixels' own noise moves the factor too; what is left must stand out of that by three standard deviations
+        # the pixels' own noise moves the factor too; what is left must stand out of that as in 1 of 1000 by chance
         own = float(covariance.sum()) / norm
         excess = float(np.mean(np.square(factors))) / 2.0 - own
-        common = excess if excess > 3.0 * own * math.sqrt(2.0 / effective_frames(count + 1)) else 0.0
+        degrees = effective_frames(count + 1)
+        common = excess if excess > own * (float(chdtri(degrees, 1e-3)) / degrees - 1.0) else 0.0
     return NoiseCovariance(
         covariance_DN2=covariance,
         samples=effective_frames(count + 1) * pixels,
@@ -231,7 +233,8 @@ class _Problem:
         centre, width = WHITE_FRACTION_PRIOR
         prior = np.zeros((self.groups, 2 * self.groups + 1))
         for g in range(self.groups):
-            scale = max(abs(first[g]) + abs(first[self.groups + g]), 1e-12) * width
+            # the sum is the gain, known even where the two cannot be told apart
+            scale = max(abs(first[g] + first[self.groups + g]), 1e-12) * width
             prior[g, g], prior[g, self.groups + g] = -centre / scale, 1.0 / scale
         matrix = np.concatenate([matrix, prior])
         target = np.concatenate([target, np.zeros(self.groups)])

@@ -456,6 +456,19 @@ def _root_estimate(variance: float, sd: float) -> Estimate:
     return Estimate(value=value, low=low, high=high)
 
 
+def _median_of_means(values: NDArray[np.float64], frames: int, integer: bool) -> float:
+    """Median of pixel means; means of few whole numbers tie, so the ties are taken as spread over their step."""
+    middle = float(np.median(values))
+    if not integer or frames < 1:
+        return middle
+    step = 1.0 / frames
+    # an even number of pixels may put the median between two steps
+    middle = float(np.partition(values, len(values) // 2)[len(values) // 2])
+    below = int(np.count_nonzero(values < middle - 0.5 * step))
+    tied = int(np.count_nonzero(np.abs(values - middle) <= 0.5 * step))
+    return middle - 0.5 * step + step * (0.5 * len(values) - below) / tied
+
+
 def _dark_estimate(
     darks: _Darks, good: NDArray[np.bool_], exposures: Sequence[float | None]
 ) -> tuple[Estimate, float | None]:
@@ -465,8 +478,13 @@ def _dark_estimate(
     candidates = shared or known
     exposure = candidates[0] if candidates else None
     mean = darks.at(exposure)
-    level = float(np.median(mean[good]))
-    repeats = [float(np.median(total.mean_DN[good])) for item, total in darks.sums if item.exposure_ms == exposure]
+    integer = all(total.integer for _, total in darks.sums)
+    level = _median_of_means(mean[good], sum(t.frames for i, t in darks.sums if i.exposure_ms == exposure), integer)
+    repeats = [
+        _median_of_means(total.mean_DN[good], total.frames, total.integer)
+        for item, total in darks.sums
+        if item.exposure_ms == exposure
+    ]
     frames = sum(total.frames for item, total in darks.sums if item.exposure_ms == exposure)
     pixels = int(good.sum())
     noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
@@ -680,6 +698,13 @@ def _evidence(
             " correlated; gains come from pairs"
         )
     linearity = _linearity(used)
+    repeats = _repeats(used)
+    for row in repeats:
+        if abs(row["change_percent"]) > max(0.3, 5.0 * row["noise_percent"]):
+            warnings.append(
+                f"the level changed by {row['change_percent']:+.2g} % from {row['series'][0]} to {row['series'][-1]} at"
+                " the same setting: output or detector drift between series"
+            )
     if linearity is not None and linearity["largest_departure_percent"] > 1.0:
         warnings.append(
             "signal departs from a line in tube load or exposure by up to"
@@ -717,6 +742,7 @@ def _evidence(
         "stack_over_pair_variance": ratio,
         "drift_percent_per_series": {p.series: p.drift_percent for p in used},
         "output_rms_percent": max((p.common_mode_percent for p in used), default=0.0),
+        "repeated_settings": repeats,
         "linearity": linearity,
         "dark": dark_levels,
         "dark_neighbour_correlation": dark_correlation,
@@ -730,6 +756,30 @@ def _evidence(
         },
         "photon_transfer": [point.as_dict() for point in points],
     }
+
+
+def _repeats(points: Sequence[SeriesPoint]) -> list[dict[str, Any]]:
+    """Settings measured more than once: levels in order of time, change from first to last and its noise, %."""
+    groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
+    for point in points:
+        key = (point.kV, point.filters, point.exposure_ms, point.load_mAs, point.photons_per_pixel)
+        groups.setdefault((*key, point.source_detector_mm), []).append(point)
+    rows = []
+    for members in groups.values():
+        if len(members) < 2:
+            continue
+        levels = [point.mean_signal_DN for point in members]
+        change = 100.0 * (levels[-1] / levels[0] - 1.0)
+        own = [point.common_mode_percent / math.sqrt(point.frames) for point in (members[0], members[-1])]
+        rows.append(
+            {
+                "series": [point.series for point in members],
+                "mean_signal_DN": levels,
+                "change_percent": change,
+                "noise_percent": math.hypot(*own, 0.02),
+            }
+        )
+    return rows
 
 
 def _linearity(points: Sequence[SeriesPoint]) -> dict[str, Any] | None:

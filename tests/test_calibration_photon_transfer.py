@@ -294,3 +294,43 @@ def test_flats_without_any_noise_are_refused(tmp_path):
         writer.add_series("flat", kind="flat", frames=np.full((4, 20, 20), 900, dtype=np.uint16))
     with pytest.raises(InputError, match="no usable flat"):
         transfer_of(path)
+
+
+def test_a_level_that_changes_between_repeats_of_a_setting_is_said(tmp_path):
+    path = tmp_path / "repeats.h5"
+    rng = np.random.default_rng(5)
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=as_adc(flat_frames(0.0, rng=rng)), exposure_ms=20.0)
+        for name, level in (("before", 3000.0), ("after", 3045.0), ("same", 3000.0)):
+            exposure_ms = 40.0 if name == "same" else 20.0
+            frames = as_adc(flat_frames(level, rng=rng))
+            writer.add_series(name, kind="flat", frames=frames, exposure_ms=exposure_ms)
+    found = transfer_of(path)
+    (row,) = found.evidence["repeated_settings"]
+    assert row["series"] == ["before", "after"]
+    assert row["change_percent"] == pytest.approx(1.5, abs=0.15)
+    assert any("the level changed by +1.5 % from before to after" in line for line in found.warnings)
+
+
+def test_a_steady_level_between_repeats_is_not_mentioned(tmp_path):
+    path = tmp_path / "steady.h5"
+    rng = np.random.default_rng(6)
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=as_adc(flat_frames(0.0, rng=rng)), exposure_ms=20.0)
+        for name in ("before", "after"):
+            writer.add_series(name, kind="flat", frames=as_adc(flat_frames(3000.0, rng=rng)), exposure_ms=20.0)
+    found = transfer_of(path)
+    assert abs(found.evidence["repeated_settings"][0]["change_percent"]) < 0.3
+    assert found.warnings == ()
+
+
+def test_two_frames_of_whole_numbers_still_give_a_fine_dark_level(tmp_path):
+    path = tmp_path / "few.h5"
+    rng = np.random.default_rng(7)
+    with write_acquisition(path) as writer:
+        frames = as_adc(flat_frames(0.0, rng=rng, count=2, dark=14.7 + 100, read_DN=3.0))
+        writer.add_series("dark", kind="dark", frames=frames, exposure_ms=20.0)
+        frames = as_adc(flat_frames(3000.0, rng=rng, count=2, dark=14.7 + 100, read_DN=3.0))
+        writer.add_series("flat", kind="flat", frames=frames, exposure_ms=20.0)
+    found = transfer_of(path)
+    assert found.dark_DN.value == pytest.approx(114.7, abs=4 * 1.2533 * 3.0 / np.sqrt(2 * 1600))

@@ -1,6 +1,7 @@
 """The optional libraries of this room, loaded when first used; their absence is one clear line."""
 
 import importlib
+import os
 from types import ModuleType
 
 from ..errors import MissingDependencyError
@@ -19,6 +20,9 @@ def load_segmentation_models() -> ModuleType:
 
 
 def _load(name: str) -> ModuleType:
+    # Threads that wait by spinning make a step ten times slower wherever other work shares the processor. Read once,
+    # when torch's runtime starts; whoever has set it already is obeyed.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return importlib.import_module(name)
     except ImportError as error:

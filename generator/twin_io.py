@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import filters_from_text, text_from_filters
-from ..errors import FileFormatError
+from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
 
 FORMAT = "raytwin-twin"
 VERSION = 1
+_MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels")
 _FILTER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover")
 
 
@@ -57,7 +58,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
             if value is not None:
                 instrument.attrs[entry.name] = text_from_filters(value) if entry.name in _FILTER_FIELDS else value
         maps = file.create_group("maps")
-        for name in ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels"):
+        for name in _MAPS:
             maps.create_dataset(name, data=getattr(twin.maps, name), compression="gzip", shuffle=True)
         if twin.maps.dark_exposure_ms is not None:
             maps.attrs["dark_exposure_ms"] = twin.maps.dark_exposure_ms
@@ -128,7 +129,9 @@ def read_twin(path: str | os.PathLike[str]) -> Twin:
             )
         try:
             return _twin_from_file(file, path)
-        except (KeyError, OSError, json.JSONDecodeError) as error:
+        except InputError:
+            raise
+        except (KeyError, OSError, TypeError, ValueError, IndexError) as error:
             raise FileFormatError(
                 f"twin {path}",
                 received=f"a damaged file ({error})",
@@ -169,6 +172,11 @@ def _twin_from_file(file: Any, path: object) -> Twin:
                 series=tuple(json.loads(_text(group.attrs["series"]))),
                 role=_text(group.attrs["role"]),
             )
+        )
+    shapes = {maps[name].shape for name in _MAPS} | {level.flat_shape.shape for level in levels}
+    if len(shapes) > 1 or len(next(iter(shapes))) != 2:
+        raise FileFormatError(
+            f"twin {path}", received=f"maps of shapes {sorted(shapes)}", expected="maps (row, column) of one shape"
         )
     spectral = None
     if "spectral" in file:

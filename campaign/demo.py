@@ -33,21 +33,24 @@ HIGH = Setting(kV=90, power_W=45, exposure_ms=100, averaged=10, filters=_FILTERS
 class DemoPlan:
     """How large the demo is.
 
-    Fields: size (row, column) and pixel_mm of the detector; calibration_frames a series; products, test_products (images
+    Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the paper's
+    line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series; products, test_products (images
     of the two sets); exposures_ms of the fast settings; generated (training pairs an exposure); networks an exposure;
     shared_steps (of the one network they all start from), steps (of each after that); batch; seed.
     """
 
     size: tuple[int, int] = (96, 128)
     pixel_mm: float = 0.45
+    source_detector_mm: float | None = 2000.0
+    bones_mm: tuple[float, ...] | None = (3.0, 6.0, 10.0)
     calibration_frames: int = 16
     products: int = 72
     test_products: int = 48
     exposures_ms: tuple[float, ...] = (100.0, 50.0, 20.0)
     generated: int = 144
-    networks: int = 3
-    shared_steps: int = 700
-    steps: int = 100
+    networks: int = 2
+    shared_steps: int = 260
+    steps: int = 60
     batch: int = 8
     seed: int = 1
     recipe: str = "raytwin"
@@ -61,6 +64,8 @@ class DemoPlan:
 PAPER_PLAN = DemoPlan(
     size=(760, 956),
     pixel_mm=0.15,
+    source_detector_mm=None,
+    bones_mm=None,
     calibration_frames=200,
     products=254,
     test_products=84,
@@ -142,6 +147,9 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
     at = chain.path
     seed = str(plan.seed)
     size = ["--size", f"{plan.size[0]}x{plan.size[1]}", "--pixel-mm", f"{plan.pixel_mm:g}", "--seed", seed]
+    if plan.source_detector_mm is not None:
+        size += ["--source-detector-mm", f"{plan.source_detector_mm:g}"]
+    bones = [] if plan.bones_mm is None else ["--bones-mm", ",".join(f"{length:g}" for length in plan.bones_mm)]
 
     # the measured system
     truth = chain.step(
@@ -160,10 +168,10 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
     )
     calibration = chain.step("calibrate", ["calibrate", at("calibration.h5"), "-o", at("twin.h5")], outputs=["twin.h5"])
     validation = chain.step("validate", ["validate", at("twin.h5"), at("calibration.h5")])
-    for name, count in (("set1", plan.products), ("set2", plan.test_products)):
+    for name, count, more in (("set1", plan.products, []), ("set2", plan.test_products, bones)):
         chain.step(
             f"lab_{name}",
-            ["lab", "-o", at(f"{name}.h5"), "--protocol", name, *size, "--products", str(count)],
+            ["lab", "-o", at(f"{name}.h5"), "--protocol", name, *size, "--products", str(count), *more],
             outputs=[f"{name}.h5"],
         )
 
@@ -207,13 +215,13 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
              "-o", at(f"published_{number}.h5")],
             outputs=[f"published_{number}.h5"],
         )  # fmt: skip
-    _mix(chain, [f"train_{exposure:g}ms.h5" for exposure in plan.exposures_ms] + ["references.h5"], "train_mixed.h5")
-
-    # networks: one shared start, then a few for each exposure
+    # networks: one shared start from the least noisy images (noisier ones teach a new network nothing for hundreds of
+    # steps), then a few for each exposure
+    _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_shared.h5")
     common = ["--recipe", plan.recipe, "--batch", str(plan.batch), "--seed", seed]
     shared = chain.step(
         "train_shared",
-        ["train", at("train_mixed.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
+        ["train", at("train_shared.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
          "--steps", str(plan.shared_steps)],
         outputs=["runs_shared"],
     )  # fmt: skip

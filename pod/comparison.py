@@ -268,7 +268,8 @@ def _correlation(
     meat = clustered_meat(influences[0][0], influences[1][0], left, right)
     across = influences[0][1] @ meat @ influences[1][1]
     value = float(gradients[0] @ across @ gradients[1]) / (spreads[0] * spreads[1])
-    return min(max(value, -0.99), 0.99)
+    # what is shared moves both alike; an estimate below 0 is noise of few images or networks
+    return min(max(value, 0.0), 0.99)
 
 
 def _curve_test(

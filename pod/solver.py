@@ -190,43 +190,70 @@ def _adjusted(
     columns: Array, hits: Array, misses: Array, link: Link, begin: Array, iterations: int
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     fits, width = begin.shape
-    products = np.einsum("ki,kj->kij", columns, columns).reshape(len(columns), width * width)
-    current = begin
+    current = begin.copy()
     information = np.full((fits, width, width), np.nan)
     value = np.full(fits, np.nan)
-    last = np.full(fits, np.inf)
-    last_step = np.zeros_like(current)
     converged = np.zeros(fits, bool)
     running = np.arange(fits)
-    for _ in range(5 * iterations):
-        eta = current[running] @ columns.T
-        parts = link.log_parts(eta)
-        h, m = hits[running], misses[running]
-        fisher = -(h + m) * parts.log_hit_1 * parts.log_miss_1
-        matrix = (fisher @ products).reshape(-1, width, width)
-        inverse = np.stack([_solve(matrix, np.tile(row, (len(running), 1))) for row in np.eye(width)], axis=1)
-        leverage = fisher * np.einsum("fij,kij->fk", inverse, products.reshape(-1, width, width))
-        adjusted = h * parts.log_hit_1 + m * parts.log_miss_1 + 0.5 * leverage * link.pod_curvature(eta)
-        gradient = adjusted @ columns
-        step = np.einsum("fij,fj->fi", inverse, gradient)
-        size = np.einsum("fj,fj->f", gradient, step)
-        size = np.where(np.isfinite(size), size, np.inf)
-        worse = (size > 4 * last[running]) & (size > 1e-12)
-        back = running[worse]
-        last_step[back] *= 0.5
-        current[back] -= last_step[back]
-        moved = running[~worse]
-        last[moved] = size[~worse]
-        information[moved] = matrix[~worse]
-        value[moved] = (h * parts.log_hit + m * parts.log_miss).sum(axis=1)[~worse]
-        length = np.abs(step[~worse]).max(axis=1)
+    for _ in range(iterations):
+        step, size, matrix, log_likelihood = _scoring_step(
+            columns, hits[running], misses[running], link, current[running]
+        )
+        information[running], value[running] = matrix, log_likelihood
         # a step longer than 2 standard deviations of x is a start that was too far off, not information
-        last_step[moved] = step[~worse] * np.minimum(1.0, 2.0 / np.maximum(length, 1e-300))[:, None]
-        done = size[~worse] < 1e-20
-        converged[moved[done]] = True
-        current[moved] += last_step[moved]
-        running = running[~converged[running]]
+        step *= np.minimum(1.0, 2.0 / np.maximum(np.abs(step).max(axis=1), 1e-300))[:, None]
+        going = np.isfinite(step).all(axis=1) & (size >= 1e-20)
+        converged[running[size < 1e-20]] = True
+        current[running[going]] += step[going]
+        running = running[going]
         if not running.size:
             break
+    for fit in np.flatnonzero(~converged):
+        found = _adjusted_root(columns, hits[fit : fit + 1], misses[fit : fit + 1], link, begin[fit])
+        if found is not None:
+            current[fit] = found
+            _, _, information[fit], value[fit] = (
+                part[0]
+                for part in _scoring_step(columns, hits[fit : fit + 1], misses[fit : fit + 1], link, found[None])
+            )
+            converged[fit] = True
     current[~converged] = np.nan
     return current, information, np.where(converged, value, np.nan), converged
+
+
+def _scoring_step(
+    columns: Array, hits: Array, misses: Array, link: Link, current: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Step of Fisher scoring on the adjusted score, its squared length, the information and the log-likelihood."""
+    width = columns.shape[1]
+    products, places = _products(columns)
+    eta = current @ columns.T
+    parts = link.log_parts(eta)
+    fisher = -(hits + misses) * parts.log_hit_1 * parts.log_miss_1
+    matrix = (fisher @ products)[:, places]
+    inverse = np.stack([_solve(matrix, np.tile(row, (len(current), 1))) for row in np.eye(width)], axis=1)
+    leverage = fisher * np.einsum("fij,ki,kj->fk", inverse, columns, columns, optimize=True)
+    adjusted = hits * parts.log_hit_1 + misses * parts.log_miss_1 + 0.5 * leverage * link.pod_curvature(eta)
+    gradient = adjusted @ columns
+    step = np.einsum("fij,fj->fi", inverse, gradient)
+    size = np.einsum("fj,fj->f", gradient, step)
+    log_likelihood = (hits * parts.log_hit + misses * parts.log_miss).sum(axis=1)
+    return step, np.where(np.isfinite(size), np.abs(size), np.inf), matrix, log_likelihood
+
+
+def _adjusted_root(columns: Array, hits: Array, misses: Array, link: Link, begin: Array) -> Array | None:
+    """Root of the adjusted score by Powell's method, for the few fits in which scoring goes round in circles."""
+    from scipy.optimize import root
+
+    def step(current: Array) -> Array:
+        found = _scoring_step(columns, hits, misses, link, current[None])[0][0]
+        return np.where(np.isfinite(found), found, 1e6)
+
+    for stretch in (1.0, 0.3, 2.0, 4.0, -1.0):
+        start = begin.copy()
+        start[1:] *= stretch
+        answer = root(step, start, method="hybr", options={"xtol": 1e-13})
+        size = _scoring_step(columns, hits, misses, link, answer.x[None])[1][0]
+        if size < 1e-14:
+            return np.asarray(answer.x)
+    return None

@@ -220,8 +220,6 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
         raise FileFormatError("table", received=f"{path} ({error})", expected="comma-separated values") from None
     header = [name.strip() for name in cells[0]]
     numbers = [n for n, _ in kept][1:]
-    if len(set(header)) != len(header) or "" in header:
-        raise FileFormatError("table header", received=", ".join(header), expected="distinct, non-empty column names")
     if all(_is_number(name) for name in header):
         raise FileFormatError(
             "table header",
@@ -229,6 +227,8 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
             expected="column names in the first line",
             remedy="add a line such as size,hit",
         )
+    if len(set(header)) != len(header) or "" in header:
+        raise FileFormatError("table header", received=", ".join(header), expected="distinct, non-empty column names")
     for number, row in zip(numbers, cells[1:], strict=False):
         if len(row) != len(header):
             raise FileFormatError(

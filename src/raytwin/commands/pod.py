@@ -200,6 +200,8 @@ def _covariates(table: PodTable, arguments: argparse.Namespace, result: dict[str
     held: dict[str, float] = {}
     for option in arguments.covariate:
         name, equals, value = option.partition("=")
+        if name == table.size_name:
+            raise InputError("--covariate", received=repr(option), expected="another property than the size")
         columns[name] = table.numbers(name)
         try:
             held[name] = float(value) if equals else float(np.median(columns[name]))

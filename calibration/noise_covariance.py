@@ -180,7 +180,15 @@ class SpreadFit:
 class _Problem:
     """The series' covariances in whitened form; linear in everything but the width of the spread."""
 
-    def __init__(self, series: Sequence[NoiseCovariance], group: Sequence[int], radius: int, read_variance: float):
+    def __init__(
+        self,
+        series: Sequence[NoiseCovariance],
+        group: Sequence[int],
+        radius: int,
+        read_variance: float,
+        expected: Sequence[NDArray[np.float64]] | None = None,
+    ):
+        self.series = list(series)
         self.radius = radius
         self.lags = _half_plane(radius)
         self.rows = np.array([dy for dy, _ in self.lags]) + radius
@@ -192,12 +200,13 @@ class _Problem:
         self.data: list[NDArray[np.float64]] = []
         from scipy.linalg import cholesky, solve_triangular
 
-        for item in series:
+        for number, item in enumerate(series):
             cut = item.radius - radius
             window = item.covariance_DN2[
                 cut : item.covariance_DN2.shape[0] - cut, cut : item.covariance_DN2.shape[1] - cut
             ]
-            smooth = self._smoothed(window, item.samples, read_variance)
+            # weights from the measured covariances favour those that came out low, so the fit's own take their place
+            smooth = self._smoothed(window, item.samples, read_variance) if expected is None else expected[number]
             matrix = sampling_covariance(smooth, item.samples, radius)
             lower = cholesky(matrix + 1e-12 * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), lower=True)
             inverse = solve_triangular(lower, np.eye(len(lower)), lower=True)
@@ -212,6 +221,23 @@ class _Problem:
         kept = np.where(np.abs(window) > 4.0 * zero / math.sqrt(samples), window, 0.0)
         kept[centre, centre] = zero
         return np.asarray(kept)
+
+    def reweighted(self, model: str, sigma: float) -> "_Problem":
+        """The same problem with its weights from the covariances fitted at this width."""
+        _, coefficients, _ = self.solve(model, sigma)
+        shape = noise_autocovariance(model, sigma, self.radius)
+        centre = self.radius
+        expected = []
+        for item, signal, group in zip(self.series, self.signal, self.group, strict=True):
+            window = np.zeros_like(shape)
+            white = float(coefficients[-1])
+            if group >= 0:
+                window += signal * max(float(coefficients[group]), 0.0) * shape
+                white += signal * float(coefficients[self.groups + group])
+            measured = float(item.covariance_DN2[item.radius, item.radius])
+            window[centre, centre] = max(window[centre, centre] + white, 0.1 * measured, 1e-6)
+            expected.append(window)
+        return _Problem(self.series, self.group, self.radius, 0.0, expected)
 
     def solve(self, model: str, sigma: float) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
         """Chi-square, coefficients (A_0.., W_0.., read variance) and whitened design at this width."""
@@ -273,20 +299,25 @@ def fit_spread(
         (s.covariance_DN2[s.radius, s.radius] for s, g in zip(series, group, strict=True) if g < 0), default=0.0
     )
     problem = _Problem(series, group, radius, float(read_guess))
-    widest = 0.45 * radius
-    found: dict[str, tuple[float, float]] = {}
-    for model in models:
-        grid = np.linspace(0.0, widest, 25)
+    grid = np.linspace(0.0, 0.45 * radius, 25)
+
+    def width_of(problem: _Problem, model: str) -> tuple[float, float]:
         values = [problem.solve(model, float(sigma))[0] for sigma in grid]
         best = int(np.argmin(values))
-        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+        bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
         result = minimize_scalar(
-            lambda sigma, model=model: problem.solve(model, float(sigma))[0],
-            bounds=(low, high),
+            lambda sigma: problem.solve(model, float(sigma))[0],
+            bounds=bounds,
             method="bounded",
             options={"xatol": 1e-5},
         )
-        found[model] = (float(result.fun), float(result.x))
+        return float(result.fun), float(result.x)
+
+    for _ in range(2):
+        found = {model: width_of(problem, model) for model in models}
+        model = min(found, key=lambda name: found[name][0] + MODEL_PENALTY[name])
+        problem = problem.reweighted(model, found[model][1])
+    found = {model: width_of(problem, model) for model in models}
     model = min(found, key=lambda name: found[name][0] + MODEL_PENALTY[name])
     chi_square, sigma = found[model]
     _, coefficients, matrix = problem.solve(model, sigma)

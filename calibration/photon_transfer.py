@@ -487,11 +487,12 @@ def _dark_estimate(
     ]
     frames = sum(total.frames for item, total in darks.sums if item.exposure_ms == exposure)
     pixels = int(good.sum())
-    noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
-    sd = 1.2533 * math.sqrt(noise / max(frames, 1) / pixels)
-    # frame noise moves each pixel's mean, the median of a map of fixed spread moves far less than one pixel's share
+    noise = float(np.nanmedian(darks.variance[good])) / max(frames, 1) if darks.effective > 0 else 0.0
+    # frame noise carries pixels over the median of the map: sd^2 = E|noise| / (pixels x density at the median)
+    low, high = np.quantile(mean[good], [0.4, 0.6])
+    sd = math.sqrt(math.sqrt(2.0 * noise / math.pi) * max(float(high - low), 0.5 * math.sqrt(noise)) / 0.2 / pixels)
     if len(repeats) > 1:
-        sd = math.hypot(sd, float(np.std(repeats, ddof=1)) / math.sqrt(len(repeats)))
+        sd = max(sd, float(np.std(repeats, ddof=1)) / math.sqrt(len(repeats)))
     return estimate_from_sd(level, max(sd, 1e-9)), exposure
 
 

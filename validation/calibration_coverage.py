@@ -1,6 +1,7 @@
 """Calibration against the truth of the virtual lab: errors, and how often the stated 95 % intervals hold the truth.
 
     python validation/calibration_coverage.py [--seeds 40] [--first 0] [--size 64] [--frames 20] [--json FILE]
+        [--sessions FOLDER]
 
 Each seed is another hidden system. `z` is (answer - truth) over the interval's half width / 1.96: its spread should be
 1 where only sampling noise is at work and below 1 where the interval carries systematic uncertainty. `predicted` rows
@@ -25,10 +26,10 @@ from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.generator.predict import predict_flatfield
-from raytwin.lab.protocols import run_protocol
+from raytwin.lab.protocols import run_protocol, truth_path
 
 
-def measure_seed(seed: int, *, size: int, frames: int) -> list[dict[str, Any]]:
+def measure_seed(seed: int, *, size: int, frames: int, sessions: Path | None = None) -> list[dict[str, Any]]:
     """Rows `{quantity, seed, truth, value, low, high}` of one hidden system."""
     rows: list[dict[str, Any]] = []
 
@@ -37,8 +38,11 @@ def measure_seed(seed: int, *, size: int, frames: int) -> list[dict[str, Any]]:
             rows.append({"quantity": quantity, "seed": seed, "label": label, "truth": truth, **estimate})
 
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "session.h5"
-        truth = run_protocol(path, protocol="calibration", seed=seed, rows=size, columns=size, frames=frames)
+        path = (sessions or Path(folder)) / f"session_{seed}_{size}_{frames}.h5"
+        if truth_path(path).exists():
+            truth = json.loads(truth_path(path).read_text(encoding="utf-8"))
+        else:
+            truth = run_protocol(path, protocol="calibration", seed=seed, rows=size, columns=size, frames=frames)
         with open_acquisition(path) as acquisition:
             twin = calibrate_twin(acquisition, rng=np.random.default_rng(seed))
             validation = validate_twin(twin, acquisition)
@@ -115,12 +119,13 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--sessions", type=Path, help="folder where lab sessions are kept for the next run")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     started = time.perf_counter()
     for seed in tqdm(range(arguments.first, arguments.first + arguments.seeds), disable=None, file=sys.stderr):
-        rows += measure_seed(seed, size=arguments.size, frames=arguments.frames)
+        rows += measure_seed(seed, size=arguments.size, frames=arguments.frames, sessions=arguments.sessions)
     table = summarise(rows)
     print(
         f"{arguments.seeds} hidden systems, {arguments.size} x {arguments.size} pixels, {arguments.frames} frames a"

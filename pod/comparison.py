@@ -228,48 +228,50 @@ def _p_equivalence(middle: float, logs: Interval, edge: float) -> float | None:
     return max(1 - normal.cdf((middle + edge) / spread_low), normal.cdf((middle - edge) / spread_high))
 
 
-def _codes(table: Trials, shared: list[str]) -> list[NDArray[np.intp]]:
-    """Codes of the shared labels, as they stand in both tables."""
-    return [
-        codes
-        for codes in (table.network if "network" in shared else None, table.image if "image" in shared else None)
-        if codes is not None
-    ]
-
-
 def _correlation(
     first: Trials, second: Trials, fits: tuple[PodFit, ...], *, log_size: bool, shared: list[str], repeats: str
 ) -> float:
-    """Correlation of the two a90 by the clustered covariance of their scores, as pooled curves."""
-    gradients, spreads, influences = [], [], []
+    """Correlation of the two a90 from what they share, by the clustered spread of their difference, as pooled curves.
+
+    Each look adds to a90 what its score says; summed over both tables with opposite signs these make the difference.
+    Its variance is the largest of those clustered by network, by image and by both (one estimate alone may fall
+    short), with Student's quantile for few clusters.
+    """
+    influences, variances = [], []
     apart = repeats == "pooled"  # looks taken as independent: only a look at the same image by the same network pairs
-    for table, fit in zip((first, second), fits, strict=True):
+    for table, fit, sign in zip((first, second), fits, (-1.0, 1.0), strict=True):
         curve = fit.curve
         if curve is None:
             return 0.0
         x90 = (curve.link.eta_from_pod(0.9) - curve.coefficients[0]) / curve.coefficients[1]
         gradient = -np.array([1.0, x90]) / curve.coefficients[1]
         groups = [codes for codes in (table.network, table.image) if codes is not None and codes.max() > 0]
+        covariance = curve.covariance
         if groups and not apart:
             covariance = clustered_covariance(table, curve, groups=groups, log_size=log_size)
-        else:
-            covariance = curve.covariance
-        gradients.append(gradient)
-        spreads.append(math.sqrt(float(gradient @ covariance @ gradient)))
-        influences.append((score_rows(table, curve, log_size=log_size), bread(table, curve, log_size=log_size)))
-    if not all(spread > 0 for spread in spreads):
+        variances.append(float(gradient @ covariance @ gradient))
+        scores = score_rows(table, curve, log_size=log_size)
+        influences.append(sign * scores @ bread(table, curve, log_size=log_size) @ gradient)
+    both = _stacked(first, second, shared)
+    codes = [one for one in (both.network, both.image) if one is not None]
+    if not codes or not all(variance > 0 for variance in variances):
         return 0.0
-    left, right = _codes(first, shared), _codes(second, shared)
-    if len(left) != len(right) or not left:
-        return 0.0
-    if apart and len(left) > 1:
-        base = 1 + max(int(left[1].max()), int(right[1].max()))
-        left, right = [left[0] * base + left[1]], [right[0] * base + right[1]]
-    meat = clustered_meat(influences[0][0], influences[1][0], left, right)
-    across = influences[0][1] @ meat @ influences[1][1]
-    value = float(gradients[0] @ across @ gradients[1]) / (spreads[0] * spreads[1])
+    if apart and len(codes) > 1:
+        codes = [np.unique(codes[0] * (int(codes[1].max()) + 1) + codes[1], return_inverse=True)[1].astype(np.intp)]
+    rows = np.concatenate(influences)[:, None]
+    ways = [float(clustered_meat(rows, rows, [one])[0, 0]) for one in codes]
+    ways.append(float(clustered_meat(rows, rows, codes)[0, 0]))
+    fewest = min(int(one.max()) + 1 for one in codes)
+    difference = max(ways) * (_student_quantile(fewest - 1) / Z_TWO_SIDED) ** 2
+    value = (sum(variances) - difference) / (2 * math.sqrt(variances[0] * variances[1]))
     # what is shared moves both alike; an estimate below 0 is noise of few images or networks
     return min(max(value, 0.0), 0.99)
+
+
+def _student_quantile(degrees: int) -> float:
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(degrees, 1), 0.975))
 
 
 def _curve_test(
@@ -310,11 +312,50 @@ def _curve_test(
         return None
     statistic = 2 * (found[1] - found[0])
     kind = "likelihood ratio"
-    if repeats in ("scaled", "cluster"):
+    if repeats == "cluster":
+        return _robust_test(first, second, both, fits=fits, log_size=log_size)
+    if repeats == "scaled":
         inflation = [_inflation(fit) for fit in fits]
         statistic /= max(float(np.mean(inflation)), 1e-12)
         kind = "likelihood ratio divided by the mean inflation of the curves' variances by repeats"
     return _test(statistic, kind)
+
+
+def _robust_test(
+    first: Trials, second: Trials, both: Trials, *, fits: tuple[PodFit, ...], log_size: bool
+) -> CurveTest | None:
+    """Wald test of equal (c0, c1) with the clustered covariance of their difference, F with few clusters.
+
+    Of the covariances by network, by image and by both the one is taken that speaks least against equality.
+    """
+    from scipy.special import fdtrc
+
+    influences = []
+    for table, fit, sign in zip((first, second), fits, (-1.0, 1.0), strict=True):
+        if fit.curve is None:
+            return None
+        scores = score_rows(table, fit.curve, log_size=log_size)
+        influences.append(sign * scores @ bread(table, fit.curve, log_size=log_size))
+    rows = np.concatenate(influences)
+    codes = [one for one in (both.network, both.image) if one is not None]
+    if not codes:
+        return None
+    change = np.array([(fits[1].c0 or 0.0) - (fits[0].c0 or 0.0), (fits[1].c1 or 0.0) - (fits[0].c1 or 0.0)])
+    statistics = []
+    for groups in [[one] for one in codes] + ([codes] if len(codes) > 1 else []):
+        covariance = clustered_meat(rows, rows, groups)
+        if np.linalg.eigvalsh(covariance).min() > 0:
+            statistics.append(float(change @ np.linalg.solve(covariance, change)))
+    if not statistics:
+        return None
+    fewest = min(int(one.max()) + 1 for one in codes)
+    # Hotelling: T^2 (G - 2) / (2 (G - 1)) is F with 2 and G - 2 degrees of freedom
+    degrees = max(fewest - 2, 1)
+    value = max(min(statistics), 0.0)
+    p = float(fdtrc(2, degrees, value * degrees / (2 * (fewest - 1)))) if fewest > 2 else 1.0
+    return CurveTest(
+        statistic=value, degrees_of_freedom=2, p=p, kind=f"Wald, robust to networks and images ({fewest} clusters)"
+    )
 
 
 def _inflation(fit: PodFit) -> float:

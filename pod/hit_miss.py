@@ -1,6 +1,8 @@
 """POD from hits and misses: generalised linear model g(POD) = c0 + c1 x, x the size or its natural logarithm.
 
 Sizes: a_p = (g(p) - c0) / c1 on the scale of x, and its exponential on log size.
+Likelihood-ratio bounds are those of the ordinary likelihood, for a bias-reduced fit too: its supremum exists even where
+the data separate, and the bounds then do not depend on which estimate is shown.
 Validity: independent trials (see `crossed`, `cluster` and `scaled` in `repeats.py` for repeated looks), POD that rises
 from 0 to 1 with size (see `lapse.py` where it does not reach 1). A size outside the tested range is not given out.
 Source: MIL-HDBK-1823A (2009) appendix G; Firth, Biometrika 80 (1993) 27, doi:10.1093/biomet/80.1.27.

@@ -42,11 +42,15 @@ def notes_on_table(table: PodTable, repeats: str) -> list[str]:
     settings = set(table.other.get("setting", ()))
     if len(settings) > 1:
         notes.append(f"{len(settings)} settings in one curve; choose one with --where setting=...")
-    if repeats == "pooled" and table.site is not None and len(set(table.site)) < len(table.site):
-        notes.append(
-            f"{len(table.site)} trials of {len(set(table.site))} sites taken as independent: repeats need --repeats scaled,"
-            " cluster or crossed"
-        )
+    if repeats == "pooled":
+        for name in ("site", "image", "network"):
+            labels = getattr(table, name)
+            if labels is not None and 1 < len(set(labels)) < len(labels):
+                notes.append(
+                    f"{len(labels)} trials of {len(set(labels))} {name}s taken as independent: repeats need --repeats"
+                    " scaled, cluster or crossed"
+                )
+                break
     return notes
 
 

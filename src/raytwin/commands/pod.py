@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
         where=where_from_options(arguments.where),
     )
     result = _response(table, arguments) if arguments.response else _hit_miss(table, arguments)
-    if len(table.false_alarm):
+    if len(table.false_alarm) and "false_alarms" not in result:
         result["false_alarms"] = asdict(
             false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
         )

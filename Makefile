@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow check format clean
+.PHONY: demo test test-slow validation check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -23,6 +23,11 @@ test: $(READY) check
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 -m slow
+
+# answers against the virtual lab's truth; minutes (`--help` of each script has its options)
+validation: $(READY)
+	$(BIN)/python validation/calibration_coverage.py --seeds 40 --json build/calibration_coverage.json
+	$(BIN)/python validation/generated_against_lab.py --seeds 3 --json build/generated_against_lab.json
 
 # mypy sees the rooms as raytwin.<room> through a folder of links, without an install
 check: $(READY)

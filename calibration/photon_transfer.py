@@ -422,6 +422,13 @@ def _fit(covariances: list[NoiseCovariance], groups: list[int], usable: list[boo
 def _bent(covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], fit: SpreadFit) -> int | None:
     """Index of the brightest flat of a group if its variance lies 6 sigma and 5 % below the line through the others."""
     present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
+    # the bent flat is in the fit and moves its read variance, so that of the darks is taken where there are any
+    darks = [c for c, group in zip(covariances, groups, strict=True) if group < 0]
+    read = (
+        float(np.average([c.covariance_DN2[c.radius, c.radius] for c in darks], weights=[c.samples for c in darks]))
+        if darks
+        else fit.read_variance_DN2
+    )
     for group in present:
         members = [i for i, g in enumerate(groups) if g == group and usable[i]]
         if len(members) < 3:
@@ -431,11 +438,11 @@ def _bent(covariances: list[NoiseCovariance], groups: list[int], usable: list[bo
 
         def zero_lag(i: int) -> float:
             centre = covariances[i].radius
-            return float(covariances[i].covariance_DN2[centre, centre]) - fit.read_variance_DN2
+            return float(covariances[i].covariance_DN2[centre, centre]) - read
 
         signal = np.array([covariances[i].signal_DN for i in others])
         variance = np.array([zero_lag(i) for i in others])
-        sd = np.array([math.sqrt(2.0 / covariances[i].samples) * (zero_lag(i) + fit.read_variance_DN2) for i in others])
+        sd = np.array([math.sqrt(2.0 / covariances[i].samples) * (zero_lag(i) + read) for i in others])
         weight = signal**2 / sd**2
         ratio = variance / signal
         slope = float(np.sum(weight * ratio) / np.sum(weight))
@@ -443,7 +450,7 @@ def _bent(covariances: list[NoiseCovariance], groups: list[int], usable: list[bo
         slope_sd = math.sqrt(max(scatter, 1.0) / float(np.sum(weight)))
         item = covariances[brightest]
         measured = zero_lag(brightest) / item.signal_DN
-        measured_sd = math.sqrt(2.0 / item.samples) * (measured + fit.read_variance_DN2 / item.signal_DN)
+        measured_sd = math.sqrt(2.0 / item.samples) * (measured + read / item.signal_DN)
         if measured - slope < -6.0 * math.hypot(slope_sd, measured_sd) and measured < 0.95 * slope:
             return brightest
     return None

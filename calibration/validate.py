@@ -10,6 +10,7 @@ import numpy as np
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
+from ..files import sha256_of_file
 from ..generator.predict import predict_flatfield
 from ..generator.twin import Estimate, Twin
 from .frame_sums import effective_frames, sum_frames
@@ -116,7 +117,7 @@ def validate_twin(
         if not item.corrected
     }
     calibrated = {name for level in twin.levels for name in level.series}
-    same_session = twin.provenance.get("acquisition_sha256") is not None
+    same_session = twin.provenance.get("acquisition_sha256") == sha256_of_file(acquisition.path)
     rows, skipped = [], []
     for item in chosen:
         tell(item.name)

@@ -133,6 +133,7 @@ def main() -> int:
     )
     print_table(table)
     if arguments.json is not None:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps({"table": table, "rows": rows}, indent=1) + "\n", encoding="utf-8")
     return 0
 

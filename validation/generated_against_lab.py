@@ -258,6 +258,7 @@ def main() -> int:
     for name in ("mean_percent", *(f"covariance_{dy}{dx}_percent" for dy, dx in LAGS)):
         print(f"largest |{name}|, raytwin: {max(abs(entry[name]) for entry in ours):.2f}")
     if arguments.json is not None:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps({"table": table, "rows": rows}, indent=1) + "\n", encoding="utf-8")
     return 0
 

@@ -1,0 +1,97 @@
+"""A session of the virtual lab from calibration to validation: the twin shares no physics with what it measures."""
+
+import json
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition
+from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
+from raytwin.calibration.validate import validate_twin
+from raytwin.cli import main
+from raytwin.files import sha256_of_file
+from raytwin.generator.predict import predict_flatfield
+from raytwin.lab.protocols import run_protocol
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    path = tmp_path_factory.mktemp("lab") / "session.h5"
+    truth = run_protocol(path, protocol="calibration", seed=5, rows=48, columns=48, frames=12)
+    with open_acquisition(path) as acquisition:
+        twin = calibrate_twin(
+            acquisition, rng=np.random.default_rng(1), provenance={"acquisition_sha256": sha256_of_file(path)}
+        )
+        settings = {item.name: item.setting for item in acquisition.series}
+        validation = validate_twin(twin, acquisition)
+    return {"path": path, "truth": truth, "twin": twin, "settings": settings, "validation": validation}
+
+
+def off_by(estimate, truth):
+    """Error in standard deviations of the stated interval."""
+    return (estimate["value"] - truth) / ((estimate["high"] - estimate["low"]) / 3.92)
+
+
+def test_the_hidden_truth_lies_within_four_standard_deviations_of_every_answer(session):
+    truth, answer = session["truth"], calibration_answer(session["twin"])
+    assert abs(off_by(answer["psf_sigma_px"], truth["psf_sigma_px"])) < 4
+    assert abs(off_by(answer["read_noise_DN"], truth["read_noise_DN"])) < 4
+    dark = {entry["exposure_ms"]: entry["dark_DN"] for entry in truth["dark_DN_at"]}
+    assert abs(off_by(answer["dark_DN"], dark[session["twin"].maps.dark_exposure_ms])) < 4
+    assert abs(off_by(answer["inherent_filtration_mm_Al"], truth["inherent_filtration_mm_Al"])) < 3
+    assert abs(off_by(answer["flux_scale"], truth["flux_scale"])) < 3
+    for level in answer["levels"]:
+        exact = next(row for row in truth["levels"] if (row["kV"], row["filter"]) == (level["kV"], level["filter"]))
+        for name in ("gain_DN", "photon_transfer_slope_DN"):
+            estimate = {"value": level[name], "low": level[f"{name}_low"], "high": level[f"{name}_high"]}
+            assert abs(off_by(estimate, exact[name])) < 4
+            assert level[name] == pytest.approx(exact[name], rel=0.05)
+
+
+def test_the_lab_s_bad_pixels_are_found_and_few_others(session):
+    marked = session["twin"].maps.bad_pixels > 0
+    for pixel in session["truth"]["bad_pixels"]:
+        assert marked[pixel["row"], pixel["column"]], pixel
+    assert marked.sum() - len(session["truth"]["bad_pixels"]) <= 3
+
+
+def test_held_back_settings_are_predicted_within_their_intervals(session):
+    rows = session["validation"].rows
+    assert len(rows) == 8
+    assert all(row.role == "evaluation" and not row.used_in_calibration for row in rows)
+    assert sum(row.inside_mean for row in rows) >= 7
+    assert sum(row.inside_sd for row in rows) >= 7
+    answer = session["validation"].as_dict()
+    assert answer["median_abs_error_percent"]["mean"] < 2
+    assert answer["median_abs_error_percent"]["sd"] < 2
+    for row in rows:
+        expected = session["truth"]["series"][row.series]
+        prediction = predict_flatfield(session["twin"], session["settings"][row.series])
+        assert prediction.mean_DN.value == pytest.approx(expected["mean_DN"], rel=0.06)
+        assert prediction.gain_DN.value == pytest.approx(expected["gain_DN"], rel=0.05)
+        assert prediction.photons_absorbed.low < expected["photons_absorbed"] < prediction.photons_absorbed.high
+
+
+def test_the_spectral_posterior_names_what_flats_leave_open(session):
+    spectral = session["twin"].spectral
+    assert any(line.startswith("log_mu_Al") for line in spectral.undetermined)
+    assert session["twin"].evidence["spectrum"]["effective_draws"] > 100
+    assert spectral.calibrated_kV == (40.0, 90.0)
+
+
+def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, capsys):
+    answers = []
+    for name in ("a.h5", "b.h5"):
+        assert main(["calibrate", str(session["path"]), "-o", str(tmp_path / name), "--seed", "3", "--json"]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[0] == answers[1]
+    assert main(["validate", str(tmp_path / "a.h5"), str(session["path"]), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["coverage"]["rows"] == 8
+    words = ["predict", str(tmp_path / "a.h5"), "--kv", "60", "--filter", "Cu:0.05", "--power-w", "40"]
+    assert main([*words, "--exposure-ms", "20", "--json"]) == 0
+    predicted = json.loads(capsys.readouterr().out)
+    row = next(row for row in shown["rows"] if row["kV"] == 60 and row["exposure_ms"] == 20)
+    assert predicted["mean_DN"]["value"] == pytest.approx(row["mean_DN"]["value"])
+    # the row's interval holds the measured series' own noise too
+    assert row["mean_DN"]["high"] - row["mean_DN"]["low"] > predicted["mean_DN"]["high"] - predicted["mean_DN"]["low"]

@@ -19,7 +19,7 @@ from .crossed import fit_mixed, usable_factors
 from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, PodFit, fit_trials
 from .likelihood import Curve
 from .links import LINKS
-from .robust import bread, clustered_covariance, clustered_meat, score_rows
+from .robust import bread, clustered_covariance, clustered_meat, few_clusters_factor, score_rows
 from .solver import fit_batch
 from .trials import Trials
 
@@ -262,16 +262,11 @@ def _correlation(
     ways = [float(clustered_meat(rows, rows, [one])[0, 0]) for one in codes]
     ways.append(float(clustered_meat(rows, rows, codes)[0, 0]))
     fewest = min(int(one.max()) + 1 for one in codes)
-    difference = max(ways) * (_student_quantile(fewest - 1) / Z_TWO_SIDED) ** 2
+    # the arms of a clustered interval carry Student's quantile already
+    difference = max(ways) * (1.0 if repeats == "cluster" else few_clusters_factor(fewest))
     value = (sum(variances) - difference) / (2 * math.sqrt(variances[0] * variances[1]))
     # what is shared moves both alike; an estimate below 0 is noise of few images or networks
     return min(max(value, 0.0), 0.99)
-
-
-def _student_quantile(degrees: int) -> float:
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(degrees, 1), 0.975))
 
 
 def _curve_test(

@@ -8,7 +8,7 @@ from ..errors import InputError
 from .crossed import fit_crossed
 from .hit_miss import PodFit, fit_pooled, sizes_from_curve
 from .links import Link
-from .robust import clustered_covariance
+from .robust import clustered_covariance, few_clusters_factor
 from .trials import Trials
 
 __all__ = ["REPEATS", "fit_cluster", "fit_scaled"]
@@ -45,7 +45,8 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     """The pooled curve with intervals robust to repeats: two-way clustered by network and by image (or site).
 
     Wald bounds take the sandwich covariance, likelihood-ratio bounds divide the likelihood by the inflation of the
-    variance of eta at a90. The curve is a population-averaged one. With few clusters the intervals are too short.
+    variance of eta at a90; both with Student's quantile for the fewest clusters. The curve is a population-averaged
+    one.
     Source: Cameron, Gelbach & Miller, J. Bus. Econ. Stat. 29 (2011) 238; Chandler & Bate, Biometrika 94 (2007) 167.
 
     Raises:
@@ -67,10 +68,11 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     if not groups:
         return replace(naive, repeats="cluster", naive=naive)
     covariance = clustered_covariance(table, naive.curve, groups=groups, log_size=log_size)
-    sizes = sizes_from_curve(naive.curve, table=table, log_size=log_size, robust=covariance)
     fewest = min(int(codes.max()) + 1 for codes in groups)
+    stretch = few_clusters_factor(fewest)
+    sizes = sizes_from_curve(naive.curve, table=table, log_size=log_size, robust=covariance * stretch)
     if fewest < 20:
-        notes.append(f"only {fewest} clusters: cluster-robust intervals are too short below some 20")
+        notes.append(f"only {fewest} clusters: cluster-robust intervals may be somewhat short below some 20")
     return replace(
         naive,
         repeats="cluster",

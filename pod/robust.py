@@ -66,6 +66,13 @@ def clustered_covariance(table: Trials, curve: Curve, *, groups: list[NDArray[np
     return np.asarray(inner @ meat @ inner)
 
 
+def few_clusters_factor(clusters: int) -> float:
+    """What to multiply a clustered covariance by so that normal quantiles serve: (t / z)^2 at 97.5 %, clusters - 1."""
+    from scipy.special import stdtrit
+
+    return float((stdtrit(max(clusters - 1, 1), 0.975) / 1.959963984540054) ** 2)
+
+
 def _joined(left: list[NDArray[np.intp]], right: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     code_left, code_right = left[0], right[0]
     for next_left, next_right in zip(left[1:], right[1:], strict=True):

@@ -36,7 +36,8 @@ class DemoPlan:
     Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the paper's
     line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series; products, test_products (images
     of the two sets); exposures_ms of the fast settings; generated (training pairs an exposure); networks an exposure;
-    shared_steps (of the one network they all start from), steps (of each after that); batch; seed.
+    first_steps, shared_steps (of the one network they all start from: on the least noisy images, then on all exposures),
+    steps (of each network after that); batch; seed.
     """
 
     size: tuple[int, int] = (96, 128)
@@ -49,14 +50,15 @@ class DemoPlan:
     exposures_ms: tuple[float, ...] = (100.0, 50.0, 20.0)
     generated: int = 144
     networks: int = 3
-    shared_steps: int = 260
-    steps: int = 45
+    first_steps: int = 200
+    shared_steps: int = 60
+    steps: int = 30
     batch: int = 8
     seed: int = 1
     recipe: str = "raytwin"
 
     def __post_init__(self) -> None:
-        for name in ("products", "test_products", "generated", "networks", "shared_steps", "steps"):
+        for name in ("products", "test_products", "generated", "networks", "first_steps", "shared_steps", "steps"):
             if getattr(self, name) < 1:
                 raise InputError(name, received=getattr(self, name), expected="1 or more")
 
@@ -71,7 +73,8 @@ PAPER_PLAN = DemoPlan(
     test_products=84,
     generated=254,
     networks=100,
-    shared_steps=6000,
+    first_steps=4000,
+    shared_steps=2000,
     steps=2000,
     batch=2,
 )
@@ -215,17 +218,24 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
              "-o", at(f"published_{number}.h5")],
             outputs=[f"published_{number}.h5"],
         )  # fmt: skip
-    # networks: one shared start from the least noisy images (noisier ones teach a new network nothing for hundreds of
-    # steps), then a few for each exposure
-    _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_shared.h5")
+    # networks: one shared start, first from the least noisy images (noisier ones teach a new network nothing for hundreds of
+    # steps), then from all exposures; a few networks for each exposure after that
     common = ["--recipe", plan.recipe, "--batch", str(plan.batch), "--seed", seed]
+    _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_clear.h5")
+    _mix(chain, [f"train_{exposure:g}ms.h5" for exposure in plan.exposures_ms], "train_mixed.h5")
+    first = chain.step(
+        "train_first",
+        ["train", at("train_clear.h5"), "-o", at("runs_first"), *common, "--networks", "1",
+         "--steps", str(plan.first_steps)],
+        outputs=["runs_first"],
+    )  # fmt: skip
     shared = chain.step(
         "train_shared",
-        ["train", at("train_shared.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
-         "--steps", str(plan.shared_steps)],
+        ["train", at("train_mixed.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
+         "--steps", str(plan.shared_steps), "--start-from", at("runs_first")],
         outputs=["runs_shared"],
     )  # fmt: skip
-    training: dict[str, Any] = {"shared": shared}
+    training: dict[str, Any] = {"first": first, "shared": shared}
     detection: dict[str, Any] = {}
     pod: dict[str, Any] = {}
     compared: dict[str, Any] = {}

@@ -20,6 +20,7 @@ from .figures import (
 )
 
 _DASH = "&ndash;"
+_SHARED_NAMES = {"first": "1 s and the longest exposure (first)", "shared": "all exposures (shared start)"}
 
 
 def write_report(result: Mapping[str, Any], directory: Path, *, version: str) -> Path:
@@ -205,7 +206,7 @@ def _network_rows(training: Mapping[str, Any], hits: Mapping[str, list[dict[str,
             alarms = [int(row["false_alarm"]) for row in own if row["contrast"] == "" and row["false_alarm"] != ""]
             rows.append(
                 {
-                    "name": "all exposures (shared start)" if name == "shared" else name.replace("ms", " ms"),
+                    "name": _SHARED_NAMES.get(name) or name.replace("ms", " ms"),
                     "network": str(network["network"]),
                     "epoch": str(network["best_epoch"]),
                     "hit_rate": _percent(network["validation_hit_rate"]),
@@ -223,7 +224,7 @@ def _limits(result: Mapping[str, Any]) -> list[str]:
         f"{plan['networks']} networks on {plan['test_products']} images give wide intervals; the paper trained 100 and tested on 82."
         " <code>raytwin demo --paper-size</code> does that, in days on a CPU.",
         "The lab's base system has no scatter, lag, glare or drift: the twin is not tested here against effects it does not model.",
-        f"Products are {plan['size'][0]} x {plan['size'][1]} pixels of {plan['pixel_mm']} mm with the photon numbers per pixel of the"
-        " paper's line; a contrast here is that of this pixel size.",
-        "The networks start from one network trained on all exposures, so they are less independent than networks from scratch.",
+        f"Products are {plan['size'][0]} x {plan['size'][1]} pixels of {plan['pixel_mm']} mm, three times coarser than the paper's, with"
+        " the detector nearer than a line of its photon numbers would have it: the contrasts are not those of the paper's line.",
+        "The networks of all exposures start from one shared network, so they are less independent than networks from scratch.",
     ]

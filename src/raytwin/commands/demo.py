@@ -27,7 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--test-products", type=int, help="images to test on")
     parser.add_argument("--generated", type=int, help="training pairs generated for each exposure")
     parser.add_argument("--networks", type=int, help="networks for each exposure")
-    parser.add_argument("--shared-steps", type=int, help="training steps of the network that all start from")
+    parser.add_argument(
+        "--first-steps", type=int, help="training steps of the shared network on the least noisy images"
+    )
+    parser.add_argument("--shared-steps", type=int, help="its further steps on all exposures")
     parser.add_argument("--steps", type=int, help="training steps of each network after that")
     parser.add_argument("--batch", type=int, help="images a step")
     parser.add_argument("--seed", type=int, help="seed of everything (default 1)")
@@ -52,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
             "test_products",
             "generated",
             "networks",
+            "first_steps",
             "shared_steps",
             "steps",
             "batch",

@@ -33,11 +33,11 @@ HIGH = Setting(kV=90, power_W=45, exposure_ms=100, averaged=10, filters=_FILTERS
 class DemoPlan:
     """How large the demo is.
 
-    Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the paper's
-    line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series; products, test_products (images
-    of the two sets); exposures_ms of the fast settings; generated (training pairs an exposure); networks an exposure;
-    first_steps, shared_steps (of the one network they all start from: on the least noisy images, then on all exposures),
-    steps (of each network after that); batch; seed.
+    Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the
+    paper's line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series;
+    products, test_products (images of the two sets); exposures_ms of the fast settings; generated (training pairs an
+    exposure); networks an exposure; first_steps, shared_steps (of the one network they all start from: on the least noisy
+    images, then on all exposures), steps (of each network after that); batch; seed.
     """
 
     size: tuple[int, int] = (96, 128)

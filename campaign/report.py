@@ -224,7 +224,7 @@ def _limits(result: Mapping[str, Any]) -> list[str]:
         f"{plan['networks']} networks on {plan['test_products']} images give wide intervals; the paper trained 100 and tested on 82."
         " <code>raytwin demo --paper-size</code> does that, in days on a CPU.",
         "The lab's base system has no scatter, lag, glare or drift: the twin is not tested here against effects it does not model.",
-        f"Products are {plan['size'][0]} x {plan['size'][1]} pixels of {plan['pixel_mm']} mm, coarser than the"
-        " paper's, with the detector nearer than a line of its photon numbers would have it: the contrasts are not those of the paper's line.",
+        f"Products are {plan['size'][0]} x {plan['size'][1]} pixels of {plan['pixel_mm']} mm, coarser than the paper's,"
+        " with the detector nearer than its photon numbers would have it: the contrasts are not those of the paper's line.",
         "The networks of all exposures start from one shared network, so they are less independent than networks from scratch.",
     ]

@@ -1,1 +1,101 @@
-"""raytwin.calibration"""
+"""From measured darks and flats to a twin: frame sums, photon transfer, optical spread, spectral posterior, validation.
+
+Names are loaded when they are first asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .calibrate import (
+        calibrate_twin,
+        calibration_answer,
+    )
+    from .frame_sums import (
+        FrameSums,
+        effective_frames,
+        merge_frame_sums,
+        sum_frames,
+    )
+    from .noise_covariance import (
+        NoiseCovariance,
+        SpreadFit,
+        compute_noise_covariance,
+        fit_spread,
+        sampling_covariance,
+    )
+    from .photon_transfer import (
+        PhotonTransfer,
+        SeriesPoint,
+        compute_photon_transfer,
+    )
+    from .priors import (
+        PRIORS,
+        Prior,
+    )
+    from .spectral_fit import (
+        SpectralFit,
+        fit_spectrum,
+        geometry_factor,
+    )
+    from .validate import (
+        Validation,
+        ValidationRow,
+        validate_twin,
+    )
+
+_LAZY = {
+    "FrameSums": "frame_sums",
+    "NoiseCovariance": "noise_covariance",
+    "PRIORS": "priors",
+    "PhotonTransfer": "photon_transfer",
+    "Prior": "priors",
+    "SeriesPoint": "photon_transfer",
+    "SpectralFit": "spectral_fit",
+    "SpreadFit": "noise_covariance",
+    "Validation": "validate",
+    "ValidationRow": "validate",
+    "calibrate_twin": "calibrate",
+    "calibration_answer": "calibrate",
+    "compute_noise_covariance": "noise_covariance",
+    "compute_photon_transfer": "photon_transfer",
+    "effective_frames": "frame_sums",
+    "fit_spectrum": "spectral_fit",
+    "fit_spread": "noise_covariance",
+    "geometry_factor": "spectral_fit",
+    "merge_frame_sums": "frame_sums",
+    "sampling_covariance": "noise_covariance",
+    "sum_frames": "frame_sums",
+    "validate_twin": "validate",
+}
+
+__all__ = [
+    "PRIORS",
+    "FrameSums",
+    "NoiseCovariance",
+    "PhotonTransfer",
+    "Prior",
+    "SeriesPoint",
+    "SpectralFit",
+    "SpreadFit",
+    "Validation",
+    "ValidationRow",
+    "calibrate_twin",
+    "calibration_answer",
+    "compute_noise_covariance",
+    "compute_photon_transfer",
+    "effective_frames",
+    "fit_spectrum",
+    "fit_spread",
+    "geometry_factor",
+    "merge_frame_sums",
+    "sampling_covariance",
+    "sum_frames",
+    "validate_twin",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_LAZY[name]}", __name__), name)

@@ -57,7 +57,7 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
     def pod_at(p: Array) -> Array:
         return averaged_pod(p[0] + p[1] * x, math.hypot(*p[2:]), link=link)
 
-    pod = pod_at(parameters)
+    pod = np.clip(pod_at(parameters), 1e-300, 1 - 1e-15)
     odds = np.log(pod) - np.log1p(-pod)
     rise = []
     for index, value in enumerate(parameters):

@@ -342,7 +342,8 @@ def size_in_range(
     low, high = (math.exp(smallest), math.exp(largest)) if log_size else (smallest, largest)
     margin = 1e-9 * (largest - smallest)
     if not x <= largest + margin:
-        beyond = f" (the curve would reach it at {size_from_x(x, log_size=log_size):.4g})" if math.isfinite(x) else ""
+        far = size_from_x(x, log_size=log_size)
+        beyond = "" if far is None else f" (the curve would reach it at {far:.4g})"
         return None, f"POD does not reach {percent} % up to the largest size tested, {high:.4g}{beyond}: no a{percent}"
     if x < smallest - margin:
         return (

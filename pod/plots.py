@@ -154,7 +154,8 @@ def plot_comparison(
     left.axhline(0.9, color=_GREY, lw=0.6, ls=":")
     left.set_ylim(-0.03, 1.03)
     _finish(left, size_label, "probability of detection", log=comparison.first.log_size)
-    left.legend(frameon=False, fontsize=8)
+    if left.get_legend_handles_labels()[1]:
+        left.legend(frameon=False, fontsize=8)
     margin = comparison.margin
     right.axhspan(1 / (1 + margin), 1 + margin, color="#dfe7ef", zorder=0)
     right.axhline(1, color=_GREY, lw=0.7)

@@ -226,6 +226,14 @@ def test_a_curve_that_does_not_reach_90_percent_has_no_a90():
     assert any("does not reach 90 %" in note for note in fit.warnings)
 
 
+def test_a_curve_that_is_all_but_flat_on_log_size_says_so_without_a_number():
+    # at a slope near 0 the size where POD would be 90 % is beyond any number
+    size = np.array([0.1, 0.1, 0.2, 0.2, 0.4, 0.4, 0.8, 0.8])
+    fit = fit_pod(size, [0, 1, 0, 1, 0, 1, 1, 0], log_size=True)
+    assert fit.a90 is None
+    assert fit.warnings
+
+
 def test_a_falling_curve_has_no_sizes():
     size, hit = drawn(11)
     fit = fit_pod(size, 1 - hit)

@@ -194,7 +194,7 @@ def _p(value: float | None) -> str:
 
 def _further_lines(result: dict[str, Any]) -> list[str]:
     lines = []
-    if "lapse" in result:
+    if result.get("lapse"):
         lapse = result["lapse"]
         words = [
             f"{name} {shown(lapse[name]['value'])} ({shown(lapse[name]['low'])} to {shown(lapse[name]['high'])})"
@@ -204,13 +204,13 @@ def _further_lines(result: dict[str, Any]) -> list[str]:
             f"with {' and '.join(words)}: a90 {shown(lapse['a90'])}, a90/95 {shown(lapse['a90_95'])};"
             f" p that 0 and 1 are enough: {_p(lapse['p_plain'])}"
         )
-    if "bootstrap" in result:
+    if result.get("bootstrap"):
         boot = result["bootstrap"]
         lines.append(
             f"bootstrap by {boot['by']}, {boot['replicates']} refits: a90/95 {shown(boot['a90_95'])}, two-sided"
             f" {shown(boot['a90_low'])} to {shown(boot['a90_high'])}; without a90: {100 * boot['unknown']:.3g} %"
         )
-    if "covariates" in result:
+    if result.get("covariates"):
         fit = result["covariates"]
         for one in fit["coefficients"]:
             scale = "ln " if one["log"] else ""
@@ -220,7 +220,7 @@ def _further_lines(result: dict[str, Any]) -> list[str]:
             f"  at {at}: a90 {shown(fit['a90'])}, a90/95 {shown(fit['a90_95']['likelihood_ratio'])} (likelihood ratio),"
             f" {shown(fit['a90_95']['wald'])} (Wald)"
         )
-    if "explanation" in result:
+    if result.get("explanation"):
         lines.append(f"{'property':<22}{'gain/trial':>11}{'behind':>10}{'+-':>9}{'area':>8}{'a90':>10}{'p beyond':>10}")
         for one in result["explanation"]:
             name = ("ln " if one["log"] else "") + one["name"] + ("" if one["rising"] else " (falling)")

@@ -7,17 +7,19 @@ trust below some 400). Rows with an empty size are products without foreign obje
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import FitError, InputError
 from ..files import whole_file
 from ..pod import (
     PodFit,
     PodTable,
+    Trials,
     bootstrap_pod,
     compare_models,
     compute_roc,
@@ -144,20 +146,21 @@ def _hit_miss(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
     result["warnings"] = [*notes_on_table(table, repeats), *fit.warnings]
     trials = trials_from_table(table, log_size=arguments.log_size)
     result["alternatives"] = [asdict(one) for one in compare_models(trials)]
+    extras: dict[str, Callable[[], Any]] = {}
     if arguments.ceiling or arguments.floor:
-        lapse = fit_lapse_pod(
-            trials, link=arguments.link, log_size=arguments.log_size, ceiling=arguments.ceiling, floor=arguments.floor
-        )
-        result["lapse"] = asdict(lapse)
-        if repeats != "pooled":
-            result["warnings"].append("ceiling and floor take all looks as independent: their intervals are too narrow")
-        result["warnings"] += [f"with ceiling or floor: {note}" for note in lapse.warnings]
+        extras["lapse"] = lambda: _lapse(trials, arguments, repeats, result)
     if arguments.bootstrap is not None:
-        result["bootstrap"] = _bootstrap(table, arguments)
+        extras["bootstrap"] = lambda: _bootstrap(table, arguments)
     if arguments.covariate:
-        result["covariates"] = _covariates(table, arguments, result)
+        extras["covariates"] = lambda: _covariates(table, arguments, result)
     if arguments.explain:
-        result["explanation"] = _explanation(table, arguments, repeats)
+        extras["explanation"] = lambda: _explanation(table, arguments, repeats)
+    for name, make in extras.items():
+        try:
+            result[name] = make()
+        except FitError as error:  # the curve stands; what cannot be added to it is null with its reason
+            result[name] = None
+            result["warnings"].append(f"no {name}: {error}")
     if arguments.as_published:
         result["as_published"] = asdict(fit_as_published(trials))
     if arguments.export:
@@ -166,6 +169,16 @@ def _hit_miss(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.plots:
         result["plots"] = _plots(fit, table, arguments)
     return result
+
+
+def _lapse(trials: Trials, arguments: argparse.Namespace, repeats: str, result: dict[str, Any]) -> dict[str, Any]:
+    fit = fit_lapse_pod(
+        trials, link=arguments.link, log_size=arguments.log_size, ceiling=arguments.ceiling, floor=arguments.floor
+    )
+    if repeats != "pooled":
+        result["warnings"].append("ceiling and floor take all looks as independent: their intervals are too narrow")
+    result["warnings"] += [f"with ceiling or floor: {note}" for note in fit.warnings]
+    return asdict(fit)
 
 
 def _bootstrap(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:

@@ -42,6 +42,9 @@ Codes = NDArray[np.intp]
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(61)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 _ZERO_SD = 1e-3  # a standard deviation (of eta) below it is reported and treated as 0
+LARGEST_SD = (
+    8.0  # on the link's scale: beyond it a level is all hits or all misses and its spread has no finite estimate
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,9 +139,9 @@ def fit_mixed(
         value = deviance(best)
         reduced = second_differences(lambda p: deviance(_filled(best, free, p)), best[free])
         covariance = np.zeros((len(best), len(best)))
-        covariance[np.ix_(free, free)] = 2 * np.linalg.inv(reduced)
+        covariance[np.ix_(free, free)] = 2 * _inverse(reduced)
     else:
-        covariance = np.asarray(2 * np.linalg.inv(hessian))
+        covariance = 2 * _inverse(hessian)
     if not converged:
         raise FitError("the fit with crossed random effects did not converge; use --repeats cluster")
     back = np.eye(len(best))
@@ -154,6 +157,20 @@ def fit_mixed(
         deviance=value,
         converged=converged,
     )
+
+
+def _inverse(hessian: Array) -> Array:
+    """Inverse of the curvature at a maximum.
+
+    Raises:
+        FitError: the likelihood is flat in some direction there: nothing fixes the spreads.
+    """
+    try:
+        return np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise FitError(
+            "the data do not fix the spread between networks and images (the likelihood is flat); use --repeats cluster"
+        ) from None
 
 
 def _filled(whole: Array, free: NDArray[np.bool_], part: Array) -> Array:
@@ -316,7 +333,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             notes.append(
                 f"only {levels} {name}s: the spread between {name}s is poorly known and the bounds are too low"
             )
-        if value > 8:
+        if value > LARGEST_SD:
             notes.append(
                 f"the spread between {name}s is so large that {name}s are all hits or all misses; mind the fit"
             )

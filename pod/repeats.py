@@ -5,13 +5,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from ..errors import InputError
-from .crossed import fit_crossed
+from .crossed import LARGEST_SD, fit_crossed
 from .hit_miss import PodFit, fit_pooled, sizes_from_curve
 from .links import Link
 from .robust import clustered_covariance, few_clusters_factor
 from .trials import Trials
 
-__all__ = ["REPEATS", "fit_cluster", "fit_scaled"]
+__all__ = ["REPEATS", "fit_cluster", "fit_crossed_where_finite", "fit_scaled"]
 
 
 def fit_scaled(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
@@ -86,9 +86,40 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     )
 
 
+def fit_crossed_where_finite(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
+    """Crossed random effects; where a spread has no finite estimate, the clustered curve instead, and said so.
+
+    When every network hits or misses the same images, the likelihood rises with the images' spread without end. The
+    averaged curve is then that of the assumed Gaussian's far tails rather than of the data, and its a90 lies far beyond the
+    sizes at which anything is missed; the pooled curve is population-averaged without such an assumption.
+
+    Raises:
+        InputError: neither network nor image is known.
+        FitError: the search did not converge.
+    """
+    fit = fit_crossed(table, link=link, log_size=log_size, method=method)
+    if fit.crossed is None:
+        return fit
+    spreads = {"network": fit.crossed.sd_network, "image": fit.crossed.sd_image}
+    endless = [name for name, sd in spreads.items() if sd is not None and sd > LARGEST_SD]
+    if not endless:
+        return fit
+    clustered = fit_cluster(table, link=link, log_size=log_size, method=method)
+    which = " and ".join(f"{name}s" for name in endless)
+    return replace(
+        clustered,
+        crossed=replace(fit.crossed, a50_conditional=None, a90_conditional=None),
+        warnings=(
+            f"the spread between {which} has no finite estimate ({which} are all hits or all misses): curve and bounds are the"
+            " clustered ones (repeats cluster)",
+            *clustered.warnings,
+        ),
+    )
+
+
 REPEATS: dict[str, Callable[..., PodFit]] = {
     "pooled": fit_pooled,
-    "crossed": fit_crossed,
+    "crossed": fit_crossed_where_finite,
     "scaled": fit_scaled,
     "cluster": fit_cluster,
 }

@@ -102,6 +102,15 @@ def compare_pod(
         for table in (first, second)
     )
     notes = [f"{name}: {note}" for name, fit in zip(("first", "second"), fits, strict=True) for note in fit.warnings]
+    if repeats == "crossed" and any(fit.repeats == "cluster" for fit in fits):
+        # a spread without finite estimate in one table: both are treated alike, and so is the test of the curves
+        repeats = "cluster"
+        fits = tuple(
+            fit
+            if fit.repeats == "cluster"
+            else fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
+            for table, fit in zip((first, second), fits, strict=True)
+        )
     pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
     paired = " and ".join(pairs) or "nothing"
     correlation = 0.0

@@ -288,3 +288,19 @@ def test_false_alarms_that_come_by_image_count_less():
     assert found.high > false_alarm_rate(alarm).high + 0.1
     with pytest.raises(InputError, match="false_alarm"):
         false_alarm_rate([0, 2])
+
+
+def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> None:
+    """With identical networks the images' spread has no finite estimate: the a90 stays where misses end, and it is said."""
+    rng = np.random.default_rng(5)
+    size = np.sort(rng.uniform(0.02, 0.15, 70))
+    seen = rng.random(70) < -np.expm1(-np.exp(-3.0 + 60.0 * size))
+    network = np.repeat(np.arange(3), 70)
+    image = np.tile(np.arange(70), 3)
+    fit = fit_pod(np.tile(size, 3), np.tile(seen, 3), repeats="crossed", network=network, image=image)
+    once = fit_pod(size, seen)
+    assert fit.repeats == "cluster"
+    assert any("no finite estimate" in note for note in fit.warnings)
+    assert fit.a90 == pytest.approx(once.a90, rel=1e-6)
+    assert fit.a90_95.wald is not None and once.a90_95.wald is not None
+    assert fit.a90_95.wald >= 0.9 * once.a90_95.wald

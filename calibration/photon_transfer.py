@@ -22,7 +22,8 @@ from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covarian
 COVARIANCE_FRAMES = 400
 _COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
 _FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16))
-_DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot or noisy
+_DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
+_NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 Progress = Callable[[str], None]
 
@@ -169,8 +170,11 @@ def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDA
         hot = np.abs(local - centre) > np.maximum(limit, own)
         code[hot & (code == 0)] = BAD_PIXEL_CODES["hot"]
     if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
-        centre = float(np.median(darks.variance))
-        limit = centre * (1.0 + _DARK_NOISE_SIGMAS * math.sqrt(2.0 / darks.effective)) + 1.0
+        # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
+        from scipy.stats import chi2
+
+        centre = float(np.median(darks.variance)) * darks.effective / float(chi2.median(darks.effective))
+        limit = centre * float(chi2.isf(_NOISY_CHANCE, darks.effective)) / darks.effective + 1.0
         code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.at(brightest[0].exposure_ms)

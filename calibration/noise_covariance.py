@@ -19,6 +19,7 @@ from .frame_sums import effective_frames
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
 # quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
 WHITE_FRACTION_PRIOR = (0.003, 0.03)
+POOR_FIT = 2.0  # chi-square a degree of freedom above which a Gaussian spread is not believed
 # In chi-square: light collected in square pixels is what detectors do, so quanta counted first must fit clearly better.
 MODEL_PENALTY = {"aperture": 0.0, "sampled": 4.0}
 
@@ -158,7 +159,8 @@ class SpreadFit:
     Fields: model (`aperture`, `sampled`); sigma_px, sigma_sd_px; gain_DN (group,): quantum and signal-following white
     variance per signal with the spread's share restored; gain_sd_DN; slope_DN (group,): variance of one pixel per
     signal; slope_sd_DN; white_fraction (group,): the white part over the quantum part; read_variance_DN2, read_sd_DN2;
-    chi_square, degrees: of the fit; chi_square_other: the same of the other description of the spread.
+    chi_square, degrees: of the fit; chi_square_other: the same of the other description of the spread; summed: gains and
+    slopes are sums of covariances, because no Gaussian fits.
     """
 
     model: str
@@ -175,6 +177,7 @@ class SpreadFit:
     degrees: int
     chi_square_other: float
     sigma_other_px: float
+    summed: bool = False
 
 
 class _Problem:
@@ -269,6 +272,42 @@ class _Problem:
         return float(residual @ residual), np.asarray(coefficients, dtype=np.float64), matrix
 
 
+def _summed_gains(
+    series: Sequence[NoiseCovariance],
+    group: Sequence[int],
+    *,
+    groups: int,
+    reach: int,
+    read_variance_DN2: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Gains and slopes with their standard deviations (group,), DN, from covariances summed up to lag `reach`.
+
+    gain = (sum over lags of C - r^2) / signal, whatever the spread's shape; slope = (C(0) - r^2) / signal. Series of a
+    group are weighted by their precision.
+    """
+    information = np.zeros((2, groups))
+    estimate = np.zeros((2, groups))
+    for item, number in zip(series, group, strict=True):
+        if number < 0:
+            continue
+        cut = item.radius - reach
+        edge = item.covariance_DN2.shape[0] - cut
+        window = item.covariance_DN2[cut:edge, cut:edge]
+        matrix = sampling_covariance(window, item.samples, reach)
+        # half plane: every lag but 0 counts twice
+        twice = np.full(len(matrix), 2.0)
+        twice[0] = 1.0
+        for kind, (value, variance) in enumerate(
+            ((float(window.sum()), float(twice @ matrix @ twice)), (float(window[reach, reach]), float(matrix[0, 0])))
+        ):
+            weight = item.signal_DN**2 / max(variance, 1e-300)
+            information[kind, number] += weight
+            estimate[kind, number] += weight * (value - read_variance_DN2) / item.signal_DN
+    estimate = estimate / information
+    sd = 1.0 / np.sqrt(information)
+    return estimate[0], sd[0], estimate[1], sd[1]
+
+
 def fit_spread(
     series: Sequence[NoiseCovariance],
     *,
@@ -281,6 +320,9 @@ def fit_spread(
     rho is the autocovariance of unit quanta after the spread (sums to 1), so gain_g = A_g + W_g and the slope of a
     photon-transfer line is A_g rho(0) + W_g. Both descriptions of the spread are tried; `sampled` is kept where it is
     better by more than `MODEL_PENALTY`, and where the data leave it open the standard deviations cover both.
+
+    Where no Gaussian describes the covariances (chi-square above `POOR_FIT` a degree of freedom), gains and slopes come from
+    the covariances themselves, summed over neighbours, and only the width from the fit.
 
     Args:
         series: covariances, darks included (signal 0).
@@ -361,14 +403,23 @@ def fit_spread(
         _, others, _ = problem.solve(other, found[other][1])
         moved = others[:groups] + others[groups : 2 * groups] - quantum - white
         gain_sd = [math.hypot(sd, math.sqrt(weight) * float(step)) for sd, step in zip(gain_sd, moved, strict=True)]
+    gain, slope = quantum + white, quantum * share + white
+    gain_spread, slope_spread = np.array(gain_sd), np.array(slope_sd)
+    summed = degrees > 0 and chi_square / degrees > POOR_FIT
+    if summed:
+        reach = min(radius, math.ceil(3.0 * math.sqrt(2.0) * sigma) + 1)
+        gain, gain_spread, slope, slope_spread = _summed_gains(
+            series, group, groups=groups, reach=reach, read_variance_DN2=float(coefficients[-1])
+        )
     return SpreadFit(
         model=model,
         sigma_px=sigma,
         sigma_sd_px=sigma_sd,
-        gain_DN=quantum + white,
-        gain_sd_DN=np.array(gain_sd),
-        slope_DN=quantum * share + white,
-        slope_sd_DN=np.array(slope_sd),
+        gain_DN=gain,
+        gain_sd_DN=gain_spread,
+        slope_DN=slope,
+        slope_sd_DN=slope_spread,
+        summed=summed,
         white_fraction=white / np.where(quantum > 0, quantum, np.nan),
         read_variance_DN2=float(coefficients[-1]),
         read_sd_DN2=math.sqrt(max(float(covariance[2 * groups, 2 * groups]), 0.0)),

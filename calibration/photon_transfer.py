@@ -725,7 +725,7 @@ def _evidence(
     if fit.degrees > 0 and fit.chi_square / fit.degrees > 2.0:
         warnings.append(
             f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f}"
-            " per degree of freedom); intervals are widened by its root"
+            " per degree of freedom); gains are sums of covariances, and the images generated from this twin have a Gaussian spread"
         )
     dark_levels = [
         {

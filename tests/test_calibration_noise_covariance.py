@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import correlate1d
 
 from raytwin.calibration.noise_covariance import (
+    POOR_FIT,
     compute_noise_covariance,
     fit_spread,
     sampling_covariance,
@@ -164,3 +166,27 @@ def test_stated_standard_deviations_are_those_of_repetition():
 def test_darks_alone_cannot_give_a_gain():
     with pytest.raises(FitError, match="at least one flat series"):
         fit_spread([covariance_of(0.0)], group=[-1])
+
+
+def test_a_spread_that_is_no_gaussian_still_gives_the_gain() -> None:
+    """A three-pixel kernel with heavy corners: the fit says so, and the summed covariances restore the gain."""
+    rng = np.random.default_rng(4)
+    kernel = np.array([0.2, 0.6, 0.2])
+    series, groups = [], []
+    for signal in (500.0, 2000.0):
+        quanta = 3.0 * rng.poisson(signal / 3.0, (60, 134, 134))
+        frames = correlate1d(correlate1d(quanta.astype(float), kernel, axis=1), kernel, axis=2)[:, 3:-3, 3:-3]
+        frames = frames + 5.0 * rng.standard_normal(frames.shape)
+        good = np.ones((128, 128), dtype=bool)
+        series.append(compute_noise_covariance([frames], signal_DN=np.full((128, 128), signal), good=good, radius=5))
+        groups.append(0)
+    dark = 5.0 * rng.standard_normal((60, 128, 128))
+    series.append(compute_noise_covariance([dark], signal_DN=np.zeros((128, 128)), good=good, radius=5))
+    groups.append(-1)
+    fit = fit_spread(series, group=groups)
+    assert fit.summed
+    assert fit.chi_square / fit.degrees > POOR_FIT
+    # 2 x 655 k independent samples: the sum over 49 lags is known to about 0.5 %
+    assert fit.gain_DN[0] == pytest.approx(3.0, rel=0.015)
+    assert abs(fit.gain_DN[0] - 3.0) < 4 * fit.gain_sd_DN[0]
+    assert fit.slope_DN[0] == pytest.approx(3.0 * float((kernel @ kernel) ** 2), rel=0.01)

@@ -1,0 +1,200 @@
+"""Tungsten spectra measured at PTB against the tube model with one fitted parameter, and what they cannot tell apart.
+
+    python validation/ptb_spectra.py FOLDER [--json FILE]
+
+FOLDER holds W_20kV.dat ... W_45kV.dat (Ketelhut and Bueermann, PTB, CC BY 4.0: germanium detector, 4 mm Be, 30 degrees,
+1 m of air). The model is SpekPy's casim behind 4 mm Be and 1 m of air and one parameter more. It is fitted on two
+tube voltages, every pair in turn, by least squares of the roots of the shapes above 13 keV (so that a bin weighs by its
+photons); the other three say how well it does: total variation, half the sum of |model - measured| of the two shapes.
+
+Two parameters fitted together have the correlation -cos(angle between their derivatives of those roots), taken where
+tungsten alone fits best. Beyond 0.95 each is more than three times as uncertain as if the other were known: the data
+know a combination of the two and not which it is.
+"""
+
+import argparse
+import itertools
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize_scalar
+
+from raytwin.acquisition.setting import Filter
+from raytwin.spectra import Spectrum, spectrum_from_file, tube_spectrum
+
+VOLTAGES_KV = (20, 25, 30, 35, 45)
+ABOVE_KEV = 13.0
+DECLARED = (Filter(material="Be", thickness_mm=4.0), Filter(material="air", thickness_mm=1000.0))
+ANODE_ANGLE_DEG = 30.0
+REFERENCE_KEV = 50.0
+BOUND_TOGETHER = 0.95
+
+# name -> (size of a step, lowest, highest)
+PARAMETERS: dict[str, tuple[float, float, float]] = {
+    "tungsten_um": (1.0, 0.0, 20.0),
+    "aluminium_mm": (0.1, 0.0, 5.0),
+    "beryllium_mm": (10.0, 0.0, 100.0),
+    "hardness_exponent": (0.4, -2.0, 2.0),
+    "kV_error_percent": (1.0, -5.0, 5.0),
+}
+_LAYERS = {"tungsten_um": ("W", 1e-3), "aluminium_mm": ("Al", 1.0), "beryllium_mm": ("Be", 1.0)}
+
+
+def shape(spectrum: Spectrum) -> NDArray[np.float64]:
+    """Share of the photons above 13 keV in each bin (bin,)."""
+    fluence = spectrum.fluence[spectrum.energies_keV > ABOVE_KEV]
+    return np.asarray(fluence / fluence.sum())
+
+
+def modelled_shape(
+    measured: Spectrum, parameters: dict[str, float], *, anode_angle_deg: float = ANODE_ANGLE_DEG
+) -> NDArray[np.float64]:
+    """Shape of the model at the measured spectrum's kV, on its bins."""
+    if measured.kV is None:
+        raise ValueError("the file does not state its tube voltage")
+    layers = tuple(
+        Filter(material=material, thickness_mm=scale * parameters[name])
+        for name, (material, scale) in _LAYERS.items()
+        if parameters.get(name, 0.0) > 0
+    )
+    model = tube_spectrum(
+        kV=measured.kV * (1.0 + 0.01 * parameters.get("kV_error_percent", 0.0)),
+        anode_angle_deg=anode_angle_deg,
+        filters=(*DECLARED, *layers),
+        energies_keV=measured.energies_keV,
+    )
+    tilt = (model.energies_keV / REFERENCE_KEV) ** parameters.get("hardness_exponent", 0.0)
+    photons = (model.fluence * tilt)[model.energies_keV > ABOVE_KEV]
+    return np.asarray(photons / photons.sum())
+
+
+def total_variation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Half the sum of differences of two shapes: the share of photons that would have to move."""
+    return 0.5 * float(np.sum(np.abs(first - second)))
+
+
+def fit_one(name: str, spectra: list[Spectrum]) -> float:
+    """The value of one parameter that brings the roots of the shapes closest."""
+    step, low, high = PARAMETERS[name]
+    roots = np.concatenate([np.sqrt(shape(spectrum)) for spectrum in spectra])
+
+    def misfit(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        model = [modelled_shape(spectrum, {name: float(x[0]) * step}) for spectrum in spectra]
+        return np.asarray(np.sqrt(np.concatenate(model)) - roots)
+
+    answer = least_squares(misfit, [0.3], bounds=([low / step], [high / step]), diff_step=1e-3)
+    return float(answer.x[0]) * step
+
+
+def fit_angle(spectra: list[Spectrum]) -> float:
+    """The effective anode angle, degrees, to a tenth: self-absorption is steep towards small angles."""
+
+    def misfit(angle: float) -> float:
+        angle = round(angle, 1)
+        return sum(
+            float(np.sum((np.sqrt(modelled_shape(s, {}, anode_angle_deg=angle)) - np.sqrt(shape(s))) ** 2))
+            for s in spectra
+        )
+
+    return round(float(minimize_scalar(misfit, bounds=(3.0, 30.0), method="bounded", options={"xatol": 0.1}).x), 1)
+
+
+def derivatives(spectra: list[Spectrum], at: dict[str, float]) -> dict[str, NDArray[np.float64]]:
+    """Derivative of the roots of all shapes by each parameter, in any unit of it."""
+    found = {}
+    for name, (step, low, _) in PARAMETERS.items():
+        here = at.get(name, 0.0)
+        below, above = max(low, here - 0.05 * step), here + 0.05 * step
+        sides = [
+            np.sqrt(np.concatenate([modelled_shape(spectrum, {**at, name: value}) for spectrum in spectra]))
+            for value in (below, above)
+        ]
+        found[name] = np.asarray((sides[1] - sides[0]) / ((above - below) / step))
+    smaller, declared = (
+        np.sqrt(np.concatenate([modelled_shape(spectrum, at, anode_angle_deg=angle) for spectrum in spectra]))
+        for angle in (ANODE_ANGLE_DEG - 2.0, ANODE_ANGLE_DEG)
+    )
+    found["anode_angle_deg"] = np.asarray(declared - smaller)
+    return found
+
+
+def correlations(columns: dict[str, NDArray[np.float64]]) -> dict[tuple[str, str], float]:
+    """Correlation of each two parameters in a fit of the two."""
+    unit = {name: column / np.linalg.norm(column) for name, column in columns.items()}
+    return {(a, b): -float(unit[a] @ unit[b]) for a, b in itertools.combinations(unit, 2)}
+
+
+def compare(measured: dict[int, Spectrum]) -> dict[str, Any]:
+    """Shape errors of every parameter over every pair of fitted voltages, and the correlations."""
+    rows: dict[str, Any] = {
+        "none": {"error_each_kV": {kV: total_variation(modelled_shape(s, {}), shape(s)) for kV, s in measured.items()}}
+    }
+    names = (*PARAMETERS, "anode_angle_deg")
+    for name in names:
+        values, errors = [], []
+        # an effective angle takes new tube spectra at every trial: three pairs are enough to see what it does
+        pairs = list(itertools.combinations(measured, 2))
+        for pair in pairs if name in PARAMETERS else [(20, 45), (25, 45), (30, 45)]:
+            fitted_on = [measured[kV] for kV in pair]
+            others = [spectrum for kV, spectrum in measured.items() if kV not in pair]
+            if name in PARAMETERS:
+                value = fit_one(name, fitted_on)
+                models = [modelled_shape(spectrum, {name: value}) for spectrum in others]
+            else:
+                value = fit_angle(fitted_on)
+                models = [modelled_shape(spectrum, {}, anode_angle_deg=value) for spectrum in others]
+            values.append(value)
+            errors.append(np.mean([total_variation(model, shape(s)) for model, s in zip(models, others, strict=True)]))
+        rows[name] = {
+            "pairs": len(values),
+            "value": [float(np.min(values)), float(np.median(values)), float(np.max(values))],
+            "error_other_kV": {"median": float(np.median(errors)), "worst": float(np.max(errors))},
+        }
+    spectra = list(measured.values())
+    found = correlations(derivatives(spectra, {"tungsten_um": fit_one("tungsten_um", spectra)}))
+    return {
+        "rows": rows,
+        "correlation": {f"{a} and {b}": value for (a, b), value in found.items()},
+        "not_told_apart": [f"{a} and {b}" for (a, b), value in found.items() if abs(value) > BOUND_TOGETHER],
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "folder", type=Path, help="folder with W_20kV.dat, W_25kV.dat, W_30kV.dat, W_35kV.dat, W_45kV.dat"
+    )
+    parser.add_argument("--json", type=Path, help="also write the answer here")
+    arguments = parser.parse_args()
+    files = {kV: arguments.folder / f"W_{kV}kV.dat" for kV in VOLTAGES_KV}
+    missing = [path.name for path in files.values() if not path.is_file()]
+    if missing:
+        print(f"skipped: {', '.join(missing)} not in {arguments.folder}", file=sys.stderr)
+        return 0
+    answer = compare({kV: spectrum_from_file(path) for kV, path in files.items()})
+    rows = answer["rows"]
+    bare = rows["none"]["error_each_kV"]
+    print("nothing fitted: " + ", ".join(f"{kV} kV {error:.3f}" for kV, error in bare.items()))
+    for name, row in rows.items():
+        if name != "none":
+            low, middle, high = row["value"]
+            error = row["error_other_kV"]
+            print(
+                f"{name:18s} {middle:8.3g} ({low:.3g} to {high:.3g} over {row['pairs']} pairs), error at the other kV: "
+                f"median {error['median']:.4f}, worst pair {error['worst']:.4f}"
+            )
+    print("correlation when two are fitted together:")
+    for pair, value in answer["correlation"].items():
+        print(f"  {pair}: {value:+.3f}" + ("   known only together" if pair in answer["not_told_apart"] else ""))
+    if arguments.json is not None:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        arguments.json.write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,4 +1,5 @@
-"""The forward model: the twin and its file, optical spread, noise, top-up of references, prediction of flatfields.
+"""The forward model: the twin and its file, optical spread, noise, top-up of references, prediction of flatfields
+and of the contrast of foreign objects.
 
 Names are loaded when they are first asked for.
 """
@@ -10,6 +11,14 @@ if TYPE_CHECKING:
     from .as_published import (
         published_parameters,
         sample_as_published,
+    )
+    from .contrast import (
+        Contrast,
+        ContrastChannel,
+        UncalibratedLine,
+        compute_contrast_map,
+        predict_contrast,
+        published_delta_r,
     )
     from .generate import (
         GenerationSummary,
@@ -64,6 +73,8 @@ if TYPE_CHECKING:
 _LAZY = {
     "BAD_PIXEL_CODES": "twin",
     "BeamSignal": "spectral_signal",
+    "Contrast": "contrast",
+    "ContrastChannel": "contrast",
     "DetectorMaps": "twin",
     "Estimate": "twin",
     "GenerationSummary": "generate",
@@ -76,8 +87,10 @@ _LAZY = {
     "SpectralPosterior": "twin",
     "TopUp": "topup",
     "Twin": "twin",
+    "UncalibratedLine": "contrast",
     "apply_top_up": "topup",
     "blur_variance_share": "psf",
+    "compute_contrast_map": "contrast",
     "digitise": "noise",
     "estimate_from_sd": "twin",
     "frame_sd_DN": "noise",
@@ -87,8 +100,10 @@ _LAZY = {
     "noise_kernel_1d": "psf",
     "optical_kernel_1d": "psf",
     "plan_top_up": "topup",
+    "predict_contrast": "contrast",
     "predict_flatfield": "predict",
     "predict_flatfields": "predict",
+    "published_delta_r": "contrast",
     "published_parameters": "as_published",
     "read_twin": "twin_io",
     "sample_as_published": "as_published",
@@ -103,6 +118,8 @@ __all__ = [
     "BAD_PIXEL_CODES",
     "PSF_MODELS",
     "BeamSignal",
+    "Contrast",
+    "ContrastChannel",
     "DetectorMaps",
     "Estimate",
     "GenerationSummary",
@@ -114,8 +131,10 @@ __all__ = [
     "SpectralPosterior",
     "TopUp",
     "Twin",
+    "UncalibratedLine",
     "apply_top_up",
     "blur_variance_share",
+    "compute_contrast_map",
     "digitise",
     "estimate_from_sd",
     "frame_sd_DN",
@@ -125,8 +144,10 @@ __all__ = [
     "noise_kernel_1d",
     "optical_kernel_1d",
     "plan_top_up",
+    "predict_contrast",
     "predict_flatfield",
     "predict_flatfields",
+    "published_delta_r",
     "published_parameters",
     "read_twin",
     "sample_as_published",

@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "spectrum": ("spectrum", "tube spectrum behind filters"),
     "mu": ("mu", "effective attenuation of a material"),
     "calibrate": ("calibrate", "measured flat and dark series -> calibrated twin"),
+    "contrast": ("contrast", "contrast of a foreign object in a product, and maps of it"),
     "predict": ("predict", "flatfield at a setting, measured or not"),
     "validate": ("validate", "predictions against measured flats"),
     "generate": ("generate", "dual-energy images at a setting, from reference images"),

@@ -77,7 +77,7 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
     Raises:
         InputError: no frame at all, frames of different shapes, NaN or infinite values.
     """
-    from ._kernels import accumulate
+    from ._kernels import COUNT_BLOCK, accumulate, accumulate_counts
 
     frames = pairs = maximum_count = 0
     maximum_DN = -np.inf
@@ -106,15 +106,26 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
                 [flat[0].astype(np.float64)] + [np.zeros(flat.shape[1]) for _ in range(3)] + [np.zeros(flat.shape[1])]
             )
         reference, deviation, square, pair, last = sums
-        accumulate(flat, last, frames > 0, reference, deviation, square, pair)
-        pairs += flat.shape[0] - (1 if frames == 0 else 0)
-        frames += flat.shape[0]
-        frame_means.append(flat.mean(axis=1, dtype=np.float64))
-        highest = float(flat.max())
+        count, pixels = flat.shape
+        if flat.dtype in (np.uint8, np.uint16):
+            blocks = -(-pixels // COUNT_BLOCK)
+            totals = np.empty((blocks, count), np.int64)
+            tops, times = np.empty(blocks, np.int64), np.empty(blocks, np.int64)
+            accumulate_counts(flat, last, frames > 0, reference, deviation, square, pair, totals, tops, times)
+            frame_means.append(totals.sum(axis=0) / pixels)
+            highest = float(tops.max())
+            equal = int(times[tops == tops.max()].sum())
+        else:
+            accumulate(flat, last, frames > 0, reference, deviation, square, pair)
+            frame_means.append(flat.mean(axis=1, dtype=np.float64))
+            highest = float(flat.max())
+            equal = int(np.count_nonzero(flat == highest)) if highest >= maximum_DN else 0
+        pairs += count - (1 if frames == 0 else 0)
+        frames += count
         if highest > maximum_DN:
             maximum_DN, maximum_count = highest, 0
         if highest == maximum_DN:
-            maximum_count += int(np.count_nonzero(flat == highest))
+            maximum_count += equal
     if not sums:
         raise InputError(name, received="no frames", expected="at least one frame")
     reference, deviation, square, pair, _ = (array.reshape(shape) for array in sums)

@@ -125,3 +125,29 @@ def test_frames_that_cannot_be_summed_are_refused(pieces, message):
 def test_parts_of_different_shapes_do_not_merge():
     with pytest.raises(InputError, match="parts with frames of one shape"):
         merge_frame_sums(sum_frames([np.ones((2, 3, 3))]), sum_frames([np.ones((2, 3, 4))]))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_counts_have_the_sums_of_the_same_frames_as_float_over_blocks_and_pieces(dtype):
+    """2500 pixels: two whole blocks of the compiled loop and a part of one; the highest value is met on purpose."""
+    highest = np.iinfo(dtype).max
+    frames = np.random.default_rng(4).integers(0, highest, size=(40, 50, 50), endpoint=True).astype(dtype)
+    frames[3, 0, :5] = frames[30, 49, 7] = highest
+    counts = sum_frames(in_pieces(frames, [1, 17]))
+    floats = sum_frames(in_pieces(frames.astype(np.float64), [1, 17]))
+    for name in ("frames", "pairs", "maximum_DN", "maximum_count", "integer"):
+        assert getattr(counts, name) == getattr(floats, name), name
+    for name in ("reference", "deviation_sum", "square_sum", "pair_square_sum"):
+        assert np.array_equal(getattr(counts, name), getattr(floats, name)), name  # whole numbers: exact in both
+    assert counts.frame_mean_DN == pytest.approx(floats.frame_mean_DN, rel=1e-12)
+    assert counts.maximum_count == np.sum(frames == highest)
+
+
+def test_counts_after_floats_keep_the_reference_of_the_floats():
+    frames = np.random.default_rng(5).integers(0, 4000, size=(9, 4, 6))
+    offset = frames + 0.25
+    mixed = sum_frames([offset[:3], frames[3:].astype(np.uint16)])
+    exact = np.concatenate([offset[:3], frames[3:].astype(np.float64)])
+    assert mixed.stack_variance_DN2 == pytest.approx(exact.var(axis=0, ddof=1), rel=1e-12)
+    assert mixed.pair_variance_DN2 == pytest.approx(np.mean(np.diff(exact, axis=0) ** 2, axis=0) / 2, rel=1e-12)
+    assert not mixed.integer

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.contrast import PRODUCT_THRESHOLD, dilations_for_pixel
-from ..acquisition.setting import Filter, Setting
+from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from ..materials import TABLES, Library, material_from_name, mu_per_mm, transmission
 from ..spectra import (
@@ -27,6 +27,9 @@ from ..spectra import (
     DEFAULT_ANODE,
     DEFAULT_MODEL,
     DEFAULT_SCINTILLATOR,
+    MAXIMUM_KV,
+    MAXIMUM_KV_OF_ANODE,
+    MINIMUM_KV,
     detector_response,
     energy_grid_keV,
     tube_fluence_interpolated,
@@ -39,6 +42,9 @@ from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
 FloatArray = NDArray[np.float64]
 
 MAXIMUM_OBJECT_PIXELS = 1_000_000
+MAXIMUM_SPREAD_PX = 50.0
+# a wider ring adds no noise worth its computation
+_WIDEST_RING_PX = 500
 # above this relative noise of a pixel's signal, -ln is no longer straight over the noise
 _FEW_PHOTONS = 0.3
 
@@ -77,6 +83,10 @@ class UncalibratedLine:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(name, received=f"{value}{unit}", expected=f"a finite value of 0{unit} or more")
+        if self.psf_sigma_px > MAXIMUM_SPREAD_PX:
+            raise InputError(
+                "psf_sigma_px", received=f"{self.psf_sigma_px:g} px", expected=f"at most {MAXIMUM_SPREAD_PX:g} px"
+            )
         if not 0 < self.swank <= 1:
             raise InputError("swank", received=self.swank, expected="a Swank factor above 0, at most 1")
         if self.psf_model not in PSF_MODELS:
@@ -216,6 +226,13 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         raise InputError(
             "setting", received=str(setting), expected="a tube load", remedy="give power_w=... or current_ma=..."
         )
+    highest_kV = MAXIMUM_KV_OF_ANODE.get(line.anode, MAXIMUM_KV)
+    if not MINIMUM_KV <= setting.kV <= highest_kV:
+        raise InputError(
+            "kV",
+            received=f"{setting.kV:g} kV",
+            expected=f"{MINIMUM_KV:g} to {highest_kV:g} kV, where the {line.anode} spectra are known",
+        )
     energies = energy_grid_keV(setting.kV)
     fluence = tube_fluence_interpolated(
         setting.kV, energies_keV=energies, anode=line.anode, anode_angle_deg=line.anode_angle_deg, model=line.model
@@ -238,6 +255,10 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
             return rate, np.array([np.sum(second * through)]) / rate / line.swank
 
     rate, gain = signal(np.ones_like(energies))
+    bare = line.output_scale * float(np.sum(fluence * response.mean_deposited_keV)) * (BIN_WIDTH_KEV / 100.0)
+    # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
+    if not rate[0] > 1e-30 * bare:
+        raise InputError("filter", received=text_from_filters(layers), expected="layers that let some photons through")
     distance = setting.source_detector_mm or line.source_detector_mm
     return _Beam(
         signal=signal,
@@ -319,6 +340,13 @@ def _slabs(
     quantum, white, spreads = [], [], []
     for share, ratio in zip(rates[:2], noises[:2], strict=True):
         signal = beam.open_signal_DN * float(share)
+        if not 1e-30 < signal < 1e30:
+            raise InputError(
+                "setting",
+                received=f"{signal:.3g} DN behind product and object at {setting.kV:g} kV",
+                expected="a signal that a detector could hold",
+                remedy="check tube load, distance, pixel pitch and output",
+            )
         total = beam.open_gain_DN * float(ratio) / signal  # variance of M before the spread: gain S / S^2
         quantum.append(total / (1.0 + spread.white_fraction) / setting.averaged)
         white.append(
@@ -378,7 +406,7 @@ def published_delta_r(
 
 def disc_and_ring(pixels: int, dilations: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Masks (row, column) of a disc of exactly `pixels` pixels, and of the ring around it that Delta R is taken over."""
-    from scipy.ndimage import binary_dilation, generate_binary_structure
+    from scipy.ndimage import distance_transform_cdt
 
     reach = math.ceil(math.sqrt(pixels / math.pi)) + 2
     position = np.arange(-reach - dilations, reach + dilations + 1)
@@ -386,8 +414,9 @@ def disc_and_ring(pixels: int, dilations: int) -> tuple[NDArray[np.bool_], NDArr
     nearest = np.zeros(distance.size, dtype=bool)
     nearest[np.argsort(distance, axis=None, kind="stable")[:pixels]] = True
     disc = nearest.reshape(distance.shape)
-    grown = binary_dilation(disc, structure=generate_binary_structure(2, 1), iterations=dilations)
-    return disc, grown & ~disc
+    # as many dilations with the cross of four neighbours as steps along rows and columns
+    steps = distance_transform_cdt(~disc, metric="taxicab")
+    return disc, (steps > 0) & (steps <= dilations)
 
 
 def _variance_of_difference(
@@ -569,7 +598,7 @@ def _contrasts(
 ) -> tuple[tuple[Contrast, ...], ...]:
     _checked_slabs(product, foreign_object, displaces, object_pixels)
     spread = _spread_of(line)
-    masks = disc_and_ring(object_pixels, dilations_for_pixel(spread.pixel_mm))
+    masks = disc_and_ring(object_pixels, min(dilations_for_pixel(spread.pixel_mm), _WIDEST_RING_PX))
     known: dict[tuple[Setting, str], _Slabs] = {}
     beams: dict[Setting, _Beam] = {}
 

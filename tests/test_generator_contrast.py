@@ -168,6 +168,17 @@ def test_blur_correlates_so_many_pixels_help_less_than_their_number():
     assert sharp.sd_pixel < sharp.sd_object < 1.01 * sharp.sd_pixel  # the ring's share
 
 
+@pytest.mark.parametrize("pixels", [1, 2, 30, 500])
+def test_the_ring_is_that_of_the_definition_of_contrast(pixels):
+    from scipy.ndimage import binary_dilation, generate_binary_structure
+
+    disc, ring = disc_and_ring(pixels, 21)
+    assert disc.sum() == pixels
+    expected = binary_dilation(disc, structure=generate_binary_structure(2, 1), iterations=21) & ~disc
+    np.testing.assert_array_equal(ring, expected)
+    assert not (disc | ring)[[0, -1]].any()
+
+
 def test_a_map_holds_what_single_predictions_say():
     pairs = [[(replace(LOW, kV=kV), replace(HIGH, kV=other)) for other in (80.0, 90.0)] for kV in (40.0, 50.0)]
     grid = compute_contrast_map(LINE, pairs, object_pixels=40, **SLABS)
@@ -207,12 +218,22 @@ def test_what_has_no_contrast_is_refused():
     refused("at most the product's 20 mm", foreign_object=filter_from_text("Al:21"), displaces=True)
     refused("object pixels: got 0", object_pixels=0)
     refused("let some photons through at 40 kV", foreign_object=filter_from_text("Pb:50"))
+    refused("10 to 300 kV", high=replace(HIGH, kV=900.0))
+    refused("layers that let some photons through", line=UncalibratedLine(inherent=(filter_from_text("Pb:100"),)))
+    refused("a signal that a detector could hold", line=UncalibratedLine(output_scale=1e-60))
     refused("a twin without spectral part", line=hand_made_twin(spectral=None))
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("swank", 0.0), ("swank", 1.2), ("output_scale", math.nan), ("pixel_mm", 0.0), ("read_noise_keV", -1.0)],
+    [
+        ("swank", 0.0),
+        ("swank", 1.2),
+        ("output_scale", math.nan),
+        ("pixel_mm", 0.0),
+        ("psf_sigma_px", 1e9),
+        ("read_noise_keV", -1.0),
+    ],
 )
 def test_an_impossible_line_is_refused(field, value):
     with pytest.raises(InputError, match=field):

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation check format clean
+.PHONY: demo test test-slow validation benchmark check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -28,6 +28,12 @@ test-slow: $(READY)
 validation: $(READY)
 	$(BIN)/python validation/calibration_coverage.py --seeds 40 --json build/calibration_coverage.json
 	$(BIN)/python validation/generated_against_lab.py --seeds 3 --json build/generated_against_lab.json
+
+# speed and memory as this machine has them, each against its reference in the same run
+benchmark: $(READY)
+	$(BIN)/python benchmarks/predict_settings.py
+	$(BIN)/python benchmarks/frame_sums.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/pod_bootstrap.py
 
 # mypy sees the rooms as raytwin.<room> through a folder of links, without an install
 check: $(READY)

@@ -202,6 +202,33 @@ class SpectralModel:
         top = photons.shape[1]
         if through is not None:
             photons = photons * through[:top]
+        return self._signal_of_photons(samples, photons)
+
+    def signal_of_stacks(
+        self, parameters: NDArray[np.float64], *, kV: float, stacks: Sequence[Sequence[Filter]]
+    ) -> BeamSignal:
+        """Rate, gain and photons (stack,) behind many filter stacks at one kV, for one parameter set (parameter,).
+
+        The same numbers as `signal` gives one by one; the tube's part is made once.
+        """
+        photons = self.weights(parameters[None, :], OpenBeam(kV=kV, filters=()))
+        top = photons.shape[1]
+        layers = {layer: row for row, layer in enumerate(dict.fromkeys(layer for one in stacks for layer in one))}
+        if layers:
+            crossed = np.zeros((len(stacks), len(layers)))
+            for row, stack in enumerate(stacks):
+                for layer in stack:
+                    name = attenuation_scale_name(layer.material)
+                    scale = np.exp(parameters[self._index[name]]) if name in self._index else 1.0
+                    crossed[row, layers[layer]] += scale
+            photons = photons * np.exp(-crossed @ np.array([self.depth(layer)[:top] for layer in layers]))
+        else:
+            photons = np.repeat(photons, len(stacks), axis=0)
+        return self._signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
+
+    def _signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
+        """What photons (draw, energy) give, with the scintillator and gains of samples (draw, parameter)."""
+        top = photons.shape[1]
         log_thickness = self._column(samples, "log_scintillator_thickness")
         first = _sum_interpolated(_LOG_THICKNESS, self._first[:, :top], log_thickness, photons)
         second = _sum_interpolated(_LOG_THICKNESS, self._second[:, :top], log_thickness, photons)
@@ -241,9 +268,11 @@ def _sum_interpolated(
 ) -> NDArray[np.float64]:
     """sum over energy of weight (draw, energy) times `table` interpolated at `at` (draw,)."""
     below, share = _brackets(nodes, at)
-    every = weight @ table.T
+    lowest = int(below.min())
+    every = weight @ table[lowest : int(below.max()) + 2].T  # the nodes in use: draws lie close together
     rows = np.arange(len(at))
-    return np.asarray(every[rows, below] * (1.0 - share) + every[rows, below + 1] * share)
+    column = below - lowest
+    return np.asarray(every[rows, column] * (1.0 - share) + every[rows, column + 1] * share)
 
 
 def gain_behind_object(

@@ -37,6 +37,10 @@ if TYPE_CHECKING:
         slope_share,
         spectral_model_of,
     )
+    from .predict_many import (
+        Levels,
+        predict_levels,
+    )
     from .psf import (
         PSF_MODELS,
         blur_variance_share,
@@ -79,6 +83,7 @@ _LAZY = {
     "Estimate": "twin",
     "GenerationSummary": "generate",
     "Level": "twin",
+    "Levels": "predict_many",
     "NoiseModel": "twin",
     "OpenBeam": "spectral_signal",
     "PSF_MODELS": "psf",
@@ -103,6 +108,7 @@ _LAZY = {
     "predict_contrast": "contrast",
     "predict_flatfield": "predict",
     "predict_flatfields": "predict",
+    "predict_levels": "predict_many",
     "published_delta_r": "contrast",
     "published_parameters": "as_published",
     "read_twin": "twin_io",
@@ -124,6 +130,7 @@ __all__ = [
     "Estimate",
     "GenerationSummary",
     "Level",
+    "Levels",
     "NoiseModel",
     "OpenBeam",
     "Prediction",
@@ -147,6 +154,7 @@ __all__ = [
     "predict_contrast",
     "predict_flatfield",
     "predict_flatfields",
+    "predict_levels",
     "published_delta_r",
     "published_parameters",
     "read_twin",

@@ -30,7 +30,13 @@ def _elements_of_formula(formula: str, *, name: str) -> dict[str, float]:
         counts = xraydb.chemparse(formula)
         masses = {element: count * xraydb.atomic_mass(element) for element, count in counts.items()}
         heaviest = max(xraydb.atomic_number(element) for element in counts)
-    except Exception:
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+    ):  # all that xraydb raises on names it cannot read
         masses, heaviest = {}, 0
     if not masses or heaviest > _HIGHEST_Z:
         known = sorted(_compositions())

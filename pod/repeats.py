@@ -108,7 +108,6 @@ def fit_crossed_where_finite(table: Trials, *, link: Link, log_size: bool, metho
     which = " and ".join(f"{name}s" for name in endless)
     return replace(
         clustered,
-        crossed=replace(fit.crossed, a50_conditional=None, a90_conditional=None),
         warnings=(
             f"the spread between {which} has no finite estimate ({which} are all hits or all misses): curve and bounds are the"
             " clustered ones (repeats cluster)",

@@ -304,3 +304,19 @@ def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> N
     assert fit.a90 == pytest.approx(once.a90, rel=1e-6)
     assert fit.a90_95.wald is not None and once.a90_95.wald is not None
     assert fit.a90_95.wald >= 0.9 * once.a90_95.wald
+
+
+def test_the_band_of_a_clustered_fall_back_follows_the_clustered_curve() -> None:
+    """Its POD rises through 90 % at its a90, and the band holds it."""
+    rng = np.random.default_rng(5)
+    size = np.sort(rng.uniform(0.02, 0.15, 70))
+    seen = rng.random(70) < -np.expm1(-np.exp(-3.0 + 60.0 * size))
+    network, image = np.repeat(np.arange(3), 70), np.tile(np.arange(70), 3)
+    fit = fit_pod(np.tile(size, 3), np.tile(seen, 3), repeats="crossed", network=network, image=image)
+    assert fit.repeats == "cluster"
+    assert fit.crossed is None
+    assert fit.a90 is not None
+    pod, low, high = curve_with_band(fit, np.array([0.5 * fit.a90, fit.a90, 1.2 * fit.a90]))
+    assert pod[1] == pytest.approx(0.9, abs=1e-6)
+    assert np.all(np.diff(pod) > 0)
+    assert np.all((low <= pod) & (pod <= high))

@@ -97,6 +97,13 @@ def _assumed(arguments: argparse.Namespace) -> AssumedCurve:
             expected="a pilot with an a50 and an a90",
             remedy="give --a50 and --a90",
         )
+    if fit.repeats == "cluster" and arguments.networks > 1:
+        raise InputError(
+            "--pilot",
+            received=f"{arguments.pilot}, where every network hits or misses the same images, and --networks {arguments.networks}",
+            expected="a pilot whose networks differ, or one network",
+            remedy="plan with --networks 1: such networks add nothing to each other",
+        )
     crossed = fit.crossed
     return AssumedCurve(
         a50=fit.a50,

@@ -24,7 +24,8 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
 
     Likelihood-ratio band, each size for itself or (`simultaneous`) the whole curve at once, from the joint region. With
     crossed random effects the population-averaged curve, its band by the delta method on the link's scale (two degrees
-    of freedom where simultaneous). For `cluster` the pooled curve, the band widened by the inflation of its variance.
+    of freedom where simultaneous). For `cluster` the pooled curve, the band widened by the inflation of its variance
+    and by Student's quantile, as its bounds are.
 
     Args:
         fit: a fit that has a curve.
@@ -45,7 +46,7 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
             from dataclasses import replace
 
             inflation = max(fit.se0**2 / curve.covariance[0, 0], fit.se1**2 / curve.covariance[1, 1])
-            curve = replace(curve, divisor=curve.divisor * float(inflation))
+            curve = replace(curve, divisor=curve.divisor * float(inflation) * fit.few_clusters)
         low, high = eta_band(curve, x.ravel(), quantile=quantile)
         eta = curve.coefficients[0] + curve.coefficients[1] * x
         ends = (link.pod_from_eta(np.asarray(np.clip(end, -1e3, 1e3))).reshape(x.shape) for end in (low, high))

@@ -72,7 +72,8 @@ class PodFit:
     a90_95: one-sided 95 % upper bound on a90. a90_95_two_sided: upper end of the two-sided 95 % interval;
     a90_low_two_sided: its lower end. c0, c1 with se0, se1: coefficients per unit of size (of ln size if `log_size`).
     deviance: against the saturated model of the rows as given. `curve`: what bands and plots need (None where no fit).
-    `naive`: the same fit with the repeats ignored, beside a fit that heeds them.
+    `naive`: the same fit with the repeats ignored, beside a fit that heeds them. few_clusters: what the clustered bounds'
+    variance was multiplied by for Student's quantile.
     """
 
     link: str
@@ -101,6 +102,7 @@ class PodFit:
     warnings: tuple[str, ...] = ()
     curve: Curve | None = field(default=None, repr=False)
     crossed: CrossedEffects | None = None
+    few_clusters: float = 1.0
     naive: "PodFit | None" = field(default=None, repr=False)
 
 

@@ -81,6 +81,7 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
         a90_95=sizes.one_sided,
         a90_95_two_sided=sizes.two_sided,
         a90_low_two_sided=sizes.low,
+        few_clusters=stretch,
         warnings=tuple(dict.fromkeys((*notes, *sizes.warnings))),
         naive=naive,
     )

@@ -12,8 +12,11 @@ from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..files import sha256_of_file
 from ..generator.predict import predict_flatfield
+from ..generator.psf import noise_autocovariance_1d
 from ..generator.twin import Estimate, Twin
 from .frame_sums import effective_frames, sum_frames
+
+_LAGS = 24  # px; farther neighbours share no light
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,6 +114,8 @@ def validate_twin(
             remedy="validate against flats of the same detector",
         )
     good = twin.maps.bad_pixels == 0
+    axis = noise_autocovariance_1d(twin.noise.psf_model, twin.noise.psf_sigma_px.value, _LAGS) ** 2
+    squared_correlations = float((axis[0] + 2.0 * axis[1:].sum()) / axis[0]) ** 2
     darks = {
         item.exposure_ms: sum_frames(item.iter_frames(), name=f"series {item.name}").mean_DN
         for item in acquisition.of_kind("dark")
@@ -152,7 +157,12 @@ def validate_twin(
         # quantum noise is correlated: the mean over pixels carries gain, not slope
         spread = predicted.gain_DN.value * mean / item.averaged + twin.noise.read_variance_DN2 / item.averaged
         mean_sd = math.sqrt(max(spread, variance) / total.frames / pixels) * 1.2533
-        noise_sd = math.sqrt(variance) * math.sqrt(0.5 / (effective_frames(total.frames) * pixels) * 4.0)
+        # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
+        quantum = (
+            min(max(1.0 - twin.noise.read_variance_DN2 / item.averaged / variance, 0.0), 1.0) if variance > 0 else 0.0
+        )
+        shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
+        noise_sd = math.sqrt(0.5 * variance * shared / (effective_frames(total.frames) * pixels))
         rows.append(
             ValidationRow(
                 series=item.name,

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         Levels,
         predict_levels,
     )
+    from .projection import project_polychromatic
     from .psf import (
         PSF_MODELS,
         blur_variance_share,
@@ -109,6 +110,7 @@ _LAZY = {
     "predict_flatfield": "predict",
     "predict_flatfields": "predict",
     "predict_levels": "predict_many",
+    "project_polychromatic": "projection",
     "published_delta_r": "contrast",
     "published_parameters": "as_published",
     "read_twin": "twin_io",
@@ -155,6 +157,7 @@ __all__ = [
     "predict_flatfield",
     "predict_flatfields",
     "predict_levels",
+    "project_polychromatic",
     "published_delta_r",
     "published_parameters",
     "read_twin",

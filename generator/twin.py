@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
+from .effects.effect import AppliedEffect
 
 # reason codes of bad pixels; a pixel carries the first that applies
 BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5}
@@ -123,7 +124,9 @@ class SpectralPosterior:
 
     Fields: names (parameters, units in the names); samples (draw, parameter); best (parameter,): the most probable set;
     prior: name -> text; undetermined: directions that the data leave as wide as the prior, in words; anode,
-    anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model.
+    anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model; alternative:
+    the scintillator of draws that have another one (where nobody declared it); level_discrepancy, gain_discrepancy: relative
+    sd of a single level and gain beyond the parameters.
     """
 
     names: tuple[str, ...]
@@ -142,6 +145,7 @@ class SpectralPosterior:
     gain_discrepancy: float
     calibrated_kV: tuple[float, float]
     calibrated_filters: tuple[str, ...]
+    alternative: tuple[Filter, ...] = ()
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Draws of one parameter (draw,)."""
@@ -155,7 +159,7 @@ class SpectralPosterior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Twin:
-    """A calibrated line."""
+    """A calibrated line; `effects` are those beyond the base model that it is known to have."""
 
     instrument: Instrument
     maps: DetectorMaps
@@ -166,6 +170,7 @@ class Twin:
     evidence: Mapping[str, Any]
     warnings: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    effects: tuple[AppliedEffect, ...] = ()
 
     def level_at(self, setting: Setting) -> Level | None:
         """The measured level of this kV and these filters (same layers in any order), or None."""

@@ -12,6 +12,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import filters_from_text, text_from_filters
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
+from .effects import AppliedEffect, in_order
 from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
 
 FORMAT = "raytwin-twin"
@@ -52,6 +53,19 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
         file.attrs["provenance"] = json.dumps(dict(twin.provenance))
         file.attrs["evidence"] = json.dumps(dict(twin.evidence))
         file.attrs["warnings"] = json.dumps(list(twin.warnings))
+        if twin.effects:
+            in_order(twin.effects)  # refuses what could not be read back
+            file.attrs["effects"] = json.dumps(
+                [
+                    {
+                        "id": item.id,
+                        "parameters": dict(item.parameters),
+                        "since": item.since,
+                        "options": dict(item.options),
+                    }
+                    for item in twin.effects
+                ]
+            )
         instrument = file.create_group("instrument")
         for entry in fields(Instrument):
             value = getattr(twin.instrument, entry.name)
@@ -93,7 +107,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
             spectral.attrs["undetermined"] = json.dumps(list(posterior.undetermined))
             for name in ("anode", "anode_angle_deg", "model", "counting", "level_discrepancy", "gain_discrepancy"):
                 spectral.attrs[name] = getattr(posterior, name)
-            for name in ("inherent", "scintillator", "cover"):
+            for name in ("inherent", "scintillator", "alternative", "cover"):
                 spectral.attrs[name] = text_from_filters(getattr(posterior, name))
             spectral.attrs["calibrated_kV"] = np.array(posterior.calibrated_kV)
             spectral.attrs["calibrated_filters"] = json.dumps(list(posterior.calibrated_filters))
@@ -193,6 +207,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             model=_text(attributes["model"]),
             inherent=filters_from_text(_text(attributes["inherent"])),
             scintillator=filters_from_text(_text(attributes["scintillator"])),
+            alternative=filters_from_text(_text(attributes.get("alternative", ""))),
             cover=filters_from_text(_text(attributes["cover"])),
             counting=bool(attributes["counting"]),
             level_discrepancy=float(attributes["level_discrepancy"]),
@@ -223,7 +238,22 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         evidence=json.loads(_text(file.attrs["evidence"])),
         warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
         provenance=json.loads(_text(file.attrs["provenance"])),
+        effects=_effects_from_text(_text(file.attrs["effects"])) if "effects" in file.attrs else (),
     )
+
+
+def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:
+    effects = tuple(
+        AppliedEffect(
+            id=str(item["id"]),
+            parameters={str(name): float(value) for name, value in item["parameters"].items()},
+            since=str(item["since"]),
+            options={str(name): str(value) for name, value in item.get("options", {}).items()},
+        )
+        for item in json.loads(text)
+    )
+    in_order(effects)  # names the effects and parameters that it does not know
+    return effects
 
 
 def _optional_float(group: Any, name: str) -> float | None:

@@ -47,6 +47,12 @@ def rooms_on_disk():
     }
 
 
+def subpackages_on_disk():
+    """Folders of a room that are packages themselves: `generator/effects` -> `raytwin.generator.effects`."""
+    folders = [path.parent.relative_to(ROOT) for room in rooms_on_disk() for path in ROOT.glob(f"{room}/*/__init__.py")]
+    return {"raytwin." + ".".join(folder.parts): folder.as_posix() for folder in folders}
+
+
 def python_files():
     for room in sorted(rooms_on_disk()):
         yield from ((room, path) for path in sorted((ROOT / room).rglob("*.py")))
@@ -108,10 +114,10 @@ def test_packages_on_disk_and_in_pyproject_agree():
     setuptools = project()["tool"]["setuptools"]
     listed = set(setuptools["packages"])
     on_disk = {"raytwin", "raytwin.commands"} | {f"raytwin.{room}" for room in rooms_on_disk()}
-    assert listed == on_disk
+    assert listed == on_disk | set(subpackages_on_disk())
     places = setuptools["package-dir"]
     assert places.pop("raytwin") == "src/raytwin"
-    assert places == {f"raytwin.{room}": room for room in rooms_on_disk()}
+    assert places == {f"raytwin.{room}": room for room in rooms_on_disk()} | subpackages_on_disk()
 
 
 def test_check_and_format_of_the_makefile_cover_every_room():

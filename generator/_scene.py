@@ -1,0 +1,349 @@
+"""What stands in the beam, projected once for each beam: scenes, their sharp borders, and the cache of projections."""
+
+import math
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .line_state import FloatArray
+from .predict import slope_share, spectral_model_of
+from .projection import project_polychromatic
+from .spectral_signal import REFERENCE_KV, OpenBeam, SpectralModel
+from .twin import Level, Twin
+
+if TYPE_CHECKING:
+    from .series import SeriesRequest
+
+_SCALES = (
+    "log_output",
+    "log_DN_per_keV",
+    "log_swank",
+    "yield_exponent",
+)  # they scale a projection and change nothing else
+_BORDER_KEV = 40.0  # attenuation at this energy says where the border of an object lies
+_BORDER_DEPTH = 0.02  # optical depth across a pixel's neighbourhood from which its border counts
+_MOST_UNIQUE_PIXELS = 300_000
+_LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
+_BUDGET_BYTES = 400_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Borders:
+    """Pixels that the border of an object cuts: the signal is shared between the neighbours on either side.
+
+    Fields: pixel, thick, thin (n,): flat indices of the pixel and of its most and least attenuating neighbour; covered
+    (n,): share of the pixel behind the thick one; sharpness (n,): 1 a step, 0 a slope.
+    """
+
+    pixel: NDArray[np.intp]
+    thick: NDArray[np.intp]
+    thin: NDArray[np.intp]
+    covered: FloatArray
+    sharpness: FloatArray
+
+
+def find_borders(depth: FloatArray) -> Borders:
+    """Pixels of `depth` (row, column) (optical depth, pixel means) that lie on a step between two plateaus.
+
+    The mean of exp(-depth) over a pixel that an edge cuts is not exp(-mean depth). A step spans the same range in 3 x 3
+    as in 5 x 5 pixels, a slope half of it; between the two, sharpness falls from 1 to 0.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    rows, columns = depth.shape
+    range_3 = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
+    range_5 = maximum_filter(depth, 5, mode="nearest") - minimum_filter(depth, 5, mode="nearest")
+    sharpness = np.clip(2.0 * range_3 / np.maximum(range_5, 1e-12) - 1.0, 0.0, 1.0)
+    row, column = np.nonzero((range_3 > _BORDER_DEPTH) & (sharpness > 0))
+    around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    near_row = np.clip(row[:, None] + around[:, 0], 0, rows - 1)
+    near_column = np.clip(column[:, None] + around[:, 1], 0, columns - 1)
+    near = depth[near_row, near_column]
+    index = near_row * columns + near_column
+    every = np.arange(row.size)
+    if row.size == 0:
+        empty = np.zeros(0, dtype=np.intp)
+        return Borders(empty, empty, empty, np.zeros(0), np.zeros(0))
+    most, least = near.argmax(axis=1), near.argmin(axis=1)
+    high, low = near[every, most], near[every, least]
+    covered = (depth[row, column] - low) / (high - low)
+    inside = (covered > 1e-6) & (covered < 1 - 1e-6)
+    return Borders(
+        pixel=(row * columns + column)[inside],
+        thick=index[every, most][inside],
+        thin=index[every, least][inside],
+        covered=covered[inside],
+        sharpness=sharpness[row, column][inside],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    source: Mapping[str, NDArray[np.floating]]
+    number: int
+    materials: tuple[str, ...]
+    thickness_mm: NDArray[np.float64]  # (material, point): the distinct points where that saves work
+    inverse: NDArray[np.intp] | None
+    borders: Borders
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class BeamProjection:
+    """One beam behind one scene: signal and variance of an exposure, and further moments on demand."""
+
+    model: SpectralModel | None
+    weights: FloatArray | None
+    energies_keV: FloatArray | None
+    open_signal_DN: float
+    signal_DN: FloatArray
+    variance_DN2: FloatArray
+    _cache: "ModelCache"
+    _key: tuple[object, ...]
+    _scene: _Scene | None
+    _scale: Mapping[str, float]
+
+    def moments(self, name: str, weights: FloatArray) -> FloatArray:
+        """Maps (k, row, column) of sum_E weights exp(-mu t), or (k, 1, 1) in the open field; kept under `name`."""
+        if self.model is None:
+            raise InputError("scene", received="a twin without spectral part", expected="one with a spectral part")
+        return self._cache.project(self._key, name, weights, self.model, self._scene, self._scale)
+
+
+@dataclass(slots=True)
+class ModelCache:
+    """Scenes and projections, kept between calls of the forward model; the oldest go first beyond `budget_bytes`."""
+
+    budget_bytes: int = _BUDGET_BYTES
+    _scenes: "OrderedDict[int, _Scene]" = field(default_factory=OrderedDict)
+    _maps: "OrderedDict[tuple[object, ...], FloatArray]" = field(default_factory=OrderedDict)
+    _held: int = 0
+    _numbers: int = 0
+    _levels: dict[tuple[object, ...], tuple[object, float, float]] = field(default_factory=dict)
+    _spectra: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
+
+    def model(self, twin: Twin, request: "SeriesRequest") -> SpectralModel | None:
+        """The twin's spectral model, or None where it has none."""
+        if twin.spectral is None or request.setting is None:
+            return None
+        return spectral_model_of(twin, highest_kV=request.setting.kV)
+
+    def projection(
+        self,
+        twin: Twin,
+        request: "SeriesRequest",
+        model: SpectralModel | None,
+        parameters: FloatArray | None,
+        attenuation_scale: Mapping[str, float],
+        *,
+        use_measured_level: bool,
+    ) -> BeamProjection:
+        """Signal and variance of one exposure behind the request's scene, under even illumination."""
+        level = None if request.setting is None or not use_measured_level else twin.level_at(request.setting)
+        if model is None or parameters is None or request.setting is None or twin.spectral is None:
+            return self._without_spectrum(twin, request, level)
+        beam = OpenBeam(kV=request.setting.kV, filters=request.setting.filters)
+        shape, scales = self._split(model, parameters, beam)
+        key = (id(model), beam, shape.tobytes(), tuple(sorted(attenuation_scale.items())))
+        weights = self._shape_weights(model, shape, beam)
+        signal_scale, gain_scale = self._level(twin, request, model, beam, level, scales)
+        scene = None
+        if request.thickness_mm:
+            scene = self._scene(request.thickness_mm, model, twin.maps.shape)
+        maps = self.project(key, "signal", weights, model, scene, attenuation_scale)
+        return BeamProjection(
+            model=model,
+            weights=weights,
+            energies_keV=model.energies_keV[: weights.shape[1]],
+            open_signal_DN=signal_scale * float(weights[0].sum()),
+            signal_DN=signal_scale * maps[0],
+            variance_DN2=signal_scale * gain_scale * maps[1],
+            _cache=self,
+            _key=key,
+            _scene=scene,
+            _scale=attenuation_scale,
+        )
+
+    def _without_spectrum(self, twin: Twin, request: "SeriesRequest", level: Level | None) -> BeamProjection:
+        if request.thickness_mm:
+            raise InputError(
+                "scene",
+                received="thickness maps and a twin without spectral part",
+                expected="a twin that can project them",
+                remedy="calibrate from flats that state kV and tube load",
+            )
+        if level is None and request.setting is None and len(twin.levels) == 1:
+            level = twin.levels[0]
+        load = None if request.setting is None else request.setting.tube_load_mAs
+        open_signal = request.open_signal_DN
+        if open_signal is None and level is not None and level.rate_DN_per_mAs is not None and load is not None:
+            there = level.source_detector_mm or self._distance_mm(twin, request, level)
+            open_signal = level.rate_DN_per_mAs.value * load * (there / self._distance_mm(twin, request, level)) ** 2
+        if open_signal is None or not twin.levels:
+            raise _no_level(request)
+        level = level or twin.levels[0]
+        gain = level.photon_transfer_slope_DN.value / slope_share(twin)
+        one = np.ones((1, 1))
+        return BeamProjection(
+            None, None, None, open_signal, open_signal * one, gain * open_signal * one, self, (), None, {}
+        )
+
+    @staticmethod
+    def _distance_mm(twin: Twin, request: "SeriesRequest", level: Level | None) -> float:
+        setting = None if request.setting is None else request.setting.source_detector_mm
+        measured = None if level is None else level.source_detector_mm
+        return request.source_detector_mm or setting or twin.instrument.source_detector_mm or measured or 1000.0
+
+    @staticmethod
+    def _split(model: SpectralModel, parameters: FloatArray, beam: OpenBeam) -> tuple[FloatArray, tuple[float, float]]:
+        """Parameters with the scales taken out, and (signal, variance over signal) that the scales amount to."""
+        shape = parameters.copy()
+        values = {}
+        for name in _SCALES:
+            index = model.names.index(name)
+            values[name] = float(shape[index])
+            shape[index] = 0.0
+        gamma = values["log_DN_per_keV"]
+        signal = values["log_output"] + values["yield_exponent"] * math.log(beam.kV / REFERENCE_KV) + gamma
+        return shape, (math.exp(signal), math.exp(gamma - values["log_swank"]))
+
+    def _shape_weights(self, model: SpectralModel, shape: FloatArray, beam: OpenBeam) -> FloatArray:
+        """Weights (2, energy) of signal and variance with all scales at 1."""
+        key = (id(model), beam, shape.tobytes())
+        if key not in self._spectra:
+            weights = model.moment_weights(shape, beam)[:2]
+            share = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+            weights = np.where(share > _LEAST_WEIGHT, weights, 0.0)
+            self._spectra[key] = (model, weights)
+            while len(self._spectra) > 512:
+                self._spectra.popitem(last=False)
+        return self._spectra[key][1]
+
+    def _level(
+        self,
+        twin: Twin,
+        request: "SeriesRequest",
+        model: SpectralModel,
+        beam: OpenBeam,
+        level: Level | None,
+        scales: tuple[float, float],
+    ) -> tuple[float, float]:
+        """Factors on the projected signal, and on variance over signal, of one exposure."""
+        posterior = twin.spectral
+        if posterior is None or request.setting is None:
+            raise _no_level(request)
+        key = (id(posterior), beam)
+        if key not in self._levels:
+            best, best_scales = self._split(model, np.asarray(posterior.best, dtype=np.float64), beam)
+            sums = self._shape_weights(model, best, beam).sum(axis=1)
+            if not sums[0] > 0:
+                raise InputError(
+                    "filter",
+                    received=" + ".join(map(str, beam.filters)),
+                    expected="layers that let some photons through",
+                )
+            self._levels[key] = (
+                posterior,
+                best_scales[0] * float(sums[0]),
+                best_scales[1] * float(sums[1]) / float(sums[0]),
+            )
+        _, best_rate, best_gain = self._levels[key]
+        distance = self._distance_mm(twin, request, level)
+        load = request.setting.tube_load_mAs
+        pitch = twin.instrument.pixel_mm or 1.0
+        gain_scale = scales[1]
+        if level is not None:
+            gain_scale *= level.photon_transfer_slope_DN.value / slope_share(twin) / best_gain
+        if request.open_signal_DN is not None:
+            return scales[0] * request.open_signal_DN / best_rate, gain_scale
+        if load is None:
+            raise _no_level(request)
+        if level is not None and level.rate_DN_per_mAs is not None:
+            there = level.source_detector_mm or distance
+            measured = level.rate_DN_per_mAs.value * load * (there / distance) ** 2
+            return scales[0] * measured / best_rate, gain_scale
+        return scales[0] * load * (1000.0 / distance) ** 2 * pitch**2, gain_scale
+
+    def _scene(
+        self, thickness_mm: Mapping[str, NDArray[np.floating]], model: SpectralModel, shape: tuple[int, int]
+    ) -> _Scene:
+        number = id(thickness_mm)
+        found = self._scenes.get(number)
+        if found is not None and found.source is thickness_mm:
+            self._scenes.move_to_end(number)
+            return found
+        materials = tuple(thickness_mm)
+        stack = np.stack([np.asarray(thickness_mm[name], dtype=np.float64) for name in materials])
+        if stack.shape[1:] != shape:
+            raise InputError(
+                "thickness maps of a scene",
+                received=f"{stack.shape[1:]}",
+                expected=f"(row, column) of the twin's detector, {shape}",
+            )
+        if not np.all(np.isfinite(stack) & (stack >= 0)):
+            raise InputError(
+                "thickness maps of a scene",
+                received="negative or not finite path lengths",
+                expected="finite path lengths of 0 mm or more",
+            )
+        energy = int(np.searchsorted(model.energies_keV, _BORDER_KEV))
+        depth = np.tensordot([model.mu(name)[energy] for name in materials], stack, axes=1)
+        points = stack.reshape(len(materials), -1)
+        inverse = None
+        if points.shape[1] <= _MOST_UNIQUE_PIXELS:
+            distinct, where = np.unique(points.astype(np.float32), axis=1, return_inverse=True)
+            if distinct.shape[1] < 0.7 * points.shape[1]:
+                points, inverse = distinct.astype(np.float64), where.reshape(-1)
+        self._numbers += 1
+        scene = _Scene(thickness_mm, self._numbers, materials, points, inverse, find_borders(depth), shape)
+        self._scenes[number] = scene
+        while len(self._scenes) > 64:
+            self._scenes.popitem(last=False)
+        return scene
+
+    def project(
+        self,
+        key: tuple[object, ...],
+        name: str,
+        weights: FloatArray,
+        model: SpectralModel,
+        scene: _Scene | None,
+        attenuation_scale: Mapping[str, float],
+    ) -> FloatArray:
+        """Maps (k, row, column) or (k, 1, 1) of the weights (k, energy) behind a scene, kept under key and name."""
+        if scene is None:
+            return np.asarray(weights.sum(axis=1)[:, None, None])
+        whole = (*key, scene.number, name)
+        found = self._maps.get(whole)
+        if found is not None:
+            self._maps.move_to_end(whole)
+            return found
+        top = weights.shape[1]
+        mu = np.stack([model.mu(material)[:top] * attenuation_scale.get(material, 1.0) for material in scene.materials])
+        flat = project_polychromatic(scene.thickness_mm, mu, weights).astype(np.float64)
+        if scene.inverse is not None:
+            flat = flat[:, scene.inverse]
+        borders = scene.borders
+        if borders.pixel.size:
+            shared = borders.covered * flat[:, borders.thick] + (1.0 - borders.covered) * flat[:, borders.thin]
+            flat[:, borders.pixel] += borders.sharpness * (shared - flat[:, borders.pixel])
+        maps = flat.reshape(len(weights), *scene.shape)
+        self._maps[whole] = maps
+        self._held += maps.nbytes
+        while self._held > self.budget_bytes and len(self._maps) > 1:
+            self._held -= self._maps.popitem(last=False)[1].nbytes
+        return maps
+
+
+def _no_level(request: "SeriesRequest") -> InputError:
+    return InputError(
+        "series",
+        received="a beam of unknown level" if request.setting is None else str(request.setting),
+        expected="a tube load (current_mA or power_W), or the level of the open beam",
+        remedy="state current_mA or power_W",
+    )

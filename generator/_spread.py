@@ -1,0 +1,214 @@
+"""Blur and noise correlation of one series: transfer functions on cosine transforms, whose borders mirror."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .line_state import FloatArray, LineState
+from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
+
+_GRID = 64  # cells of the noise power spectrum per axis
+_REACH = 14  # of the noise kernel where effects change it, px
+_SHOWN = 4  # lags of the autocovariance, 0 included
+
+
+@dataclass(frozen=True, slots=True)
+class NoisePattern:
+    """Correlation of quantum noise after the spread.
+
+    Fields: share (of the variance that is left in one pixel); autocovariance (4, 4), 1 at lag 0; kernel: what white noise
+    per pixel is convolved with, per axis (2 R + 1,) or (2 R + 1, 2 R + 1).
+    """
+
+    share: float
+    autocovariance: FloatArray
+    kernel: FloatArray
+
+    def squared_transfer(self, f_row: FloatArray, f_column: FloatArray) -> FloatArray:
+        """Transfer function (n, m) from the variance before the spread to the variance of the pixels."""
+        reach = self.kernel.shape[0] // 2
+        square = self.kernel[..., reach:] ** 2
+        steps = np.arange(reach + 1)
+        weight = np.where(steps == 0, 1.0, 2.0)
+        rows = np.cos(2 * np.pi * f_row * steps) * weight
+        columns = np.cos(2 * np.pi * f_column.T * steps) * weight
+        separable = self.kernel.ndim == 1
+        found = np.outer(rows @ square, columns @ square) if separable else rows @ square[reach:] @ columns.T
+        return np.asarray(found * (self.share / found[0, 0]))
+
+    def sample(
+        self, mean_DN: FloatArray, quantum_DN: FloatArray, shape: tuple[int, int], rng: np.random.Generator
+    ) -> FloatArray:
+        """Noise of zero mean (row, column): quanta of `quantum_DN` each, counted per pixel, then spread.
+
+        Args:
+            mean_DN: before the spread, (row, column) or (1, 1), 0 or more.
+            quantum_DN: DN a quantum, of the same shape.
+        """
+        reach = self.kernel.shape[0] // 2
+        wide = (shape[0] + 2 * reach, shape[1] + 2 * reach)
+        if mean_DN.shape == (1, 1):
+            mean, quantum = np.broadcast_to(mean_DN, wide), np.broadcast_to(quantum_DN, wide)
+        else:
+            mean, quantum = (np.pad(values, reach, mode="symmetric") for values in (mean_DN, quantum_DN))
+        expected = mean / quantum
+        counts = (rng.poisson(expected) - expected) * quantum
+        if self.kernel.ndim == 1:
+            spread = convolve_separable(counts, self.kernel, mode="constant")
+        else:
+            from scipy.signal import oaconvolve
+
+            spread = oaconvolve(counts, self.kernel, mode="same")
+        return np.asarray(spread[reach : reach + shape[0], reach : reach + shape[1]], dtype=np.float64)
+
+
+@lru_cache(maxsize=64)
+def _base_pattern(psf_model: str, psf_sigma_px: float) -> NoisePattern:
+    half = noise_autocovariance_1d(psf_model, psf_sigma_px, _SHOWN - 1)
+    table = np.outer(half, half)
+    return NoisePattern(
+        share=float(table[0, 0]),
+        autocovariance=table / table[0, 0],
+        kernel=np.asarray(noise_kernel_1d(psf_model, psf_sigma_px), dtype=np.float64),
+    )
+
+
+def base_transfer_1d(psf_model: str, psf_sigma_px: float, frequency: FloatArray) -> FloatArray:
+    """Transfer function of the calibrated spread along one axis, frequency in cycles per pixel."""
+    if psf_model == "sampled":
+        reach = max(3, math.ceil(6 * psf_sigma_px))
+        kernel = sampled_gaussian_1d(psf_sigma_px, reach)[reach:]
+        steps = np.arange(reach + 1)
+        return np.asarray(np.cos(2 * np.pi * frequency[..., None] * steps) @ np.where(steps == 0, kernel, 2 * kernel))
+    return np.asarray(np.exp(-2.0 * (np.pi * psf_sigma_px * frequency) ** 2))
+
+
+def optical_transfer(
+    state: LineState, psf_model: str, psf_sigma_px: float, f_row: FloatArray, f_column: FloatArray
+) -> FloatArray:
+    """Transfer function of the light's spread (n, m): the calibrated one, tails in part in its place, and factors."""
+    result = base_transfer_1d(psf_model, psf_sigma_px, f_row) * base_transfer_1d(psf_model, psf_sigma_px, f_column)
+    if state.tails:
+        left = 1.0 - sum(weight for weight, _ in state.tails)
+        result = left * result
+        for weight, transfer in state.tails:
+            result = result + weight * transfer(f_row, f_column)
+    for factor in state.optical_transfers:
+        result = result * factor(f_row, f_column)
+    return np.asarray(result)
+
+
+def noise_pattern(psf_model: str, psf_sigma_px: float, state: LineState) -> NoisePattern:
+    """Noise correlation with the state's spread.
+
+    Where nothing changes the calibrated spread it is that of `psf`. Else the power of quanta that land anywhere in a
+    pixel, whose light square pixels collect and sample (`aperture`): sum over aliases of |H|^2 sinc^2, and that of the
+    calibrated spread is replaced by it.
+    """
+    if not (state.tails or state.optical_transfers or state.power_transfers):
+        return _base_pattern(psf_model, psf_sigma_px)
+    frequency = np.arange(_GRID // 2 + 1) / _GRID
+    half = noise_autocovariance_1d(psf_model, psf_sigma_px, _GRID // 2)
+    line = _even_transform(half)
+    power = np.outer(line, line)
+    aliases = 0 if psf_model == "sampled" else 2 if psf_sigma_px > 0.4 else 4
+    order = np.arange(-aliases, aliases + 1)
+    every = (frequency[:, None] + order).ravel()
+    f_row, f_column = every[:, None], every[None, :]
+    before = (
+        base_transfer_1d(psf_model, psf_sigma_px, every)[:, None]
+        * base_transfer_1d(psf_model, psf_sigma_px, every)[None, :]
+    )
+    change = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column) ** 2
+    for factor in state.power_transfers:
+        change = change * factor(f_row, f_column)
+    change = change - before**2
+    if aliases:
+        collected = np.sinc(every) ** 2
+        change = change * collected[:, None] * collected[None, :]
+        count = order.size
+        change = change.reshape(frequency.size, count, frequency.size, count).sum(axis=(1, 3))
+    power = np.maximum(power + change, 0.0)
+    whole = np.concatenate([power, power[-2:0:-1]], axis=0)
+    whole = np.concatenate([whole, whole[:, -2:0:-1]], axis=1)
+    covariance = np.fft.ifft2(whole).real
+    impulse = np.fft.fftshift(np.fft.ifft2(np.sqrt(whole)).real)
+    middle = slice(_GRID // 2 - _REACH, _GRID // 2 + _REACH + 1)
+    return NoisePattern(
+        share=float(covariance[0, 0]),
+        autocovariance=covariance[:_SHOWN, :_SHOWN] / covariance[0, 0],
+        kernel=np.ascontiguousarray(impulse[middle, middle]),
+    )
+
+
+def _even_transform(half: FloatArray) -> FloatArray:
+    """Spectrum at 0..n of an even sequence of period 2 n given at 0..n."""
+    return np.asarray(np.fft.fft(np.concatenate([half, half[-2:0:-1]])).real[: half.size])
+
+
+@lru_cache(maxsize=64)
+def _frequencies(length: int) -> NDArray[np.float64]:
+    return np.arange(length) / (2.0 * length)
+
+
+@lru_cache(maxsize=32)
+def _base_filters(shape: tuple[int, int], psf_model: str, psf_sigma_px: float) -> tuple[FloatArray, FloatArray]:
+    f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
+    picture = base_transfer_1d(psf_model, psf_sigma_px, f_row) * base_transfer_1d(psf_model, psf_sigma_px, f_column)
+    return picture, _base_pattern(psf_model, psf_sigma_px).squared_transfer(f_row, f_column)
+
+
+def _object_transfer(state: LineState, shape: tuple[int, int]) -> FloatArray | None:
+    result: FloatArray | None = None
+    for factor in state.object_transfers:
+        part = factor(_frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
+        result = part if result is None else result * part
+    return result
+
+
+def _filtered(maps: FloatArray, filters: FloatArray) -> FloatArray:
+    """Maps (k, row, column) through transfer functions (k, row, column) or (row, column); borders mirror."""
+    from scipy.fft import dctn, idctn
+
+    return np.asarray(idctn(dctn(maps, type=2, axes=(-2, -1)) * filters, type=2, axes=(-2, -1)))
+
+
+def spread_maps(
+    signal_DN: FloatArray,
+    variance_DN2: FloatArray,
+    *,
+    state: LineState,
+    pattern: NoisePattern,
+    psf_model: str,
+    psf_sigma_px: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Picture after all blur (DN), and quantum variance after blur of the object and spread of the quanta (DN^2)."""
+    if signal_DN.shape == (1, 1):
+        return signal_DN, pattern.share * variance_DN2
+    shape = (signal_DN.shape[0], signal_DN.shape[1])
+    if state.tails or state.optical_transfers or state.power_transfers:
+        f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
+        picture = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
+        power = pattern.squared_transfer(f_row, f_column)
+    else:
+        picture, power = _base_filters(shape, psf_model, psf_sigma_px)
+    filters = np.stack([picture, power])
+    blur = _object_transfer(state, shape)
+    if blur is not None:
+        filters = filters * blur
+    spread = _filtered(np.stack([signal_DN, variance_DN2]), filters)
+    return spread[0], np.maximum(spread[1], 0.0)
+
+
+def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
+    """Signal and variance before the spread of light, with the blur of the object in them, 0 or more."""
+    signal, variance = state.signal_DN, state.variance_DN2
+    if signal.shape == (1, 1) or not state.object_transfers:
+        return signal, variance
+    blur = _object_transfer(state, (signal.shape[0], signal.shape[1]))
+    spread = _filtered(np.stack([signal, variance]), np.ones(signal.shape) if blur is None else blur)
+    floor = 1e-12 * max(float(signal.max()), 1e-300)
+    return np.maximum(spread[0], floor), np.maximum(spread[1], 0.0)

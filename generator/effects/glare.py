@@ -1,0 +1,57 @@
+"""Veiling glare: light that travels far inside the detector. It knows nothing of gap or thickness.
+
+h = (1 - r) delta + r exp(-R / L) / (2 pi L R),    transfer function (1 - r) + r / sqrt(1 + (2 pi L f)^2)
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ..line_state import FloatArray, LineContext, LineState, needed
+from .effect import Effect, Parameter
+
+
+def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
+    share = parameters["strength"] / 100.0
+    if share == 0:
+        return state
+    length_px = parameters["length_mm"] / needed(context.twin.instrument.pixel_mm, "pixel_mm", "veiling_glare")
+
+    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
+        return np.asarray(
+            (1.0 - share) + share / np.sqrt(1.0 + (2 * np.pi * length_px) ** 2 * (f_row**2 + f_column**2))
+        )
+
+    return replace(state, optical_transfers=(*state.optical_transfers, transfer))
+
+
+VEILING_GLARE = Effect(
+    id="veiling_glare",
+    title="veiling glare in the detector",
+    parameters=(
+        Parameter(
+            name="strength",
+            unit="%",
+            low=0.5,
+            high=5.0,
+            default=2.0,
+            source="share of the light that leaves its place; flat panels and image intensifiers",
+            log=False,
+        ),
+        Parameter(
+            name="length_mm",
+            unit="mm",
+            low=1.0,
+            high=20.0,
+            default=5.0,
+            source="reach of glare in scintillator and cover glass",
+            log=True,
+        ),
+    ),
+    stage="optics",
+    reference="Seibert, Nalcioglu, Roeck (1984), doi:10.1118/1.595527",
+    after_calibration=False,
+    change=_add_glare,
+    needs=("pixel_mm",),
+)

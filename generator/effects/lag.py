@@ -1,0 +1,61 @@
+"""Image lag: charge that is trapped in one exposure and released in later ones.
+
+    y_n = (1 - phi) x_n + sum_i (1 - a_i) R_i,n       R_i,n+1 = a_i R_i,n + phi_i x_n       a_i = exp(-interval / tau_i)
+
+Charge is conserved: a steady exposure reads x. After a long exposure the first beam-off frame reads phi x. Three traps
+of equal share at tau / s, tau and tau s; s = 1 is one exponential, a large s resembles a power law.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..line_state import LagLaw, LineContext, LineState
+from .effect import Effect, Parameter
+
+
+def _trap_charge(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
+    trapped = parameters["strength"] / 100.0
+    if trapped == 0:
+        return state
+    middle, spread = parameters["release_s"], parameters["spread"]
+    law = LagLaw(trapped=(trapped / 3.0,) * 3, time_s=(middle / spread, middle, middle * spread))
+    return replace(state, lag=law)
+
+
+IMAGE_LAG = Effect(
+    id="image_lag",
+    title="image lag",
+    parameters=(
+        Parameter(
+            name="strength",
+            unit="%",
+            low=0.02,
+            high=5.0,
+            default=1.0,
+            source="first beam-off frame over the last exposed one, after long exposure",
+            log=True,
+        ),
+        Parameter(
+            name="release_s",
+            unit="s",
+            low=0.02,
+            high=20.0,
+            default=0.3,
+            source="traps of amorphous silicon empty within frames to minutes",
+            log=True,
+        ),
+        Parameter(
+            name="spread",
+            unit="",
+            low=1.0,
+            high=10.0,
+            default=3.0,
+            source="ratio of neighbouring release times; measured decays follow sums of exponentials or power laws",
+            log=True,
+        ),
+    ),
+    stage="lag",
+    reference="Hsieh, Gurmen, King (2000), doi:10.1109/42.887837; Starman et al. (2012), doi:10.1118/1.4752087",
+    after_calibration=False,
+    change=_trap_charge,
+)

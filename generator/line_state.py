@@ -1,0 +1,169 @@
+"""What the forward model of a series knows of the line, from the beam to the ADC; effects change it stage by stage.
+
+The stages follow the order in which a real line works:
+
+    beam         tube voltage, filtration, compositions: before anything is projected
+    arrivals     the field that reaches the scintillator: heel, displaced objects, scatter
+    object_blur  focal spot, motion: they blur what stands in the beam, not the noise
+    quanta       statistics of the photons
+    optics       spread of light: blurs the picture and correlates the noise
+    exposure     one factor for a whole frame
+    lag          charge trapped and released later
+    response     nonlinearity, per-pixel gain
+    electronics  offsets and noise of the readout
+    readout      ADC and bad pixels
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .series import SeriesRequest
+    from .spectral_signal import SpectralModel
+    from .twin import Twin
+
+STAGES = (
+    "beam",
+    "arrivals",
+    "object_blur",
+    "quanta",
+    "optics",
+    "exposure",
+    "lag",
+    "response",
+    "electronics",
+    "readout",
+)
+
+FloatArray = NDArray[np.float64]
+# (cycles per pixel along rows (n, 1), along columns (1, m)) -> factor (n, m); even in both
+Transfer = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LagLaw:
+    """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,)."""
+
+    trapped: tuple[float, ...]
+    time_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixedPattern:
+    """A fixed relative pattern over the pixels, white, of standard deviation `rms`, drawn from `seed`."""
+
+    rms: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineState:
+    """One series on its way through the line; maps are (row, column), or (1, 1) where all pixels are alike.
+
+    Fields:
+        parameters: (parameter,) of the spectral model, or None where the twin has none.
+        attenuation_scale: material of the scene -> factor on its attenuation.
+        signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
+            even illumination, before any spread.
+        object_transfers: blur of what stands in the beam.
+        optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
+        tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
+        power_transfers: factors on the noise power that are not the square of a transfer function.
+        flat_factor: change of the illumination against the calibrated flat, map or (1, 1).
+        output_rms, output_correlation_s: common random factor of each frame, its rms and correlation time.
+        lag: traps, or None.
+        bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
+        gain_pattern: fixed pattern of the gain that calibration does not know.
+        offsets: (DN, profile over the time in the session in s) added with or without beam.
+        row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
+        step_DN: of the ADC; 0: none.
+        bad_share: share of pixels that calibration does not know to be bad; bad_seed draws them.
+    """
+
+    parameters: FloatArray | None
+    attenuation_scale: Mapping[str, float] = field(default_factory=dict)
+    signal_DN: FloatArray
+    variance_DN2: FloatArray
+    object_transfers: tuple[Transfer, ...] = ()
+    optical_transfers: tuple[Transfer, ...] = ()
+    tails: tuple[tuple[float, Transfer], ...] = ()
+    power_transfers: tuple[Transfer, ...] = ()
+    flat_factor: FloatArray
+    output_rms: float = 0.0
+    output_correlation_s: float = 0.0
+    lag: LagLaw | None = None
+    bend_per_DN: float = 0.0
+    gain_pattern: FixedPattern | None = None
+    offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
+    row_variance_DN2: float = 0.0
+    column_variance_DN2: float = 0.0
+    step_DN: float = 0.0
+    bad_share: float = 0.0
+    bad_seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineContext:
+    """What an effect may know besides the state.
+
+    Fields: twin; request; model (spectral, or None); since (`always` or `calibration`); weights (2, energy): what each
+    energy of the open beam adds to signal and to quantum variance, any scale; energies_keV (energy,); project:
+    (name, weights (k, energy)) -> maps (k, row, column) behind the scene, or (k, 1, 1) in the open field; open_signal_DN
+    of one exposure; options of the effect that are words.
+    """
+
+    twin: "Twin"
+    request: "SeriesRequest"
+    model: "SpectralModel | None"
+    since: str
+    weights: FloatArray | None
+    energies_keV: FloatArray | None
+    project: Callable[[str, FloatArray], FloatArray] | None
+    open_signal_DN: float
+    options: Mapping[str, str]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the detector."""
+        return self.twin.maps.shape
+
+    @property
+    def source_detector_mm(self) -> float | None:
+        """Distance from source to detector in this series, or None."""
+        request = self.request
+        stated = request.source_detector_mm
+        if stated is None and request.setting is not None:
+            stated = request.setting.source_detector_mm
+        return self.twin.instrument.source_detector_mm if stated is None else stated
+
+    @property
+    def source_object_mm(self) -> float | None:
+        """Distance from source to object in this series, or None."""
+        stated = self.request.source_object_mm
+        return self.twin.instrument.source_object_mm if stated is None else stated
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether something of known thickness stands in the beam."""
+        return bool(self.request.thickness_mm)
+
+
+def needed(value: float | None, name: str, effect: str) -> float:
+    """The value, or an InputError that says which effect needs it."""
+    from ..errors import InputError
+
+    if value is None:
+        raise InputError(
+            name,
+            received="unknown",
+            expected=f"a number, because the effect {effect} depends on it",
+            remedy="state it in the acquisition's instrument or series",
+        )
+    return float(value)
+
+
+Change = Callable[[LineState, Mapping[str, float], LineContext], LineState]

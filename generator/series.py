@@ -1,0 +1,642 @@
+"""The forward model of a series of frames: what they are expected to hold, and samples of them.
+
+One chain of stages in the order of the real line (`line_state`): beam, projection, arrivals, blur of the object, quanta,
+optical spread, exposure, lag, response, electronics, readout. `expected_series` and `sample_series` read the same final
+state of that chain, so that they cannot disagree. An effect changes the state at its stage (`effects`).
+
+Under even illumination, before the spread, one exposure has signal P = sum_E w1 exp(-mu t) and quantum variance
+V = sum_E w2 exp(-mu t); the flat's shape s and the relative gain g of the pixels act at readout: mean s P, variance
+s g V. Light that leaves the field is replaced by as much that enters: borders mirror.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.setting import Setting
+from ..errors import InputError
+from ._scene import BeamProjection, ModelCache
+from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
+from .effects import AppliedEffect, Effect, in_order
+from .line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineState
+from .twin import Twin
+
+__all__ = [
+    "ExpectedSeries",
+    "LineMemory",
+    "ModelCache",
+    "SeriesRequest",
+    "expected_series",
+    "final_state",
+    "sample_series",
+]
+
+KINDS = ("dark", "flat", "object", "afterglow")
+_LAGS = 3
+_HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
+_HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesRequest:
+    """What one series of an acquisition states; None where unknown.
+
+    Fields: kind (`dark`, `flat`, `object`, `afterglow`); setting (kV, filters, load, exposure, averaged, distance);
+    frames; exposure_ms; frame_interval_ms (from the begin of a stored frame to the next one's); start_s (since the
+    session's begin); index; thickness_mm: material of the scene -> (row, column); source_object_mm, source_detector_mm;
+    belt_speed_mm_s, belt_axis (`row` or `column`: the axis along which the object moves); panel_rotation_deg;
+    after_calibration (later than the series that calibrated the twin); previous: exposures before this one that lag may
+    remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
+    open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
+    material of the scene that is the product.
+    """
+
+    kind: str
+    setting: Setting | None
+    frames: int
+    exposure_ms: float
+    frame_interval_ms: float | None = None
+    start_s: float = 0.0
+    index: int = 0
+    thickness_mm: Mapping[str, NDArray[np.floating]] | None = None
+    source_object_mm: float | None = None
+    source_detector_mm: float | None = None
+    belt_speed_mm_s: float | None = None
+    belt_axis: str = "row"
+    panel_rotation_deg: float = 0.0
+    after_calibration: bool = True
+    previous: tuple["SeriesRequest", ...] = ()
+    averaged: int = 1
+    open_signal_DN: float | None = None
+    product_material: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError("kind of series", received=self.kind, expected="one of " + ", ".join(KINDS))
+        if self.frames < 1 or self.averaged < 1:
+            raise InputError("frames of a series", received=min(self.frames, self.averaged), expected="1 or more")
+        if not (math.isfinite(self.exposure_ms) and self.exposure_ms >= 0 and math.isfinite(self.start_s)):
+            raise InputError("exposure_ms", received=self.exposure_ms, expected="a finite exposure of 0 ms or more")
+        if self.belt_axis not in ("row", "column"):
+            raise InputError("belt_axis", received=self.belt_axis, expected="row or column")
+
+    @property
+    def beam_on(self) -> bool:
+        """Whether photons arrive."""
+        return self.kind in ("flat", "object")
+
+    @property
+    def exposures_per_frame(self) -> int:
+        """Exposures averaged into one stored frame."""
+        return self.averaged if self.setting is None else max(self.setting.averaged, self.averaged)
+
+    def interval_s(self, readout_ms: float | None) -> float:
+        """Time from the begin of one exposure to the next one's, s."""
+        if self.frame_interval_ms is not None and self.frame_interval_ms > 0:
+            return self.frame_interval_ms / 1000.0 / self.exposures_per_frame
+        return max(self.exposure_ms + (readout_ms or 0.0), 1e-6) / 1000.0
+
+
+@dataclass(slots=True, kw_only=True)
+class ExpectedSeries:
+    """What the stored frames of a series are expected to hold; maps (row, column), variances of one stored frame.
+
+    Fields:
+        mean_DN: raw, dark included, mean over the frames.
+        dark_DN: of it, what is there without beam (drift included).
+        signal_DN: of it, what the beam brings (released charge included).
+        trend_DN: change over the frames that is no noise: (map, (frames,) profile of mean 0) each; None: none.
+        quantum_variance_DN2: from frame to frame, of quanta, after the spread, lag and response.
+        white_variance_DN2: of electronics, secondary quanta and the ADC; without row and column noise.
+        noise_autocovariance: (4, 4) of the quantum part over lags of 0-3 rows and columns, 1 at lag 0.
+        row_variance_DN2, column_variance_DN2: of what a row or a column of one frame has in common.
+        frame_factor_rms: of the common factor of a frame.
+        frame_factor_correlation: (frames,) its correlation over 0, 1, 2... frames.
+        temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
+        quantisation_step_DN: of the stored numbers, before averaging; 0: none.
+        bad_pixel_share: pixels beyond the known bad ones.
+        fixed_pattern_rms: relative, of a gain pattern that no map knows.
+        saturated_share: share of pixels whose mean lies at the end of the ADC's range.
+        frames: in the series.
+    """
+
+    mean_DN: FloatArray
+    dark_DN: FloatArray
+    signal_DN: FloatArray
+    trend_DN: list[tuple[FloatArray, FloatArray]] | None
+    quantum_variance_DN2: FloatArray
+    white_variance_DN2: FloatArray
+    noise_autocovariance: FloatArray
+    row_variance_DN2: float
+    column_variance_DN2: float
+    frame_factor_rms: float
+    frame_factor_correlation: FloatArray
+    temporal_correlation: FloatArray
+    quantisation_step_DN: float
+    bad_pixel_share: float
+    fixed_pattern_rms: float
+    saturated_share: float
+    frames: int
+
+
+@dataclass(slots=True, kw_only=True)
+class LineMemory:
+    """What the line remembers from one series to the next when frames are sampled: trapped charge and output error.
+
+    Fields: trapped_DN (trap, row, column) or None, at time_s; output_error of the exposure that began at output_time_s.
+    """
+
+    trapped_DN: FloatArray | None = None
+    time_s: float = 0.0
+    output_error: float | None = None
+    output_time_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Charge:
+    """What one exposure of a series brings to the pixels, before lag: mean and variances in DN, gain and shape applied."""
+
+    state: LineState
+    mean: FloatArray
+    correlated: FloatArray
+    white: FloatArray
+    shape: FloatArray
+    relative: FloatArray
+    pattern: NoisePattern
+
+
+def _illumination(twin: Twin, request: SeriesRequest) -> tuple[FloatArray, FloatArray]:
+    """Shape of the flat nearest in kV and filters, and relative gain (row, column)."""
+    relative = np.asarray(twin.maps.gain_relative, dtype=np.float64)
+    relative = np.where(relative > 1e-6, relative, 1.0)
+    shape: FloatArray | None = None
+    if twin.levels:
+        level = None if request.setting is None else twin.level_at(request.setting)
+        if level is None:
+            kV = None if request.setting is None else request.setting.kV
+            wanted = set() if request.setting is None else {str(layer) for layer in request.setting.filters}
+            level = min(
+                twin.levels,
+                key=lambda item: (
+                    abs(math.log(item.kV / kV)) if kV is not None and item.kV is not None else 0.0,
+                    len(wanted ^ {str(layer) for layer in item.filters}),
+                ),
+            )
+        shape = np.maximum(np.asarray(level.flat_shape, dtype=np.float64), 0.0)
+    return (relative if shape is None else shape), relative
+
+
+def _context(
+    twin: Twin,
+    request: SeriesRequest,
+    applied: AppliedEffect | None,
+    projection: BeamProjection | None,
+) -> LineContext:
+    return LineContext(
+        twin=twin,
+        request=request,
+        model=None if projection is None else projection.model,
+        since="always" if applied is None else applied.since,
+        weights=None if projection is None else projection.weights,
+        energies_keV=None if projection is None else projection.energies_keV,
+        project=None if projection is None else projection.moments,
+        open_signal_DN=0.0 if projection is None else projection.open_signal_DN,
+        options={} if applied is None else applied.options,
+    )
+
+
+def final_state(
+    twin: Twin,
+    request: SeriesRequest,
+    *,
+    effects: Sequence[AppliedEffect] | None = None,
+    parameters: NDArray[np.float64] | None = None,
+    cache: ModelCache | None = None,
+    use_measured_level: bool = True,
+) -> LineState:
+    """The state of the line for one series after all stages: what expectation and samples are computed from.
+
+    Args: as in `expected_series`.
+    """
+    if effects is None:
+        effects = twin.effects
+    active = [item for item in in_order(effects) if item[0].since == "always" or request.after_calibration]
+    cache = ModelCache() if cache is None else cache
+    values: NDArray[np.float64] | None = None
+    if twin.spectral is not None:
+        given = twin.spectral.best if parameters is None else parameters
+        values = np.asarray(given, dtype=np.float64)
+        if values.shape != twin.spectral.best.shape:
+            raise InputError(
+                "spectral parameters",
+                received=f"shape {values.shape}",
+                expected=f"{twin.spectral.best.shape}: one value for each of {', '.join(twin.spectral.names)}",
+            )
+    one = np.ones((1, 1))
+    state = LineState(
+        parameters=values,
+        signal_DN=0.0 * one,
+        variance_DN2=0.0 * one,
+        flat_factor=one,
+        step_DN=1.0 if twin.noise.quantised else 0.0,
+    )
+    projection: BeamProjection | None = None
+    if request.beam_on:
+        model = cache.model(twin, request)
+        for applied, effect, numbers in active:
+            if effect.stage == "beam":
+                context = replace(_context(twin, request, applied, None), model=model)
+                state = effect.change(state, numbers, context)
+        projection = cache.projection(
+            twin, request, model, state.parameters, state.attenuation_scale, use_measured_level=use_measured_level
+        )
+        state = replace(state, signal_DN=projection.signal_DN, variance_DN2=projection.variance_DN2)
+    return _apply(state, twin, request, active, projection)
+
+
+def _apply(
+    state: LineState,
+    twin: Twin,
+    request: SeriesRequest,
+    active: Sequence[tuple[AppliedEffect, Effect, dict[str, float]]],
+    projection: BeamProjection | None,
+) -> LineState:
+    """All stages after the projection; those that need photons are left out without beam."""
+    with_beam = {"beam", "arrivals", "object_blur", "quanta", "optics"}
+    for applied, effect, numbers in active:
+        if effect.stage == "beam" or (projection is None and effect.stage in with_beam):
+            continue
+        state = effect.change(state, numbers, _context(twin, request, applied, projection))
+    return state
+
+
+def _charge(twin: Twin, request: SeriesRequest, state: LineState) -> _Charge:
+    shape, relative = _illumination(twin, request)
+    pattern = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
+    if not request.beam_on:
+        nothing = np.zeros(twin.maps.shape)
+        return _Charge(state, nothing, nothing, nothing, shape, relative, pattern)
+    secondary = twin.noise.white_fraction
+    picture, power = spread_maps(
+        state.signal_DN,
+        state.variance_DN2 / (1.0 + secondary),
+        state=state,
+        pattern=pattern,
+        psf_model=twin.noise.psf_model,
+        psf_sigma_px=twin.noise.psf_sigma_px.value,
+    )
+    lit = shape * state.flat_factor
+    scale = lit * relative
+    return _Charge(
+        state=state,
+        mean=lit * picture,
+        correlated=scale * power,
+        white=scale * power * (secondary / pattern.share),
+        shape=lit,
+        relative=relative,
+        pattern=pattern,
+    )
+
+
+def _decays(law: LagLaw, interval_s: float) -> FloatArray:
+    return np.exp(-interval_s / np.asarray(law.time_s, dtype=np.float64))
+
+
+def _trapped_before(
+    twin: Twin, request: SeriesRequest, law: LagLaw, calls: Mapping[str, object], cache: ModelCache
+) -> FloatArray:
+    """Charge in the traps (trap, row, column) at the begin of the series, from the exposures before it, DN."""
+    trapped = np.zeros((len(law.trapped), *twin.maps.shape))
+    share = np.asarray(law.trapped)[:, None, None]
+    clock: float | None = None
+    for earlier in request.previous:
+        interval = earlier.interval_s(twin.instrument.readout_ms)
+        exposures = earlier.frames * earlier.exposures_per_frame
+        if clock is not None:
+            trapped = trapped * _decays(law, max(earlier.start_s - clock, 0.0))[:, None, None]
+        decay = _decays(law, interval)[:, None, None]
+        left = decay**exposures
+        trapped = trapped * left
+        if earlier.beam_on:
+            state = final_state(twin, earlier, cache=cache, **calls)  # type: ignore[arg-type]
+            brought = _charge(twin, earlier, state).mean
+            trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
+        clock = earlier.start_s + exposures * interval
+    if clock is not None:
+        trapped = trapped * _decays(law, max(request.start_s - clock, 0.0))[:, None, None]
+    return trapped
+
+
+def _lag_weights(law: LagLaw, decay: FloatArray, count: int) -> FloatArray:
+    """Share of an exposure that it and the following ones read (count,)."""
+    trapped = np.asarray(law.trapped)
+    later = np.arange(count - 1)
+    return np.concatenate(
+        [[1.0 - trapped.sum()], np.sum((trapped * (1.0 - decay))[:, None] * decay[:, None] ** later, axis=0)]
+    )
+
+
+def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
+    """Covariance of stored frames (1 + lags,) over the variance of one exposure without lag."""
+    if law is None or decay is None:
+        return np.concatenate([[1.0 / averaged], np.zeros(_LAGS)])
+    trapped = np.asarray(law.trapped)
+    # covariance of single exposures over `lag`, sums of geometric series in closed form
+    first = 1.0 - float(trapped.sum())
+    amount = trapped * (1.0 - decay)
+    mixed = np.outer(amount, amount) / (1.0 - np.outer(decay, decay))
+
+    def single(lag: int) -> float:
+        if lag == 0:
+            return first**2 + float(mixed.sum())
+        return first * float(np.sum(amount * decay ** (lag - 1))) + float(np.sum(mixed * decay[:, None] ** lag))
+
+    if averaged == 1:
+        return np.array([single(lag) for lag in range(_LAGS + 1)])
+    reach = averaged * (_LAGS + 1)
+    singles = np.array([single(lag) for lag in range(reach)])
+    inside = averaged - np.abs(np.arange(-averaged + 1, averaged))
+    return np.array(
+        [
+            float(np.sum(inside * singles[np.abs(lag * averaged + np.arange(-averaged + 1, averaged))])) / averaged**2
+            for lag in range(_LAGS + 1)
+        ]
+    )
+
+
+def _frame_means(profile: FloatArray, averaged: int) -> FloatArray:
+    """Profile over exposures -> profile over stored frames."""
+    return np.asarray(profile.reshape(-1, averaged).mean(axis=1))
+
+
+def _staircase(
+    mean_DN: FloatArray, variance_DN2: FloatArray, step_DN: float
+) -> tuple[FloatArray | float, FloatArray | float]:
+    """What rounding to multiples of `step_DN` adds to the mean and the variance of a Gaussian value.
+
+    Source: characteristic functions of a quantised Gaussian, Widrow and Kollar (2008), chapter 4.
+    """
+    if step_DN <= 0:
+        return 0.0, 0.0
+    least = float(np.sqrt(max(float(np.min(variance_DN2)), 0.0)))
+    if least > 0.7 * step_DN:  # the first harmonic is below 1e-4 of a step
+        return 0.0, step_DN**2 / 12.0
+    shift = np.zeros_like(mean_DN)
+    square = np.full_like(mean_DN, step_DN**2 / 12.0)
+    cross = np.zeros_like(mean_DN)
+    for k in range(1, _HARMONICS + 1):
+        sign = -1.0 if k % 2 else 1.0
+        seen = sign * np.exp(-2.0 * (np.pi * k / step_DN) ** 2 * variance_DN2)
+        angle = 2.0 * np.pi * k / step_DN * mean_DN
+        wave = seen * np.cos(angle)
+        shift += seen * np.sin(angle) * (step_DN / (np.pi * k))
+        square += wave * (step_DN / (np.pi * k)) ** 2
+        cross += 2.0 * variance_DN2 * wave
+    return shift, np.maximum(square + 2.0 * cross - shift**2, -variance_DN2)
+
+
+def _read_variance(twin: Twin) -> FloatArray:
+    """Electronic variance (row, column) of one exposure without the ADC's rounding, DN^2."""
+    rounding = 1.0 / 12.0 if twin.noise.quantised else 0.0
+    return np.maximum(np.asarray(twin.maps.read_variance_DN2, dtype=np.float64) - rounding, 0.0)
+
+
+def expected_series(
+    twin: Twin,
+    request: SeriesRequest,
+    *,
+    effects: Sequence[AppliedEffect] | None = None,
+    parameters: NDArray[np.float64] | None = None,
+    cache: ModelCache | None = None,
+    use_measured_level: bool = True,
+) -> ExpectedSeries:
+    """What the frames of a series are expected to hold, DN.
+
+    Args:
+        twin: the calibrated line.
+        request: the series.
+        effects: in place of the twin's own; None: the twin's.
+        parameters: (parameter,) of the spectrum in place of the posterior's best.
+        cache: kept by the caller between calls, so that scenes and beams are projected once.
+        use_measured_level: where the twin measured this kV and filters, take level and noise from there and only their
+            change with the parameters from the spectral model.
+
+    Raises:
+        InputError: a beam without known level, a scene for a twin without spectral part, an unknown effect or parameter.
+    """
+    cache = ModelCache() if cache is None else cache
+    calls = {"effects": effects, "parameters": parameters, "use_measured_level": use_measured_level}
+    state = final_state(twin, request, cache=cache, **calls)  # type: ignore[arg-type]
+    charge = _charge(twin, request, state)
+    averaged = request.exposures_per_frame
+    exposures = request.frames * averaged
+    interval = request.interval_s(twin.instrument.readout_ms)
+    signal = charge.mean
+    trend: list[tuple[FloatArray, FloatArray]] = []
+    decay = None
+    if state.lag is not None:
+        law = state.lag
+        decay = _decays(law, interval)
+        before = _trapped_before(twin, request, law, calls, cache)
+        number = np.arange(exposures)
+        for trapped, left, held in zip(law.trapped, decay, before, strict=True):
+            # y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i]
+            amount = (1.0 - left) * held - trapped * charge.mean
+            course = _frame_means(left**number, averaged)
+            signal = signal + course.mean() * amount
+            trend.append((amount, course - course.mean()))
+    covariance = _temporal_covariance(state.lag, decay, averaged)
+    bend = state.bend_per_DN
+    slope: FloatArray | float = 1.0
+    if bend != 0.0:
+        slope = 1.0 - 2.0 * bend * signal
+        signal = signal * (1.0 - bend * signal)
+        trend = [(slope * amount, course) for amount, course in trend]
+    quantum = covariance[0] * slope**2 * charge.correlated
+    # secondary quanta are drawn before the traps as the others are
+    white = covariance[0] * slope**2 * charge.white
+    dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
+    for height, profile in state.offsets:
+        times = request.start_s + interval * np.arange(exposures, dtype=np.float64)
+        course = _frame_means(profile(times), averaged)
+        dark = dark + height * course.mean()
+        if request.frames > 1:
+            trend.append((np.full(twin.maps.shape, height), course - course.mean()))
+    electronic = _read_variance(twin)
+    mean = dark + signal
+    single = averaged * (quantum + white) + electronic + state.row_variance_DN2 + state.column_variance_DN2
+    shift, rounding = _staircase(mean, single, state.step_DN)
+    mean = mean + shift
+    white = white + (electronic + rounding) / averaged
+    saturated = 0.0
+    if twin.instrument.bits is not None:
+        highest = 2.0**twin.instrument.bits - 1.0
+        saturated = float(np.mean(mean >= highest))
+        if saturated > 0:
+            mean = np.minimum(mean, highest)
+    lags = np.arange(request.frames) * interval * averaged
+    correlation = np.exp(-lags / max(state.output_correlation_s, 1e-12))
+    return ExpectedSeries(
+        mean_DN=mean,
+        dark_DN=dark,
+        signal_DN=signal,
+        trend_DN=trend if trend and request.frames > 1 else None,
+        quantum_variance_DN2=np.asarray(quantum),
+        white_variance_DN2=np.asarray(white),
+        noise_autocovariance=charge.pattern.autocovariance,
+        row_variance_DN2=state.row_variance_DN2 / averaged,
+        column_variance_DN2=state.column_variance_DN2 / averaged,
+        frame_factor_rms=state.output_rms
+        * math.sqrt(_mean_of_correlated(interval, state.output_correlation_s, averaged))
+        if request.beam_on
+        else 0.0,
+        frame_factor_correlation=correlation,
+        temporal_correlation=covariance[1:] / covariance[0],
+        quantisation_step_DN=state.step_DN,
+        bad_pixel_share=state.bad_share,
+        fixed_pattern_rms=0.0 if state.gain_pattern is None or not request.beam_on else state.gain_pattern.rms,
+        saturated_share=saturated,
+        frames=request.frames,
+    )
+
+
+def _mean_of_correlated(interval_s: float, correlation_s: float, count: int) -> float:
+    """Variance of the mean of `count` values of an AR(1) process over its variance."""
+    if count == 1:
+        return 1.0
+    lag = np.arange(1, count)
+    rho = np.exp(-lag * interval_s / max(correlation_s, 1e-12))
+    return float((1.0 + 2.0 * np.sum((1.0 - lag / count) * rho)) / count)
+
+
+def _pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
+    rng = np.random.default_rng([0x6A17, pattern.seed])
+    return 1.0 + pattern.rms * rng.standard_normal(shape)
+
+
+@dataclass(frozen=True, slots=True)
+class _BadPixels:
+    dead: NDArray[np.bool_]
+    hot: NDArray[np.bool_]
+
+
+def _new_bad_pixels(state: LineState, shape: tuple[int, int]) -> _BadPixels | None:
+    """Half of them dead, half hot, a third of all in clusters of 2 x 2 and short lines."""
+    if state.bad_share <= 0:
+        return None
+    rng = np.random.default_rng([0xBAD, state.bad_seed])
+    wanted = rng.binomial(shape[0] * shape[1], min(state.bad_share, 1.0))
+    dead = np.zeros(shape, dtype=bool)
+    hot = np.zeros(shape, dtype=bool)
+    while int(np.count_nonzero(dead | hot)) < wanted:
+        left = wanted - int(np.count_nonzero(dead | hot))
+        row, column = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
+        kind = rng.random()
+        height, width = (2, 2) if kind < 1 / 12 and left >= 4 else (1, 8) if kind < 0.125 and left >= 8 else (1, 1)
+        target = dead if rng.random() < 0.5 else hot
+        target[row : row + height, column : column + width] = True
+    return _BadPixels(dead=dead, hot=hot & ~dead)
+
+
+def sample_series(
+    twin: Twin,
+    request: SeriesRequest,
+    *,
+    rng: np.random.Generator,
+    effects: Sequence[AppliedEffect] | None = None,
+    parameters: NDArray[np.float64] | None = None,
+    cache: ModelCache | None = None,
+    use_measured_level: bool = True,
+    memory: LineMemory | None = None,
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the stored frames (row, column) of a series, DN, with noise and as the ADC gives them.
+
+    Args:
+        twin, request, effects, parameters, cache, use_measured_level: as in `expected_series`.
+        rng: source of randomness.
+        memory: what the line remembers; handed from series to series it carries the charge that was really trapped and
+            the output error. None: as expected after `request.previous`, and nothing is handed on.
+
+    Raises:
+        InputError: as `expected_series`.
+    """
+    cache = ModelCache() if cache is None else cache
+    calls = {"effects": effects, "parameters": parameters, "use_measured_level": use_measured_level}
+    state = final_state(twin, request, cache=cache, **calls)  # type: ignore[arg-type]
+    charge = _charge(twin, request, state)
+    shape = twin.maps.shape
+    interval = request.interval_s(twin.instrument.readout_ms)
+    averaged = request.exposures_per_frame
+    carried = LineMemory(time_s=request.start_s) if memory is None else memory
+    trapped = None
+    decay = np.zeros(0)
+    if state.lag is not None:
+        decay = _decays(state.lag, interval)[:, None, None]
+        if carried.trapped_DN is None:
+            trapped = _trapped_before(twin, request, state.lag, calls, cache)
+        else:
+            pause = _decays(state.lag, max(request.start_s - carried.time_s, 0.0))
+            trapped = carried.trapped_DN * pause[:, None, None]
+        share = np.asarray(state.lag.trapped)[:, None, None]
+    gain = None if state.gain_pattern is None or not request.beam_on else _pattern(state.gain_pattern, shape)
+    bad = _new_bad_pixels(state, shape)
+    dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
+    electronic = np.sqrt(_read_variance(twin))
+    highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
+    lowest = 0.0 if twin.noise.quantised else -math.inf
+    scale = np.sqrt(charge.shape * charge.relative)
+    white = np.sqrt(charge.white)
+    before, variance = blurred_object(state)
+    # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
+    quantum = variance / (1.0 + twin.noise.white_fraction) / np.maximum(before, 1e-300)
+    quantum = np.maximum(quantum, 1e-9 * float(np.max(quantum)) + 1e-300)
+    number = 0
+    for _ in range(request.frames):
+        total = np.zeros(shape)
+        for _ in range(averaged):
+            now = request.start_s + number * interval
+            value = np.zeros(shape)
+            if request.beam_on:
+                value = charge.mean + scale * charge.pattern.sample(before, quantum, shape, rng)
+                value += white * rng.standard_normal(shape)
+                if state.output_rms > 0:
+                    carried.output_error = _next_error(carried, now, state, rng)
+                    carried.output_time_s = now
+                    value *= 1.0 + carried.output_error
+            if trapped is not None:
+                released = (1.0 - decay) * trapped
+                trapped = trapped - released + share * value
+                value = value * (1.0 - share.sum()) + released.sum(axis=0)
+            if gain is not None:
+                value = value * gain
+            value = value * (1.0 - state.bend_per_DN * value)
+            if bad is not None:
+                value = np.where(bad.dead, 0.0, value)
+            value = value + dark + electronic * rng.standard_normal(shape)
+            for height, profile in state.offsets:
+                value += height * float(profile(np.array(now)))
+            if state.row_variance_DN2 > 0:
+                value += math.sqrt(state.row_variance_DN2) * rng.standard_normal((shape[0], 1))
+            if state.column_variance_DN2 > 0:
+                value += math.sqrt(state.column_variance_DN2) * rng.standard_normal((1, shape[1]))
+            if bad is not None:
+                value = np.where(bad.hot, value + _HOT_SIGMAS * (electronic + 1.0), value)
+            if state.step_DN > 0:
+                value = np.rint(value / state.step_DN) * state.step_DN
+            total += np.clip(value, lowest, highest)
+            number += 1
+        carried.trapped_DN = trapped
+        yield (total / averaged).astype(np.float32)
+    carried.time_s = request.start_s + number * interval
+
+
+def _next_error(memory: LineMemory, now_s: float, state: LineState, rng: np.random.Generator) -> float:
+    """The next value of the output's AR(1) process."""
+    draw = float(rng.standard_normal())
+    if memory.output_error is None:
+        return state.output_rms * draw
+    rho = math.exp(-max(now_s - memory.output_time_s, 0.0) / max(state.output_correlation_s, 1e-12))
+    return rho * memory.output_error + math.sqrt(1.0 - rho**2) * state.output_rms * draw

@@ -1,4 +1,8 @@
-"""Dual-energy images at a setting from reference images: the noise each reference lacks is drawn anew."""
+"""Dual-energy images at a setting from reference images: the noise each reference lacks is drawn anew.
+
+At the kV and filter of the references that is a top-up (generator.topup); at any other, a transfer through two materials
+(generator.transfer).
+"""
 
 import math
 import os
@@ -15,13 +19,26 @@ from ..acquisition.setting import Setting, setting_from_text
 from ..errors import InputError
 from ..files import sha256_of_file
 from .as_published import published_parameters, sample_as_published
-from .predict import predict_flatfield, spectral_model_of
+from .predict import predict_flatfield, slope_share, spectral_model_of
+from .registration import estimate_shift_px, shift_image
 from .spectral_signal import OpenBeam, gain_behind_object
-from .topup import apply_top_up, plan_top_up
+from .topup import apply_top_up, plan_top_up, same_layers
+from .transfer import (
+    Channel,
+    DetectorNoise,
+    TransferredPair,
+    check_geometry,
+    check_transfer,
+    sample_transferred,
+    transfer_pair,
+)
 from .twin import Level, Twin
+from .two_material import TwoMaterialTables, tabulate_two_materials
 
 RECIPES = ("raytwin", "as_published")
 DEFAULT_PRODUCT = "chicken_breast"
+DEFAULT_FOREIGN = "rib_bone"
+BAD_PIXELS = ("repaired", "measured")
 _GAIN_THICKNESSES_MM = np.array([0.0, 1, 2, 4, 7, 11, 16, 22, 30, 40, 55, 75, 100, 140])
 
 
@@ -39,6 +56,7 @@ class GenerationSummary:
     reference_sha256: str
     clipped_percent: float
     warnings: tuple[str, ...]
+    transferred: bool = False
 
     def as_dict(self) -> dict[str, Any]:
         """The answer of `raytwin generate --json`."""
@@ -51,54 +69,72 @@ class GenerationSummary:
             "setting": self.setting,
             "hashes": {"dataset_sha256": self.dataset_sha256, "reference_sha256": self.reference_sha256},
             "clipped_percent": self.clipped_percent,
+            "transferred": self.transferred,
             "warnings": list(self.warnings),
         }
 
 
 @dataclass(slots=True)
 class ChannelModel:
-    """One tube voltage of a pair at the target: open signal, dark, and gain as a function of the transmission."""
+    """One tube voltage of a pair at the target: open signal, dark, and gain as a function of the transmission.
+
+    `bad_pixels` is `repaired`, where they are as their neighbours, or `measured`, where they are as the twin knows them.
+    """
 
     twin: Twin
     target: Setting
     product_material: str
-    level: Level = field(init=False)
+    bad_pixels: str = "repaired"
+    level: Level | None = field(init=False)
     open_signal_DN: NDArray[np.float64] = field(init=False)
     dark_DN: NDArray[np.float32] = field(init=False)
+    read_variance_DN2: NDArray[np.float32] = field(init=False)
     gain_DN: float = field(init=False)
     _transmission: NDArray[np.float64] = field(init=False)
     _gain_ratio: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
-        level = self.twin.level_at(self.target)
-        if level is None:
-            known = "; ".join(item.name for item in self.twin.levels)
+        twin = self.twin
+        self.level = twin.level_at(self.target)
+        if self.level is None and twin.spectral is None:
+            known = "; ".join(item.name for item in twin.levels)
             raise InputError(
                 "target setting",
                 received=str(self.target),
                 expected=f"a kV and filter that the twin was calibrated at ({known})",
                 remedy="add flats at this kV and filter to the calibration",
             )
-        predicted = predict_flatfield(self.twin, replace(self.target, averaged=1))
-        self.level = level
-        # bad pixels took their neighbours' place in the references, so flat, dark and noise are those of a good pixel
-        bad = self.twin.maps.bad_pixels > 0
-        shape = replace_bad_pixels(level.flat_shape.astype(np.float64), bad)
+        predicted = predict_flatfield(twin, replace(self.target, averaged=1))
+        shape = _flat_shape(twin, self.target).astype(np.float64)
+        dark = twin.maps.dark_at(self.target.exposure_ms)
+        variance = twin.maps.read_variance_DN2
+        bad = twin.maps.bad_pixels > 0
+        if self.bad_pixels == "repaired":
+            # they took their neighbours' place in the references, so flat, dark and noise are those of a good pixel
+            shape, dark = replace_bad_pixels(shape, bad), replace_bad_pixels(dark, bad)
+            variance = np.where(bad, np.float32(np.median(variance[~bad])), variance).astype(np.float32)
         self.open_signal_DN = predicted.mean_DN.value * shape
-        self.dark_DN = replace_bad_pixels(self.twin.maps.dark_at(self.target.exposure_ms), bad)
+        self.dark_DN = dark
+        self.read_variance_DN2 = variance
         self.gain_DN = predicted.gain_DN.value
-        if self.twin.spectral is None:
+        if twin.spectral is None:
             self._transmission, self._gain_ratio = np.array([0.0, 1.0]), np.ones(2)
         else:
-            model = spectral_model_of(self.twin, highest_kV=self.target.kV)
+            model = spectral_model_of(twin, highest_kV=self.target.kV)
             rate, ratio = gain_behind_object(
                 model,
-                self.twin.spectral.best,
+                twin.spectral.best,
                 OpenBeam(kV=self.target.kV, filters=self.target.filters),
                 material=self.product_material,
                 thickness_mm=_GAIN_THICKNESSES_MM,
             )
             self._transmission, self._gain_ratio = rate[::-1], ratio[::-1]
+
+    def channel(self) -> Channel:
+        """The same as a transfer needs it."""
+        return Channel(
+            setting=self.target, open_signal_DN=self.open_signal_DN, gain_DN=self.gain_DN, dark_DN=self.dark_DN
+        )
 
     def gain_behind(self, transmission: NDArray[np.floating]) -> NDArray[np.float64]:
         """Gain (row, column) of the spectrum behind as much product as the transmission says, DN."""
@@ -116,7 +152,7 @@ class ChannelModel:
             gain_DN=self.gain_behind(transmission),
             gain_relative=self.twin.maps.gain_relative,
             white_fraction=noise.white_fraction,
-            read_variance_DN2=self._read_variance(),
+            read_variance_DN2=self.read_variance_DN2,
             psf_model=noise.psf_model,
             psf_sigma_px=noise.psf_sigma_px.value,
             dark_DN=self.dark_DN,
@@ -132,13 +168,139 @@ class ChannelModel:
         )
 
     def log_image(self, counts: NDArray[np.floating]) -> NDArray[np.float32]:
-        """-log(I / I0) of counts (row, column)."""
-        return flat_corrected_log(counts, dark_DN=self.dark_DN, flat_DN=self.open_signal_DN + self.dark_DN)
+        """-log(I / I0) of counts (row, column); bad pixels that were put in are replaced by their neighbours."""
+        image = flat_corrected_log(counts, dark_DN=self.dark_DN, flat_DN=self.open_signal_DN + self.dark_DN)
+        if self.bad_pixels == "repaired":
+            return image
+        return np.asarray(replace_bad_pixels(image, self.twin.maps.bad_pixels > 0), dtype=np.float32)
 
-    def _read_variance(self) -> NDArray[np.float32]:
-        variance = self.twin.maps.read_variance_DN2
-        good = self.twin.maps.bad_pixels == 0
-        return np.where(good, variance, np.float32(np.median(variance[good]))).astype(np.float32)
+
+def _flat_shape(twin: Twin, setting: Setting) -> NDArray[np.float32]:
+    """Open field over its median (row, column): of this kV and filter, else of the nearest kV that was measured."""
+    level = twin.level_at(setting)
+    if level is None:
+        known = [one for one in twin.levels if one.kV is not None] or list(twin.levels)
+        level = min(
+            known,
+            key=lambda one: (
+                abs(math.log((one.kV or setting.kV) / setting.kV)),
+                not same_layers(one.filters, setting.filters),
+            ),
+        )
+    return level.flat_shape
+
+
+def same_beam(first: Setting, second: Setting) -> bool:
+    """Whether two settings have the same kV and filters."""
+    return abs(first.kV - second.kV) <= 1e-6 * second.kV and same_layers(first.filters, second.filters)
+
+
+def detector_noise(twin: Twin, *, bad_pixels: str = "repaired") -> DetectorNoise:
+    """The part of a twin's noise that no setting changes."""
+    variance = twin.maps.read_variance_DN2
+    bad = twin.maps.bad_pixels > 0
+    if bad_pixels == "repaired":
+        variance = np.where(bad, np.float32(np.median(variance[~bad])), variance).astype(np.float32)
+    return DetectorNoise(
+        psf_model=twin.noise.psf_model,
+        psf_sigma_px=twin.noise.psf_sigma_px.value,
+        white_fraction=twin.noise.white_fraction,
+        slope_share=slope_share(twin),
+        gain_relative=twin.maps.gain_relative,
+        read_variance_DN2=variance,
+        bits=twin.instrument.bits,
+        quantised=twin.noise.quantised,
+    )
+
+
+class PairTransfer:
+    """Brings reference pairs to one target pair of another kV or filter; tables and reference channels are kept.
+
+    Raises:
+        InputError: a twin without spectral part, or settings that a transfer cannot join.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        *,
+        low: Setting,
+        high: Setting,
+        product_material: str = DEFAULT_PRODUCT,
+        foreign_material: str = DEFAULT_FOREIGN,
+        bad_pixels: str = "repaired",
+    ) -> None:
+        if twin.spectral is None:
+            raise InputError(
+                "target setting",
+                received=f"{low};{high}",
+                expected="the kV and filter of the references, because this twin has no spectral part",
+                remedy="calibrate from flats that state kV and tube load",
+            )
+        self.twin = twin
+        self.targets = (low, high)
+        self.materials = (product_material, foreign_material)
+        self.models = tuple(ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high))
+        self._drawn = tuple(model.channel() for model in self.models)
+        repaired = self.models
+        if bad_pixels != "repaired":
+            repaired = tuple(ChannelModel(twin, one, product_material) for one in (low, high))
+        self._good = tuple(model.channel() for model in repaired)
+        self._detector = detector_noise(twin)
+        self._detector_drawn = detector_noise(twin, bad_pixels=bad_pixels)
+        self._references: dict[Setting, Channel] = {}
+        self._tables: dict[tuple[OpenBeam, OpenBeam, float], TwoMaterialTables] = {}
+
+    def transfer(
+        self,
+        log_images: NDArray[np.floating],
+        references: tuple[Setting, Setting],
+        *,
+        product: NDArray[np.bool_] | None = None,
+        name: str = "reference",
+    ) -> tuple[TransferredPair, tuple[str, ...]]:
+        """One reference pair (2, row, column) at the target's spectra, with the noise it brings, and warnings.
+
+        Raises:
+            InputError: the reference is too noisy for the target, or was taken at another distance.
+        """
+        check_geometry(references, self.targets)
+        pair = transfer_pair(
+            log_images,
+            self._tables_for(references, float(np.max(log_images[0]))),
+            references=[self._reference(one) for one in references],
+            targets=self._good,
+            detector=self._detector,
+            product=product,
+        )
+        warnings = check_transfer(pair, references=references, targets=self.targets, name=name)
+        if pair.unsolved_percent > 0.01:
+            warnings += (
+                f"{pair.unsolved_percent:.2g} % of the pixels fit no mixture of {self.materials[0]} and"
+                f" {self.materials[1]}; name a foreign material that does",
+            )
+        return pair, warnings
+
+    def draw(self, pair: TransferredPair, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Counts with dark (2, row, column) of a transferred pair, DN; each call draws its own noise."""
+        return sample_transferred(pair, targets=self._drawn, detector=self._detector_drawn, rng=rng)
+
+    def _reference(self, setting: Setting) -> Channel:
+        if setting not in self._references:
+            self._references[setting] = ChannelModel(self.twin, setting, self.materials[0]).channel()
+        return self._references[setting]
+
+    def _tables_for(self, references: tuple[Setting, Setting], highest_log: float) -> TwoMaterialTables:
+        beams = tuple(OpenBeam(kV=one.kV, filters=one.filters) for one in (*references, *self.targets))
+        top = 2.0 ** math.ceil(math.log2(max(highest_log, 1.0)) + 0.25)
+        key = (beams[0], beams[1], top)
+        if key not in self._tables:
+            model = spectral_model_of(self.twin, highest_kV=max(beam.kV for beam in beams))
+            best = self.twin.spectral.best if self.twin.spectral is not None else model.default_parameters()
+            self._tables[key] = tabulate_two_materials(
+                model, best, beams=beams, materials=self.materials, highest_log=top
+            )
+        return self._tables[key]
 
 
 def reference_settings(row: DatasetRow, fallback: tuple[Setting, Setting] | None) -> tuple[Setting, Setting]:
@@ -171,6 +333,9 @@ def generate_dataset(
     seed: int,
     recipe: str = "raytwin",
     product_material: str = DEFAULT_PRODUCT,
+    foreign_material: str = DEFAULT_FOREIGN,
+    bad_pixels: str = "repaired",
+    registration_px: tuple[float, float] | str | None = None,
     split: str | None = None,
     with_counts: bool = True,
     reference_setting: tuple[Setting, Setting] | None = None,
@@ -181,6 +346,19 @@ def generate_dataset(
 
     Each image takes one reference (all in turn, in an order drawn from the seed) and a noise of its own that depends on
     the seed and the image's number alone.
+
+    Args:
+        twin: the calibrated line.
+        reference: pairs with as little noise as can be had.
+        out: dataset file to write.
+        low, high: target settings; another kV or filter than the references' is reached through two materials.
+        product_material, foreign_material: what the beam hardens in, and the two materials of a transfer.
+        bad_pixels: `repaired` (as their neighbours) or `measured` (in the counts as the twin knows them; in the log
+            images replaced by their neighbours, as an import with a twin does).
+        registration_px: shift (row, column) of the reference's high image against the low one, taken off before anything
+            else; `estimate` finds it for each pair; None leaves the pair as it is.
+        split: references of this split only.
+        reference_setting: low and high setting of references that do not say.
 
     Raises:
         InputError: targets the twin or the references cannot reach, another detector size, no reference.
@@ -203,10 +381,35 @@ def generate_dataset(
     chosen = reference.indices(split=split)
     if len(chosen) == 0:
         raise InputError("reference", received=f"no image of split {split}", expected="at least one reference image")
-    channels = [ChannelModel(twin, low, product_material), ChannelModel(twin, high, product_material)]
+    if bad_pixels not in BAD_PIXELS:
+        raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
     settings = [reference_settings(reference.rows[int(index)], reference_setting) for index in chosen]
-    warnings = []
-    for pair in sorted(set(settings), key=str):
+    needs_transfer = {
+        pair: not all(same_beam(own, target) for own, target in zip(pair, (low, high), strict=True))
+        for pair in sorted(set(settings), key=str)
+    }
+    if recipe == "as_published" and any(needs_transfer.values()):
+        raise InputError(
+            "target setting",
+            received=f"{low};{high}",
+            expected="the kV and filter of the references: the published recipe knows no other",
+            remedy="use --recipe raytwin",
+        )
+    transfer = None
+    if any(needs_transfer.values()):
+        transfer = PairTransfer(
+            twin,
+            low=low,
+            high=high,
+            product_material=product_material,
+            foreign_material=foreign_material,
+            bad_pixels=bad_pixels,
+        )
+        channels = list(transfer.models)
+    else:
+        channels = [ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high)]
+    warnings: list[str] = []
+    for pair in [one for one, needed in needs_transfer.items() if not needed]:
         for own, target in zip(pair, (low, high), strict=True):
             plan = plan_top_up(reference=own, target=target)
             if plan.read < -1e-9:
@@ -229,17 +432,34 @@ def generate_dataset(
         "seed": seed,
         "recipe": recipe,
         "product_material": product_material,
+        "foreign_material": foreign_material if transfer is not None else None,
+        "bad_pixels": bad_pixels,
+        "registration_px": None if registration_px is None else str(registration_px),
     }
     with write_dataset(out, shape=reference.shape, provenance=provenance) as writer:
         for number in range(images):
             position = int(order[number % len(chosen)])
             index = int(chosen[position])
-            transmission = np.exp(-reference.images(index).astype(np.float64))
+            images_of_reference = _registered(reference.images(index), registration_px)
+            product = reference.product_masks(index)
             rng = np.random.default_rng([seed, 1, number])
             counts = np.empty((2, *reference.shape), dtype=np.float32)
             logs = np.empty_like(counts)
+            transferred = needs_transfer[settings[position]]
+            if transfer is not None and transferred:
+                transferred_pair, told = transfer.transfer(
+                    images_of_reference,
+                    settings[position],
+                    product=product,
+                    name=f"reference {reference.rows[index].image}",
+                )
+                counts = transfer.draw(transferred_pair, rng)
+                warnings += [line for line in told if line not in warnings]
+            transmission = np.exp(-images_of_reference.astype(np.float64))
             for plane, channel in enumerate(channels):
-                if recipe == "raytwin":
+                if transferred:
+                    pass
+                elif recipe == "raytwin":
                     counts[plane] = channel.sample_counts(transmission[plane], settings[position][plane], rng)
                 else:
                     counts[plane] = channel.sample_as_published(transmission[plane], rng)
@@ -253,7 +473,7 @@ def generate_dataset(
                 image=logs,
                 counts=counts if with_counts else None,
                 foreign_object_mask=foreign,
-                product_mask=reference.product_masks(index),
+                product_mask=product,
                 # the first image of a reference keeps its name, so that it pairs with the measured one
                 row=replace(
                     row, image=row.image if number < len(chosen) else f"{row.image}-{number:05d}", setting=setting_text
@@ -277,4 +497,16 @@ def generate_dataset(
         reference_sha256=reference_sha256,
         clipped_percent=clipped_percent if math.isfinite(clipped_percent) else 0.0,
         warnings=tuple(warnings),
+        transferred=transfer is not None,
     )
+
+
+def _registered(
+    log_images: NDArray[np.float32], registration_px: tuple[float, float] | str | None
+) -> NDArray[np.floating]:
+    """The pair with its high image moved onto the low one (2, row, column)."""
+    if registration_px is None:
+        return log_images
+    if isinstance(registration_px, str):
+        registration_px = estimate_shift_px(log_images[0], log_images[1])
+    return np.stack([log_images[0], shift_image(log_images[1], (-registration_px[0], -registration_px[1]))])

@@ -404,7 +404,8 @@ def test_clipped_images_are_counted_and_said(tmp_path, twin):
         ({"low": pair(20.0)[1], "high": pair(20.0)[0]}, "low kV below high kV"),
         ({"split": "val"}, "no image of split val"),
         ({"exposure_ms": 2000.0}, "too noisy"),
-        ({"low": replace(pair(20.0)[0], filters=())}, "calibrated at"),
+        ({"low": replace(pair(20.0)[0], filters=()), "recipe": "as_published"}, "published recipe knows no other"),
+        ({"bad_pixels": "other"}, "repaired, measured"),
     ],
 )
 def test_what_cannot_be_generated_is_refused_and_leaves_no_file(tmp_path, twin, options, message):

@@ -1,7 +1,8 @@
 """Generate dual-energy images at a setting from low-noise reference images: only the noise they lack is added.
 
-REFERENCE is a dataset file, or an acquisition whose object series pair up by scene. The target has the kV and filter of
-the references and less tube load; current, exposure and averaging are free.
+REFERENCE is a dataset file, or an acquisition whose object series pair up by scene. At the kV and filter of the references
+current, exposure and averaging are free, as long as the target has less tube load. At another kV or filter every pixel is
+solved for two materials (--product-material and --foreign-material) and projected through the target's spectrum.
 """
 
 import argparse
@@ -15,6 +16,8 @@ from ._answer import answer, say
 EXAMPLE = """example:
   raytwin generate twin.h5 references.h5 -n 200 --seed 1 -o train_20ms.h5 \\
     --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
+  raytwin generate twin.h5 references.h5 -n 200 --seed 1 -o other_kv.h5 \
+    --low kv=60,power_w=40,exposure_ms=20,filter=Al:2 --high kv=120,power_w=45,exposure_ms=20,filter=Al:2
 """
 
 
@@ -29,7 +32,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="DATASET", type=Path, required=True, help="dataset file to write")
     parser.add_argument("--recipe", choices=("raytwin", "as_published"), default="raytwin", help="noise recipe")
     parser.add_argument("--split", choices=("train", "val", "test"), help="use references of this split only")
-    parser.add_argument("--product-material", default="chicken_breast", help="what hardens the beam (noise gain)")
+    parser.add_argument(
+        "--product-material", default="chicken_breast", help="what the product is made of (%(default)s)"
+    )
+    parser.add_argument(
+        "--foreign-material", default="rib_bone", help="the second material of another kV or filter (%(default)s)"
+    )
+    parser.add_argument(
+        "--bad-pixels",
+        choices=("repaired", "measured"),
+        default="repaired",
+        help="measured: the counts hold the twin's bad pixels, the log images their neighbours' values (%(default)s)",
+    )
+    parser.add_argument(
+        "--registration",
+        metavar="ROWS,COLUMNS|estimate",
+        help="shift in pixels of the references' high-kV image against the low one, taken off",
+    )
     parser.add_argument("--reference-low", metavar="SETTING", help="setting of the references where they do not say")
     parser.add_argument("--reference-high", metavar="SETTING", help="the same at the high kV")
     parser.add_argument("--no-counts", action="store_true", help="leave out the raw counts")
@@ -49,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     twin = read_twin(arguments.twin)
     low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
     material_from_name(arguments.product_material)
+    material_from_name(arguments.foreign_material)
     if (arguments.reference_low is None) != (arguments.reference_high is None):
         raise InputError("--reference-low and --reference-high", received="one of the two", expected="both or neither")
     fallback = None
@@ -91,6 +111,9 @@ def run(arguments: argparse.Namespace) -> int:
                 seed=arguments.seed,
                 recipe=arguments.recipe,
                 product_material=arguments.product_material,
+                foreign_material=arguments.foreign_material,
+                bad_pixels=arguments.bad_pixels,
+                registration_px=_registration(arguments.registration),
                 split=arguments.split,
                 with_counts=not arguments.no_counts,
                 reference_setting=fallback,
@@ -103,6 +126,20 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))
     return 0
+
+
+def _registration(text: str | None) -> tuple[float, float] | str | None:
+    from ..errors import InputError
+
+    if text is None or text == "estimate":
+        return text
+    try:
+        rows, columns = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(
+            "--registration", received=repr(text), expected="ROWS,COLUMNS in pixels, or estimate", remedy="e.g. 0.5,-1"
+        ) from None
+    return rows, columns
 
 
 def _longest_pair(acquisition: Any) -> tuple[Any, Any, tuple[int, int]]:

@@ -35,7 +35,8 @@ class FrameContext:
     """What a stage may know of the frame that it works on.
 
     Fields: system, maps; exposure_ms; summed: how many exposures are simulated as one and averaged (1: a single frame);
-    key: of the random streams; frame: number within the session; memory: what stateful stages keep between frames.
+    key: of the random streams; frame: number within the session; memory: what stateful stages keep between frames;
+    began_s: the session's clock when the exposure began.
     """
 
     system: LabSystem
@@ -45,6 +46,7 @@ class FrameContext:
     key: np.uint64
     frame: int
     memory: dict[str, Any] = field(default_factory=dict)
+    began_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,11 +3,11 @@
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,8 +29,12 @@ from .objects import (
     sample_bone,
     sample_fillet,
 )
+from .session import GEOMETRIES, SESSIONS, make_session, measure_session, session_system
 from .system import LabSystem, sample_system
 from .truth import compute_truth, flat_truth
+
+if TYPE_CHECKING:
+    from .effect import EffectRequest
 
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)
 FLAT_POWERS_W = (1.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0)
@@ -299,7 +303,8 @@ def make_plan(
         InputError: an unknown protocol, numbers below 1 (2 products), or a product larger than the field.
     """
     if protocol not in PROTOCOLS:
-        raise InputError("protocol", received=repr(protocol), expected="one of " + ", ".join(PROTOCOLS))
+        known = ", ".join((*PROTOCOLS, *SESSIONS))
+        raise InputError("protocol", received=repr(protocol), expected=f"one of {known}")
     frames = DEFAULT_FRAMES[protocol] if frames is None else frames
     if frames < 1:
         raise InputError("frames", received=frames, expected="1 or more")
@@ -330,8 +335,8 @@ def run_protocol(
     protocol: str,
     seed: int,
     rows: int = 128,
-    columns: int = 160,
-    pixel_mm: float = 0.45,
+    columns: int | None = None,
+    pixel_mm: float | None = None,
     source_detector_mm: float | None = None,
     frames: int | None = None,
     products: int | None = None,
@@ -339,6 +344,8 @@ def run_protocol(
     bones_mm: tuple[float, ...] | None = None,
     session: int = 0,
     system: LabSystem | None = None,
+    geometry: str | None = None,
+    effects: Sequence["EffectRequest"] = (),
     begin: Callable[[int], None] = lambda frames: None,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
@@ -346,9 +353,10 @@ def run_protocol(
 
     Args:
         path: the acquisition file to write; the truth goes to `truth_path(path)`.
-        protocol: `calibration`, `set1` or `set2`.
+        protocol: `calibration`, `set1` or `set2`; or `full`, `short` or `products`, see `session`.
         seed: draws the hidden system, the products and the noise; the same seed is the same system in all protocols.
-        rows, columns, pixel_mm: the detector; distances scale with the pixel, see `LabSystem.at_size`.
+        rows, columns, pixel_mm: the detector, 128 x 160 pixels of 0.45 mm by default; distances scale with the pixel,
+            see `LabSystem.at_size`. Long sessions are 128 x 128 and have the pixel of their geometry.
         source_detector_mm: another distance than the one that scales with the pixel; nearer means more photons.
         frames: frames per series (of the product sets: per object at a single exposure).
         products: how many (sets only).
@@ -356,6 +364,8 @@ def run_protocol(
         bones_mm: lengths of the bones, instead of the set's own.
         session: another number is another day: other noise and other products on the same system.
         system: a system to measure with, instead of the seed's.
+        geometry: `fine` or `coarse` (the default), for the long sessions.
+        effects: to be planted, in the long sessions.
         begin, advance: called with the number of frames to come, and after each.
 
     Returns:
@@ -366,9 +376,37 @@ def run_protocol(
     """
     if seed < 0 or session < 0:
         raise InputError("seed and session", received=f"{seed} and {session}", expected="whole numbers of 0 or more")
+    if protocol in SESSIONS:
+        _only_in(
+            "a set of products or a calibration",
+            pixel_mm=pixel_mm,
+            source_detector_mm=source_detector_mm,
+            product_mm=product_mm,
+            bones_mm=bones_mm,
+        )
+        return _run_session(
+            path,
+            protocol=protocol,
+            seed=seed,
+            rows=rows,
+            columns=rows if columns is None else columns,
+            geometry=geometry or "coarse",
+            frames=frames,
+            products=products,
+            session=session,
+            system=system,
+            effects=tuple(effects),
+            begin=begin,
+            advance=advance,
+        )
+    _only_in("a long session (full, short or products)", geometry=geometry, effects=effects or None)
     if system is None:
         system = system_of_seed(
-            seed, rows=rows, columns=columns, pixel_mm=pixel_mm, source_detector_mm=source_detector_mm
+            seed,
+            rows=rows,
+            columns=160 if columns is None else columns,
+            pixel_mm=0.45 if pixel_mm is None else pixel_mm,
+            source_detector_mm=source_detector_mm,
         )
     place = list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else 0
     plan_rng, noise_rng = (np.random.default_rng([seed, 1 + place, session, part]) for part in (0, 1))
@@ -411,6 +449,56 @@ def run_protocol(
     with whole_file(truth_path(path)) as temporary:
         temporary.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     return truth
+
+
+def _only_in(place: str, **given: object) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(name, received=value, expected=f"nothing: it belongs to {place}")
+
+
+def _run_session(
+    path: str | os.PathLike[str],
+    *,
+    protocol: str,
+    seed: int,
+    rows: int,
+    columns: int,
+    geometry: str,
+    frames: int | None,
+    products: int | None,
+    session: int,
+    system: LabSystem | None,
+    effects: tuple["EffectRequest", ...],
+    begin: Callable[[int], None],
+    advance: Callable[[], None],
+) -> dict[str, Any]:
+    from .effect import Site
+    from .effects import plant
+
+    if geometry not in GEOMETRIES:
+        raise InputError("geometry", received=repr(geometry), expected="one of " + ", ".join(GEOMETRIES))
+    bench = GEOMETRIES[geometry]
+    if system is None:
+        system = session_system(seed, rows=rows, columns=columns, geometry=bench)
+    place = 100 + list(SESSIONS).index(protocol)
+    plan_rng, noise_rng, effect_rng = (np.random.default_rng([seed, place, session, part]) for part in (0, 1, 2))
+    plan = make_session(protocol, system=system, geometry=bench, rng=plan_rng, frames=frames, products=products)
+    planted = plant(effects, Site(system=system, geometry=bench, plan=plan, rng=effect_rng))
+    return measure_session(
+        path,
+        protocol=protocol,
+        seed=seed,
+        session=session,
+        system=system,
+        plan=plan,
+        planted=planted,
+        rng=noise_rng,
+        truth_path=truth_path(path),
+        geometry=geometry,
+        begin=begin,
+        advance=advance,
+    )
 
 
 def _measure(

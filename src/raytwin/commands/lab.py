@@ -4,6 +4,10 @@ The lab stands in for a real X-ray line whose truth is known: photons are sample
 light spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden
 system (tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
 `--protocol calibration` can be judged on `--protocol set2` of the same seed.
+
+The long sessions (`full`, `short`, `products`) are for a diagnosis. `full` has darks, flats at five exposures and two kV
+without and with a filter, beam-off frames, wedges at two gaps, a slab, edges, discs, flats with the panel turned, and
+products. Effects can be planted in them: they were always there, or set in after the calibration series.
 """
 
 import argparse
@@ -16,23 +20,29 @@ from ._answer import answer
 EXAMPLE = """example:
   raytwin lab -o calibration.h5 --protocol calibration --seed 1
   raytwin lab -o products.h5 --protocol set1 --seed 1 --products 40 --size 128x160
+  raytwin lab -o session.h5 --protocol full --effect image_lag=0.5 --effect kv_error=1.5@calibration --seed 1
 
 The truth goes to calibration.truth.json. Frames are 128 x 160 pixels of 0.45 mm unless --size and --pixel-mm say
 otherwise; 760x956 pixels of 0.15 mm is the paper's detector. The distances scale with the pixel, so that a power and an
-exposure time mean the same photons per pixel at every size."""
+exposure time mean the same photons per pixel at every size. Long sessions are 128 x 128 pixels, of 0.4 mm (coarse) or
+0.12 mm (fine)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="ACQ", help="acquisition file to write")
-    parser.add_argument("--protocol", required=True, metavar="NAME", help="calibration, set1 or set2")
+    parser.add_argument(
+        "--protocol", required=True, metavar="NAME", help="calibration, set1, set2; full, short or products"
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="draws system, products and noise (default 0)")
-    parser.add_argument("--size", default="128x160", metavar="N", help="pixels: ROWSxCOLUMNS, or N for N x N")
-    parser.add_argument("--pixel-mm", type=float, default=0.45, metavar="MM", help="pitch (default 0.45 mm)")
+    parser.add_argument(
+        "--size", metavar="N", help="pixels: ROWSxCOLUMNS, or N for N x N (default 128x160; long sessions 128)"
+    )
+    parser.add_argument("--pixel-mm", type=float, metavar="MM", help="pitch (default 0.45 mm)")
     parser.add_argument(
         "--frames",
         type=int,
         metavar="N",
-        help="frames per series (default 20; product sets: frames per object and exposure, default 1)",
+        help="frames per series (default 20, long sessions 50; product sets: per object and exposure, default 1)",
     )
     parser.add_argument("--products", type=int, metavar="N", help="products in a set (default 254 in set1, 84 in set2)")
     parser.add_argument("--product-mm", type=float, metavar="MM", help="length of a product (default: fills the field)")
@@ -51,7 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="ID=STRENGTH",
-        help="an effect to plant; none is available in this version",
+        help="an effect to plant in a long session, with @always or @calibration (set in after it) where it should"
+        " not be as usual; repeatable",
+    )
+    parser.add_argument(
+        "--geometry", metavar="NAME", help="long sessions: coarse (0.4 mm pixels, the default) or fine (0.12 mm)"
     )
     parser.add_argument("--json", action="store_true", help="print the truth as JSON")
 
@@ -74,16 +88,13 @@ def _lengths(text: str | None) -> tuple[float, ...] | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from ..lab.effects import request_from_text
     from ..lab.protocols import run_protocol, truth_path
+    from ..lab.session import SESSIONS
 
-    if arguments.effect:
-        raise InputError(
-            "--effect",
-            received=", ".join(arguments.effect),
-            expected="no effect: none is available in this version",
-            remedy="leave --effect out",
-        )
-    rows, columns = _size(arguments.size)
+    effects = [request_from_text(text) for text in arguments.effect]
+    usual = "128" if arguments.protocol in SESSIONS else "128x160"
+    rows, columns = _size(usual if arguments.size is None else arguments.size)
     bar: Any = None
 
     def begin(frames: int) -> None:
@@ -109,6 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
             bones_mm=_lengths(arguments.bones_mm),
             source_detector_mm=arguments.source_detector_mm,
             session=arguments.session,
+            geometry=arguments.geometry,
+            effects=effects,
             begin=begin,
             advance=advance,
         )

@@ -1,0 +1,59 @@
+"""The effects that can be planted in a session: the one registry, requests from text, and planting.
+
+Each law is made to give the strength that was asked for, as the column `strength` of the catalogue defines it, and is
+of another form than the catalogue's formula wherever nature allows.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..errors import InputError
+from .effect import FORM, EffectLaw, EffectRequest, Site
+from .effects_beam import BEAM_LAWS
+from .effects_detector import DETECTOR_LAWS
+from .line import Planted
+
+EFFECTS: Mapping[str, EffectLaw] = {law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS)}
+
+
+def request_from_text(text: str) -> EffectRequest:
+    """A request from `ID=STRENGTH[@always|@calibration]`.
+
+    Raises:
+        InputError: an unknown id, no number, or a strength far out of range.
+    """
+    name, equals, rest = text.strip().partition("=")
+    word, at, since = rest.partition("@")
+    try:
+        if not equals:
+            raise ValueError
+        strength = float(word)
+    except ValueError:
+        raise InputError("--effect", received=repr(text), expected="ID=STRENGTH", remedy=FORM) from None
+    return EffectRequest(id=name.strip(), strength=strength, since=since.strip() if at else None)
+
+
+def plant(requests: Sequence[EffectRequest], site: Site) -> tuple[Planted, ...]:
+    """The effects as they will act, each with random numbers of its own; strength 0 plants nothing.
+
+    Raises:
+        InputError: the same effect twice.
+    """
+    names = [request.id for request in requests]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError("effects", received=f"{twice[0]} twice", expected="each effect at most once")
+    planted = []
+    order = list(EFFECTS)
+    seeds = site.rng.integers(0, 2**62, size=len(order))
+    for request in sorted(requests, key=lambda one: order.index(one.id)):
+        if request.strength == 0.0:
+            continue
+        rng = np.random.default_rng(int(seeds[order.index(request.id)]))
+        own = Site(system=site.system, geometry=site.geometry, plan=site.plan, rng=rng)
+        since = request.since or EFFECTS[request.id].since
+        planted.append(
+            EFFECTS[request.id].build(EffectRequest(id=request.id, strength=request.strength, since=since), own)
+        )
+    return tuple(planted)

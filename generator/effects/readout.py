@@ -47,7 +47,7 @@ ROW_NOISE = Effect(
     ),
     stage="electronics",
     reference="correlated line noise of flat panels and CMOS; EMVA Standard 1288, release 4.0",
-    after_calibration=True,
+    after_calibration=False,
     change=_add_row_noise,
 )
 
@@ -72,7 +72,7 @@ QUANTISATION = Effect(
     ),
     stage="readout",
     reference="uniform quantiser: Widrow (1956), doi:10.1109/TCT.1956.1086334",
-    after_calibration=True,
+    after_calibration=False,
     change=_lose_bits,
 )
 

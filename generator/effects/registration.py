@@ -81,7 +81,7 @@ MISREGISTRATION = Effect(
     ),
     stage="arrivals",
     reference="rigid shift and uniform scale",
-    after_calibration=True,
+    after_calibration=False,
     change=_displace,
     needs=("scene",),
 )

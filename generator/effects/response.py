@@ -32,7 +32,6 @@ NONLINEARITY = Effect(
             default=1.0,
             source="departure from the initial line at half of the highest level",
             log=False,
-            signed=True,
         ),
         Parameter(
             name="highest_signal_DN",

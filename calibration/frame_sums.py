@@ -77,7 +77,7 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
     Raises:
         InputError: no frame at all, frames of different shapes, NaN or infinite values.
     """
-    from ._kernels import COUNT_BLOCK, accumulate, accumulate_counts
+    from ._kernels import COUNT_BLOCK, accumulate, accumulate_counts, count_equal
 
     frames = pairs = maximum_count = 0
     maximum_DN = -np.inf
@@ -111,10 +111,12 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
             blocks = -(-pixels // COUNT_BLOCK)
             totals = np.empty((blocks, count), np.int64)
             tops, times = np.empty(blocks, np.int64), np.empty(blocks, np.int64)
-            accumulate_counts(flat, last, frames > 0, reference, deviation, square, pair, totals, tops, times)
+            accumulate_counts(flat, last, frames > 0, reference, deviation, square, pair, totals, tops)
             frame_means.append(totals.sum(axis=0) / pixels)
-            highest = float(tops.max())
-            equal = int(times[tops == tops.max()].sum())
+            highest, equal = float(tops.max()), 0
+            if highest >= maximum_DN:
+                count_equal(flat, tops, tops.max(), times)
+                equal = int(times.sum())
         else:
             accumulate(flat, last, frames > 0, reference, deviation, square, pair)
             frame_means.append(flat.mean(axis=1, dtype=np.float64))

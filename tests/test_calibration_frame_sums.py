@@ -151,3 +151,21 @@ def test_counts_after_floats_keep_the_reference_of_the_floats():
     assert mixed.stack_variance_DN2 == pytest.approx(exact.var(axis=0, ddof=1), rel=1e-12)
     assert mixed.pair_variance_DN2 == pytest.approx(np.mean(np.diff(exact, axis=0) ** 2, axis=0) / 2, rel=1e-12)
     assert not mixed.integer
+
+
+@pytest.mark.parametrize("spread", [1, 3000, 65535])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_sums_of_many_frames_are_exact_whatever_the_spread_of_their_values(dtype, spread):
+    """Quiet and wild stretches in turn, so that narrow sums fill up, are moved and go on."""
+    rng = np.random.default_rng(3)
+    top = np.iinfo(dtype).max
+    wild = rng.integers(0, top, size=(151, 5, 7), endpoint=True)
+    quiet = rng.integers(max(top - spread, 0), top, size=(2 * 151, 5, 7), endpoint=True)
+    frames = np.concatenate([quiet[:151], wild, quiet[151:]]).astype(dtype)
+    whole = frames.astype(np.int64)
+    for total in (sum_frames([frames]), sum_frames([frames[:33], frames[33:]])):
+        away = whole - whole[0]
+        assert np.array_equal(total.deviation_sum, away.sum(axis=0))
+        assert np.array_equal(total.square_sum, (away**2).sum(axis=0))
+        assert np.array_equal(total.pair_square_sum, (np.diff(whole, axis=0) ** 2).sum(axis=0))
+        assert (total.maximum_DN, total.maximum_count) == (whole.max(), np.sum(whole == whole.max()))

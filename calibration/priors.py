@@ -1,6 +1,8 @@
 """What is known of a tube and a detector before its flats are looked at. The one place where priors stand.
 
-Each prior is Gaussian in the parameter (cut at the bounds); logarithms are natural.
+Each prior is Gaussian in the parameter (cut at the bounds); logarithms are natural. Three kinds of parameters: what the
+vendor does not tell (filtration, scintillator, voltage, output, gain), what the physics tables leave open (attenuation,
+spectrum model, escape), and how well a line repeats itself (the discrepancies).
 """
 
 import math
@@ -33,6 +35,9 @@ PRIORS: dict[str, Prior] = {
         centre=0.0, sd=0.2, low=-1.6, high=1.6, reason="packing density and tolerance of a declared scintillator"
     ),
     "kV_error": Prior(centre=0.0, sd=0.01, low=-0.06, high=0.06, reason="generators are set to about 1 %"),
+    "kV_tilt": Prior(
+        centre=0.0, sd=0.003, reason="the error differs between voltages: 0.3 % from 40 to 110 kV, of a set scale's 1 %"
+    ),
     "log_output": Prior(
         centre=0.0, sd=1.0, reason="tube output over the model's; fixed by the level and the gain, not by this prior"
     ),
@@ -44,22 +49,39 @@ PRIORS: dict[str, Prior] = {
         high=0.0,
         reason="light only, 0.8-1: escape of K photons, which takes CsI and Gd2O2S screens down to 0.7, is in the response",
     ),
+    "spectrum_model": Prior(
+        centre=0.5, sd=0.7, reason="SpekPy's casim is 0, its kqp 1: the truth between them or somewhat beyond"
+    ),
     "yield_exponent": Prior(
-        centre=0.0, sd=0.02, reason="spectrum models differ by 2 % in output from 40 to 120 kV (casim against kqp)"
+        centre=0.0, sd=0.02, reason="output against voltage beyond the models' difference, 2 % from 40 to 110 kV"
     ),
     "hardness_exponent": Prior(
-        centre=0.0, sd=0.03, reason="spectrum models differ by 2 % in hardness at 40 kV (casim against kqp)"
+        centre=0.0,
+        sd=0.03,
+        reason="hardness beyond the models' difference, 2 % from 30 to 60 keV: roughness of the anode",
+    ),
+    "escape_scale": Prior(
+        centre=0.0, sd=0.1, reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %"
+    ),
+    "scintillator_table": Prior(
+        centre=0.67, sd=0.6, reason="0 is xraylib, 1 the mean of Chantler's and PENELOPE's: the three tables' own mean"
     ),
 }
 UNDECLARED_SCINTILLATOR = Prior(
-    centre=0.0, sd=0.5, low=-1.6, high=1.6, reason="scintillator not declared: CsI 0.5 mm assumed"
+    centre=0.0, sd=0.5, low=-1.6, high=1.6, reason="scintillator not declared: CsI 0.5 mm or Gd2O2S 0.15 mm assumed"
 )
+# prior probability of Gd2O2S where nobody says: nothing is known, so CsI has the other half
+GADOLINIUM_SHARE = 0.5
 COUNTING_SWANK = Prior(
     centre=-0.005, sd=0.01, low=-0.1, high=0.0, reason="a counter has no energy-dependent pulse noise"
 )
-ATTENUATION_SCALE = Prior(
-    centre=0.0, sd=0.015, reason="attenuation tables differ by 1-4 % (xraylib, Chantler, PENELOPE)"
+ATTENUATION_SCALE = Prior(centre=0.0, sd=0.01, reason="density and thickness of a filter")
+TABLE_SHARE = Prior(
+    centre=0.33, sd=0.6, reason="0 is xraylib, 1 the other table: the mean of xraylib, Chantler and PENELOPE"
 )
 
-LEVEL_DISCREPANCY = 0.003  # of the level of a kV and filter: reproducibility of tube and filters beyond the parameters
-GAIN_DISCREPANCY = 0.01  # of the gain of a kV and filter
+# Departure of single levels and gains from any such model: reproducibility of tube and filters, and physics that is not
+# in it. Learned from the levels with these as the prior: logarithm of the relative standard deviation.
+LEVEL_DISCREPANCY = 0.0015
+GAIN_DISCREPANCY = 0.004
+LOG_DISCREPANCY_SD = 0.8  # a factor of 2.2 either way

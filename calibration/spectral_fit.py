@@ -1,11 +1,13 @@
-"""The spectral part of a twin: tube, filtration, scintillator and gain from the levels and gains of the flats.
+"""The spectral part of a twin: tube, filtration, scintillator and gain from levels, gains and transmissions.
 
-Only ratios between levels say anything of the spectrum, and flats alone leave much open; so the answer is a posterior,
-drawn by adaptive importance sampling about the most probable point.
+Only ratios between levels say anything of the spectrum, and flats alone leave much open; so the answer is a posterior.
+Filtration, scintillator thickness, tube voltage and the size of the discrepancies are drawn by importance sampling. All
+else (scales, tables, exponents) acts on the logarithm of a level nearly linearly: for each draw it is integrated out
+exactly about that draw's own derivatives, and drawn back from its conditional Gaussian.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,43 +16,73 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
-from ..generator.spectral_signal import REFERENCE_KV, OpenBeam, SpectralModel
+from ..generator.spectral_signal import (
+    ALTERNATIVE_SCINTILLATOR,
+    OTHER_TABLES,
+    OpenBeam,
+    SpectralModel,
+    attenuation_scale_name,
+)
 from ..generator.twin import Level, SpectralPosterior
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
+    GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
+    LOG_DISCREPANCY_SD,
     PRIORS,
+    TABLE_SHARE,
     UNDECLARED_SCINTILLATOR,
     Prior,
 )
 
-_DRAWS = 4096
+_ROUND_DRAWS = 1024
+_FINAL_DRAWS = 2048
+_ROUNDS = 12
 _KEPT = 512
+_ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
 _STUDENT_DEGREES = 5.0
-_MIXTURE = (0.7, 0.2, 0.1)
+_MIXTURE = (0.75, 0.2, 0.05)
 _Z95 = 1.959964
-LINEAR_PARAMETERS = ("log_output", "log_DN_per_keV", "log_swank", "yield_exponent")
+SHAPE_PARAMETERS = ("inherent_filtration_mm_Al", "log_scintillator_thickness", "kV_error", ALTERNATIVE_SCINTILLATOR)
+DEFAULT_SCINTILLATOR = (Filter(material="CsI", thickness_mm=0.5),)
+OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpectralFit:
-    """Posterior and how well it was drawn: effective sample size of the last round, chi-square at the best point."""
+    """Posterior and how well it was drawn: effective sample size of the last round, chi-square at the best point.
+
+    discrepancy: median and 95 % interval of the learned relative sd of a level and of a gain beyond the parameters.
+    """
 
     posterior: SpectralPosterior
     effective_draws: float
     chi_square: float
     data: int
+    discrepancy: Mapping[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transmission:
+    """Signal behind known layers over the open signal at one kV and filter, with its relative standard deviation."""
+
+    kV: float
+    filters: tuple[Filter, ...]
+    layers: tuple[Filter, ...]
+    value: float
+    relative_sd: float
+    series: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class _Datum:
-    beam: OpenBeam
-    log_rate: float | None  # per mAs at 1 m and 1 mm2
-    log_rate_sd: float
-    log_gain: float
-    log_gain_sd: float
+    kind: str  # rate, gain or transmission
+    beam: int
+    over: int  # beam of the denominator of a transmission
+    value: float  # logarithm
+    sd: float
 
 
 def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None) -> float:
@@ -68,9 +100,41 @@ def priors_for(model: SpectralModel, *, scintillator_declared: bool) -> dict[str
             result[name] = UNDECLARED_SCINTILLATOR
         elif name == "log_swank" and model.counting:
             result[name] = COUNTING_SWANK
+        elif name == ALTERNATIVE_SCINTILLATOR:
+            share = GADOLINIUM_SHARE
+            result[name] = Prior(
+                centre=share, sd=math.sqrt(share * (1.0 - share)), reason="0 is CsI, 1 Gd2O2S: not declared"
+            )
+        elif name in PRIORS:
+            result[name] = PRIORS[name]
+        elif any(name.startswith(f"{table}_") for table in OTHER_TABLES):
+            result[name] = TABLE_SHARE
         else:
-            result[name] = PRIORS.get(name, ATTENUATION_SCALE)
+            result[name] = ATTENUATION_SCALE
     return result
+
+
+def model_for(
+    instrument: Instrument, *, materials: Sequence[str], highest_kV: float, model_name: str = "casim"
+) -> SpectralModel:
+    """The spectral model of a declared instrument; what it leaves open takes the defaults (W, 12 degrees).
+
+    Without a declared scintillator CsI and Gd2O2S are both weighed (for a counting detector only CsI, as a stand-in).
+    """
+    undeclared = instrument.scintillator is None and not instrument.counting
+    return SpectralModel(
+        anode=instrument.anode or "W",
+        anode_angle_deg=instrument.anode_angle_deg or 12.0,
+        model=model_name,
+        inherent=instrument.inherent_filtration or (),
+        scintillator=instrument.scintillator or DEFAULT_SCINTILLATOR,
+        alternative=OTHER_SCINTILLATOR if undeclared else (),
+        cover=instrument.detector_cover or (),
+        counting=bool(instrument.counting),
+        # the commonest filters carry their uncertainty even where they were not measured
+        filter_materials=sorted({*materials, "Al", "Cu"}),
+        highest_kV=max(160.0, highest_kV),
+    )
 
 
 def fit_spectrum(
@@ -78,17 +142,20 @@ def fit_spectrum(
     instrument: Instrument,
     *,
     rng: np.random.Generator,
-    level_discrepancy: float = LEVEL_DISCREPANCY,
-    gain_discrepancy: float = GAIN_DISCREPANCY,
+    transmissions: Sequence[Transmission] = (),
+    level_discrepancy: float | None = None,
+    gain_discrepancy: float | None = None,
     model_name: str = "casim",
 ) -> SpectralFit:
-    """Posterior of the spectral parameters from measured levels and gains.
+    """Posterior of the spectral parameters from measured levels, gains and transmissions.
 
     Args:
         levels: measured levels; those without kV are left out.
-        instrument: what the owner declares; the rest takes the defaults (W, 12 degrees, CsI 0.5 mm, no filtration).
+        instrument: what the owner declares; the rest takes the defaults (W, 12 degrees, no filtration).
         rng: source of randomness.
-        level_discrepancy, gain_discrepancy: relative standard deviation of a level and of a gain beyond the model.
+        transmissions: of known layers (step wedges); scales cancel in them.
+        level_discrepancy, gain_discrepancy: relative standard deviation of a level and of a gain beyond the model; None:
+            learned, with the prior of `priors`.
         model_name: SpekPy's physics model.
 
     Raises:
@@ -97,39 +164,20 @@ def fit_spectrum(
     known = [level for level in levels if level.kV is not None]
     if not known:
         raise FitError("no flat series states its kV, so nothing can be said of the spectrum")
-    # the commonest filters carry their uncertainty even where they were not measured
-    materials = sorted({layer.material for level in known for layer in level.filters} | {"Al", "Cu"})
-    scintillator = instrument.scintillator or (Filter(material="CsI", thickness_mm=0.5),)
-    model = SpectralModel(
-        anode=instrument.anode or "W",
-        anode_angle_deg=instrument.anode_angle_deg or 12.0,
-        model=model_name,
-        inherent=instrument.inherent_filtration or (),
-        scintillator=scintillator,
-        cover=instrument.detector_cover or (),
-        counting=bool(instrument.counting),
-        filter_materials=materials,
-        highest_kV=max(160.0, *(level.kV or 0.0 for level in known)),
+    layers = [layer for level in known for layer in level.filters]
+    layers += [layer for item in transmissions for layer in (*item.filters, *item.layers)]
+    model = model_for(
+        instrument,
+        materials=[layer.material for layer in layers],
+        highest_kV=max([level.kV or 0.0 for level in known] + [item.kV for item in transmissions]),
+        model_name=model_name,
     )
     priors = priors_for(model, scintillator_declared=instrument.scintillator is not None)
-    data = []
-    for level in known:
-        factor = geometry_factor(source_detector_mm=level.source_detector_mm, pixel_mm=instrument.pixel_mm)
-        rate = level.rate_DN_per_mAs
-        gain = level.gain_DN
-        data.append(
-            _Datum(
-                OpenBeam(kV=level.kV or 0.0, filters=level.filters),
-                None if rate is None or rate.value <= 0 else math.log(rate.value / factor),
-                math.hypot(level_discrepancy, 0.0 if rate is None else _relative_sd(rate.value, rate.low, rate.high)),
-                math.log(max(gain.value, 1e-12)),
-                math.hypot(gain_discrepancy, _relative_sd(gain.value, gain.low, gain.high)),
-            )
-        )
-    posterior = _Posterior(model, priors, data)
-    best, samples, effective = posterior.sample(rng)
+    beams: dict[OpenBeam, int] = {}
+    data = _data(known, transmissions, instrument, beams)
+    posterior = _Posterior(model, priors, tuple(beams), data, {"level": level_discrepancy, "gain": gain_discrepancy})
+    best, samples, discrepancies, effective = posterior.sample(rng)
     names = model.names
-    undetermined = _undetermined(names, samples, priors)
     voltages = [level.kV or 0.0 for level in known]
     return SpectralFit(
         posterior=SpectralPosterior(
@@ -137,162 +185,321 @@ def fit_spectrum(
             samples=samples,
             best=best,
             prior={name: str(prior) for name, prior in priors.items()},
-            undetermined=undetermined,
+            undetermined=_undetermined(names, samples, priors),
             anode=model.anode,
             anode_angle_deg=model.anode_angle_deg,
             model=model.model,
             inherent=model.inherent,
             scintillator=model.scintillator,
+            alternative=model.alternative,
             cover=model.cover,
             counting=model.counting,
-            level_discrepancy=level_discrepancy,
-            gain_discrepancy=gain_discrepancy,
+            level_discrepancy=float(np.sqrt(np.mean(discrepancies["level"] ** 2))),
+            gain_discrepancy=float(np.sqrt(np.mean(discrepancies["gain"] ** 2))),
             calibrated_kV=(min(voltages), max(voltages)),
             calibrated_filters=tuple(sorted({text_from_filters(level.filters) for level in known})),
         ),
         effective_draws=effective,
         chi_square=posterior.chi_square(best),
-        data=posterior.size,
+        data=len(data),
+        discrepancy={
+            name: tuple(float(value) for value in np.quantile(draws, [0.5, 0.025, 0.975]))  # type: ignore[misc]
+            for name, draws in discrepancies.items()
+        },
     )
 
 
-def _relative_sd(value: float, low: float, high: float) -> float:
-    return (high - low) / (2 * _Z95) / max(abs(value), 1e-300)
+def _data(
+    levels: Sequence[Level],
+    transmissions: Sequence[Transmission],
+    instrument: Instrument,
+    beams: dict[OpenBeam, int],
+) -> list[_Datum]:
+    def number(kV: float, filters: tuple[Filter, ...]) -> int:
+        return beams.setdefault(OpenBeam(kV=kV, filters=filters), len(beams))
+
+    # The slope of a photon-transfer line is known better than the gain, which also wants the spread; their ratio is one
+    # for all levels, so that slopes carry the gains' dependence on the spectrum.
+    sloped = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
+    share = None
+    if sloped:
+        slope_sd = np.median([_relative_sd(level.photon_transfer_slope_DN) for level in sloped])
+        gain_sd = np.median([_relative_sd(level.gain_DN) for level in sloped])
+        if slope_sd < gain_sd:
+            ratios = [math.log(level.photon_transfer_slope_DN.value / level.gain_DN.value) for level in sloped]
+            share = math.exp(float(np.mean(ratios)))
+    data = []
+    for level in levels:
+        beam = number(level.kV or 0.0, level.filters)
+        rate = level.rate_DN_per_mAs
+        if rate is not None and rate.value > 0:
+            factor = geometry_factor(source_detector_mm=level.source_detector_mm, pixel_mm=instrument.pixel_mm)
+            data.append(_Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate)))
+        gain = level.gain_DN if share is None else level.photon_transfer_slope_DN
+        value = gain.value / (share or 1.0)
+        data.append(_Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain)))
+    for item in transmissions:
+        data.append(
+            _Datum(
+                "transmission",
+                number(item.kV, (*item.filters, *item.layers)),
+                number(item.kV, item.filters),
+                math.log(item.value),
+                item.relative_sd,
+            )
+        )
+    return data
+
+
+def _relative_sd(estimate: object) -> float:
+    value, low, high = estimate.value, estimate.low, estimate.high  # type: ignore[attr-defined]
+    return float((high - low) / (2 * _Z95) / max(abs(value), 1e-300))
 
 
 class _Posterior:
-    """Log posterior in units of the prior, u = (parameter - centre) / sd.
+    """Log posterior of the shapes in units of the prior, u = (parameter - centre) / sd.
 
-    Logarithms of levels and gains are linear in the scales (output, DN a keV, Swank factor, yield exponent), so these
-    are integrated out exactly: y ~ N(f(nonlinear), S) with one S for all, and drawn back from their conditional
-    Gaussian. What is left is a handful of shape parameters.
+    For each draw of the shapes: y ~ N(f, W + J J'), with W the noise and discrepancy of the data and J the derivatives
+    of the linear parameters times their prior sd.
     """
 
-    def __init__(self, model: SpectralModel, priors: dict[str, Prior], data: Sequence[_Datum]) -> None:
+    def __init__(
+        self,
+        model: SpectralModel,
+        priors: dict[str, Prior],
+        beams: Sequence[OpenBeam],
+        data: Sequence[_Datum],
+        discrepancies: Mapping[str, float | None],
+    ) -> None:
         self.model = model
+        self.beams = beams
         self.data = data
         names = model.names
-        self.shape = np.array([i for i, name in enumerate(names) if name not in LINEAR_PARAMETERS])
-        self.linear = np.array([i for i, name in enumerate(names) if name in LINEAR_PARAMETERS])
+        self.shape = np.array([i for i, name in enumerate(names) if name in SHAPE_PARAMETERS])
+        self.linear = np.array([i for i, name in enumerate(names) if name not in SHAPE_PARAMETERS])
+        self.linear_names = [names[i] for i in self.linear]
         self.centre = np.array([priors[name].centre for name in names])
         self.sd = np.array([priors[name].sd for name in names])
         self.low = (np.array([priors[name].low for name in names]) - self.centre) / self.sd
         self.high = (np.array([priors[name].high for name in names]) - self.centre) / self.sd
-        self.size = sum(1 if item.log_rate is None else 2 for item in data)
-        target, noise, rows = [], [], []
-        for item in data:
-            if item.log_rate is not None:
-                target.append(item.log_rate)
-                noise.append(item.log_rate_sd)
-                rows.append([1.0, 1.0, 0.0, math.log(item.beam.kV / REFERENCE_KV)])
-            target.append(item.log_gain)
-            noise.append(item.log_gain_sd)
-            rows.append([0.0, 1.0, -1.0, 0.0])
-        self.target = np.array(target)
-        self.noise = np.array(noise)
-        order = [LINEAR_PARAMETERS.index(names[i]) for i in self.linear]
-        self.design = np.array(rows)[:, order] * self.sd[self.linear]
-        covariance = np.diag(self.noise**2) + self.design @ self.design.T
-        self.whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.value = np.array([item.value for item in data])
+        self.noise = np.array([item.sd for item in data])
+        self.fixed = dict(discrepancies)
+        self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
+        self.is_gain = np.array([item.kind == "gain" for item in data])
+        self.dimensions = len(self.shape) + len(self.learned)
+        self.alternative = next(
+            (i for i, place in enumerate(self.shape) if names[place] == ALTERNATIVE_SCINTILLATOR), None
+        )
 
     def parameters(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter) with the scales at their prior centres, from shapes (draw, shape)."""
+        """Full parameter sets (draw, parameter), the linear ones at their prior centres, from shapes (draw, shape)."""
         full = np.tile(self.centre, (len(u), 1))
-        full[:, self.shape] += self.sd[self.shape] * u
+        full[:, self.shape] += self.sd[self.shape] * u[:, : len(self.shape)]
+        if self.alternative is not None:
+            # a Gaussian latent with the threshold that gives the prior's share
+            from scipy.special import ndtri
+
+            chosen = u[:, self.alternative] > float(ndtri(1.0 - GADOLINIUM_SHARE))
+            full[:, self.shape[self.alternative]] = chosen
         return full
 
-    def misfit(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Data less model (draw, datum), in logarithms."""
-        columns = []
-        for item in self.data:
-            signal = self.model.signal(parameters, item.beam)
-            if item.log_rate is not None:
-                columns.append(np.log(signal.rate_DN_per_mAs))
-            columns.append(np.log(signal.gain_DN))
-        return np.asarray(self.target - np.stack(columns, axis=1))
-
-    def chi_square(self, parameters: NDArray[np.float64]) -> float:
-        return float(np.sum((self.misfit(parameters[None, :]) / self.noise) ** 2))
-
-    def log_density(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log posterior of shapes (draw, shape), the scales integrated out, up to a constant."""
-        inside = np.all((u >= self.low[self.shape]) & (u <= self.high[self.shape]), axis=1)
-        result = np.full(len(u), -np.inf)
-        if inside.any():
-            whitened = self.misfit(self.parameters(u[inside])) @ self.whitening.T
-            result[inside] = -0.5 * np.sum(whitened**2, axis=1) - 0.5 * np.sum(u[inside] ** 2, axis=1)
+    def discrepancies(self, u: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Relative sd of levels and of gains beyond the model (draw,) each."""
+        result = {}
+        for name, centre in (("level", LEVEL_DISCREPANCY), ("gain", GAIN_DISCREPANCY)):
+            fixed = self.fixed[name]
+            if fixed is not None:
+                result[name] = np.full(len(u), fixed)
+            else:
+                column = len(self.shape) + self.learned.index(name)
+                result[name] = centre * np.exp(LOG_DISCREPANCY_SD * u[:, column])
         return result
 
-    def with_scales(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter): scales drawn given the shapes; without rng their mean."""
+    def variances(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance of each datum's logarithm (draw, datum)."""
+        found = self.discrepancies(u)
+        extra = np.where(self.is_gain, found["gain"][:, None], found["level"][:, None])
+        return np.asarray(self.noise**2 + extra**2 + 1e-12)
+
+    def expectation(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithms that the model expects (draw, datum) and their derivatives (draw, datum, linear)."""
+        found = [self.model.log_derivatives(parameters, beam, self.linear_names) for beam in self.beams]
+        value = np.empty((len(parameters), len(self.data)))
+        slope = np.empty((len(parameters), len(self.data), len(self.linear)))
+        for column, item in enumerate(self.data):
+            logs, rate, gain = found[item.beam]
+            value[:, column] = logs[1] if item.kind == "gain" else logs[0]
+            slope[:, column] = gain if item.kind == "gain" else rate
+            if item.kind == "transmission":
+                value[:, column] -= found[item.over][0][0]
+                slope[:, column] -= found[item.over][1]
+        return value, slope
+
+    def chi_square(self, parameters: NDArray[np.float64]) -> float:
+        """Squared misfit over noise and the prior's discrepancy, at one parameter set (parameter,)."""
+        variance = self.variances(np.zeros((1, self.dimensions)))[0]
+        misfit = self.value - self.expectation(parameters[None, :])[0][0]
+        return float(np.sum(misfit**2 / variance))
+
+    def _conditional(
+        self, u: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Log likelihood (draw,), parameters, and mean and lower root of the precision of the linear ones given u."""
         full = self.parameters(u)
-        misfit = self.misfit(full)
-        precision = np.eye(len(self.linear)) + self.design.T @ (self.design / self.noise[:, None] ** 2)
-        covariance = np.linalg.inv(precision)
-        scales = misfit / self.noise**2 @ self.design @ covariance.T
+        expected, slope = self.expectation(full)
+        slope = slope * self.sd[self.linear]
+        variance = self.variances(u)
+        misfit = self.value - expected
+        weighted = slope / variance[:, :, None]
+        precision = np.eye(len(self.linear)) + np.swapaxes(slope, 1, 2) @ weighted
+        lower = np.linalg.cholesky(precision)
+        right = np.einsum("ndk,nd->nk", weighted, misfit)
+        half = np.linalg.solve(lower, right[:, :, None])[:, :, 0]
+        mean = np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0]
+        logarithm = -0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1))
+        logarithm -= 0.5 * np.sum(np.log(variance), axis=1)
+        logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
+        return logarithm, full, mean, lower
+
+    def log_likelihood(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log likelihood of draws (draw, dimension), the linear parameters integrated out; -inf out of bounds."""
+        shapes = u[:, : len(self.shape)]
+        inside = np.all((shapes >= self.low[self.shape]) & (shapes <= self.high[self.shape]), axis=1)
+        result = np.full(len(u), -np.inf)
+        if inside.any():
+            result[inside] = self._conditional(u[inside])[0]
+        return result
+
+    def with_linear(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:
+        """Full parameter sets (draw, parameter): the linear ones drawn given the shapes; without rng their mean."""
+        _, full, z, lower = self._conditional(u)
         if rng is not None:
-            scales = scales + rng.standard_normal(scales.shape) @ np.linalg.cholesky(covariance).T
-        scales = np.clip(scales, self.low[self.linear], self.high[self.linear])
-        full[:, self.linear] += self.sd[self.linear] * scales
+            normal = rng.standard_normal(z.shape)
+            z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
+        full[:, self.linear] += self.sd[self.linear] * z
+        # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
+        names = list(self.model.names)
+        swank, gain, output = (names.index(name) for name in ("log_swank", "log_DN_per_keV", "log_output"))
+        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
+        beyond = full[:, swank] - np.clip(full[:, swank], bounds[0][swank], bounds[1][swank])
+        full[:, swank] -= beyond
+        full[:, gain] -= beyond
+        full[:, output] += beyond
         return full
 
-    def maximum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The most probable shapes (shape,) and their covariance about it, from three starts in the filtration."""
-        from scipy.optimize import least_squares
+    def sample(
+        self, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.float64]], float]:
+        """Best set (parameter,), equally likely draws (draw, parameter), their discrepancies, effective sample size.
 
-        low, high = self.low[self.shape], self.high[self.shape]
-
-        def function(u: NDArray[np.float64]) -> NDArray[np.float64]:
-            whitened = self.whitening @ self.misfit(self.parameters(u[None, :]))[0]
-            return np.concatenate([whitened, u])
-
-        position = [self.model.names[i] for i in self.shape].index("inherent_filtration_mm_Al")
-        index = self.shape[position]
-        best = None
-        for filtration in (0.3, 1.0, 3.0):
-            start = np.clip(np.zeros(len(low)), low + 1e-6, high - 1e-6)
-            start[position] = (filtration - self.centre[index]) / self.sd[index]
-            result = least_squares(function, start, bounds=(low, high), max_nfev=100)
-            if best is None or result.cost < best.cost:
-                best = result
-        if best is None or not np.all(np.isfinite(best.x)):
-            raise FitError("the spectral fit did not converge; check kV, current and filter of the flats")
-        return np.asarray(best.x), np.asarray(np.linalg.inv(best.jac.T @ best.jac))
-
-    def sample(self, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Best set (parameter,), equally likely draws (draw, parameter), and the effective sample size behind them."""
-        mode, covariance = self.maximum()
-        mean = mode
-        effective = 0.0
-        u = weight = None
-        for draws in (_DRAWS, _DRAWS, _DRAWS, 4 * _DRAWS):
-            u, log_proposal = _mixture_draws(mean, covariance, draws, rng)
-            log_weight = self.log_density(u) - log_proposal
-            weight = np.exp(log_weight - np.max(log_weight))
-            weight /= weight.sum()
-            effective = 1.0 / float(np.sum(weight**2))
-            if effective > 1.5 * _KEPT:
+        Importance sampling from the prior to the posterior by way of flattened posteriors (likelihood to the power of
+        a rising temper), each proposed from the one before.
+        """
+        u = rng.standard_normal((2 * _ROUND_DRAWS, self.dimensions))
+        log_ratio = np.zeros(len(u))  # prior over proposal
+        temper, effective = 0.0, 0.0
+        weight = np.full(len(u), 1.0 / len(u))
+        likelihood = self.log_likelihood(u)
+        for _ in range(_ROUNDS):
+            temper = _next_temper(likelihood, log_ratio, last=temper, least=0.12 * len(u))
+            weight, effective = _weights(temper * likelihood + log_ratio)
+            if temper >= 1.0 and effective > _ENOUGH:
                 break
             mean = weight @ u
             spread = u - mean
-            # with few effective draws the old covariance steadies the new one
-            trust = min(1.0, effective / (10.0 * len(mean)))
-            covariance = trust * ((spread * weight[:, None]).T @ spread) + (1.0 - trust) * 1.5 * covariance
-            covariance += 1e-8 * np.eye(len(mean))
-        if u is None or weight is None or effective < 40:
+            covariance = (spread * weight[:, None]).T @ spread
+            # few effective draws make a covariance too narrow in some direction
+            covariance = covariance * (1.0 + 2.0 * len(mean) / max(effective, 1.0)) + 1e-8 * np.eye(len(mean))
+            draws = _FINAL_DRAWS if temper >= 0.3 else _ROUND_DRAWS
+            u, log_proposal = _mixture_draws(mean, covariance, draws, rng)
+            log_ratio = -0.5 * np.sum(u**2, axis=1) - 0.5 * u.shape[1] * math.log(2 * math.pi) - log_proposal
+            likelihood = self.log_likelihood(u)
+        else:
+            weight, effective = _weights(likelihood + log_ratio)
+        if effective < 40:
             raise FitError(
                 f"the posterior of the spectrum could not be drawn (effective sample size {effective:.0f});"
                 " the levels contradict each other or the declared instrument"
             )
         positions = (np.arange(_KEPT) + rng.random()) / _KEPT  # systematic resampling
         chosen = np.minimum(np.searchsorted(np.cumsum(weight), positions), len(u) - 1)
-        return self.with_scales(mode[None, :], None)[0], self.with_scales(u[chosen], rng), effective
+        with np.errstate(invalid="ignore"):
+            density = likelihood - 0.5 * np.sum(u**2, axis=1)
+        best = self._climb(u[int(np.argmax(density))])
+        kept = u[chosen]
+        return (
+            self.with_linear(best[None, :], None)[0],
+            self.with_linear(kept, rng),
+            self.discrepancies(kept),
+            effective,
+        )
+
+    def _climb(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The most probable shapes (dimension,) near a draw, by Newton's steps on numerical derivatives."""
+        size, step = len(start), 0.05
+        moving = [i for i in range(size) if i != self.alternative]
+        eye = np.eye(size)
+        best, u = start, start
+        highest = float(self._density(start[None, :])[0])
+        for _ in range(4):
+            points = [u]
+            for i in moving:
+                points += [u + step * eye[i], u - step * eye[i]]
+            pairs = [(i, j) for n, i in enumerate(moving) for j in moving[:n]]
+            points += [u + step * (eye[i] + eye[j]) for i, j in pairs]
+            values = self._density(np.array(points))
+            if not np.all(np.isfinite(values)):
+                break  # at a bound
+            gradient, hessian = np.zeros(size), -np.eye(size)
+            up, down = values[1 : 2 * len(moving) : 2], values[2 : 2 * len(moving) + 1 : 2]
+            for n, i in enumerate(moving):
+                gradient[i] = (up[n] - down[n]) / (2 * step)
+                hessian[i, i] = min((up[n] - 2 * values[0] + down[n]) / step**2, -0.1)
+            place = {i: n for n, i in enumerate(moving)}
+            for (i, j), value in zip(pairs, values[2 * len(moving) + 1 :], strict=True):
+                mixed = value - up[place[i]] - up[place[j]] + values[0]
+                hessian[i, j] = hessian[j, i] = mixed / step**2
+            curvature, directions = np.linalg.eigh(hessian)
+            move = directions @ ((directions.T @ gradient) / np.maximum(-curvature, 0.3))
+            shares = np.array([1.0, 0.5, 0.2])
+            tried = self._density(u + shares[:, None] * move)
+            winner = int(np.argmax(tried))
+            if not tried[winner] > highest + 1e-4:
+                break
+            highest, u = float(tried[winner]), u + shares[winner] * move
+            best = u
+        return best
+
+    def _density(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(self.log_likelihood(u) - 0.5 * np.sum(u**2, axis=1))
+
+
+def _weights(logarithms: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Normalised weights (draw,) and how many equal draws they are worth."""
+    weight = np.exp(logarithms - np.max(logarithms))
+    weight /= weight.sum()
+    return weight, 1.0 / float(np.sum(weight**2))
+
+
+def _next_temper(
+    likelihood: NDArray[np.float64], log_ratio: NDArray[np.float64], *, last: float, least: float
+) -> float:
+    """The largest power (0 to 1) of the likelihood that leaves `least` effective draws, or the one that leaves most."""
+    powers = np.geomspace(1.0, max(0.5 * last, 1e-4), 60)
+    effective = []
+    for power in powers:
+        # a draw out of bounds keeps its weight of zero at any power
+        effective.append(_weights(np.where(np.isfinite(likelihood), power * likelihood + log_ratio, -np.inf))[1])
+        if effective[-1] >= least:
+            return float(power)
+    return float(powers[int(np.argmax(effective))])
 
 
 def _mixture_draws(
     mean: NDArray[np.float64], covariance: NDArray[np.float64], draws: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draws (draw, shape), log density: 70 % Student t about the mode, 20 % three times as wide, 10 % the prior."""
+    """Draws (draw, shape), log density: Student's t about the mean, one three times as wide, and the prior."""
     size = len(mean)
     lower = np.linalg.cholesky(covariance)
     normal = rng.standard_normal((draws, size))
@@ -320,18 +527,26 @@ def _mixture_draws(
 
 def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: dict[str, Prior]) -> tuple[str, ...]:
     """Parameters whose spread is still more than 0.7 of the prior's: the data say nothing of them alone."""
+    own = [
+        name
+        for name in names
+        if name
+        in {*SHAPE_PARAMETERS, "log_output", "log_DN_per_keV", "log_swank", "yield_exponent", "hardness_exponent"}
+        or name.startswith(attenuation_scale_name(""))
+    ]
     result = []
-    for index, name in enumerate(names):
+    for name in own:
         if name == "log_DN_per_keV":
             continue
-        share = float(np.std(samples[:, index])) / priors[name].sd
+        share = float(np.std(samples[:, names.index(name)])) / priors[name].sd
         if share > 0.7:
             result.append(f"{name}: {100 * share:.0f} % of the prior's width is left")
-    correlation = np.asarray(np.corrcoef(samples.T)).reshape(len(names), len(names))
-    for i in range(len(names)):
+    columns = samples[:, [names.index(name) for name in own]]
+    varies = np.std(columns, axis=0) > 0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.asarray(np.corrcoef(columns.T)).reshape(len(own), len(own))
+    for i in range(len(own)):
         for j in range(i):
-            if abs(correlation[i, j]) > 0.9:
-                result.append(
-                    f"{names[j]} and {names[i]} are known only together (correlation {correlation[i, j]:+.2f})"
-                )
+            if varies[i] and varies[j] and abs(correlation[i, j]) > 0.9:
+                result.append(f"{own[j]} and {own[i]} are known only together (correlation {correlation[i, j]:+.2f})")
     return tuple(result)

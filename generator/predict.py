@@ -1,7 +1,7 @@
 """Flatfield of a twin at a setting, measured or not: mean, noise, gain, photons and dose, with 95 % intervals."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
 from .psf import blur_variance_share
-from .spectral_signal import OpenBeam, SpectralModel
+from .spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
 
 _MEASURED_REPRODUCIBILITY = 0.002  # of a level measured at this kV and filter: what a repeat would show
+_FAR_ABOVE = 3.0  # times the brightest flat: beyond, nobody has seen whether the detector is linear
+_FAR_BELOW = 10.0  # below the dimmest flat over this, offsets matter that no flat has shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,17 +61,20 @@ class Prediction:
 
 @lru_cache(maxsize=8)
 def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
-    anode, angle, model, inherent, scintillator, cover, counting, materials = key
+    anode, angle, model, inherent, scintillator, alternative, cover, counting, names = key
+    prefix = attenuation_scale_name("")
     return SpectralModel(
         anode=anode,
         anode_angle_deg=angle,
         model=model,
         inherent=inherent,
         scintillator=scintillator,
+        alternative=alternative,
         cover=cover,
         counting=counting,
-        filter_materials=materials,
+        filter_materials=[name.removeprefix(prefix) for name in names if name.startswith(prefix)],
         highest_kV=highest_kV,
+        names=names,
     )
 
 
@@ -87,22 +92,32 @@ def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel
             expected="a twin calibrated from flats that state kV and tube load",
             remedy="calibrate from series with kV, current_mA or power_W, and exposure_ms",
         )
-    prefix = "log_mu_"
     key = (
         posterior.anode,
         posterior.anode_angle_deg,
         posterior.model,
         posterior.inherent,
         posterior.scintillator,
+        posterior.alternative,
         posterior.cover,
         posterior.counting,
-        tuple(name.removeprefix(prefix) for name in posterior.names if name.startswith(prefix)),
+        posterior.names,
     )
     return _cached_model(key, max(160.0, 20.0 * math.ceil(highest_kV / 20.0)))
 
 
 def slope_share(twin: Twin) -> float:
-    """Photon-transfer slope over gain: the share of the noise that the spread leaves in one pixel; no unit."""
+    """Photon-transfer slope over gain: the share of the noise that the spread leaves in one pixel; no unit.
+
+    As the levels have it, geometric mean, where there are any: it is the same for all of them.
+    """
+    known = [
+        math.log(level.photon_transfer_slope_DN.value / level.gain_DN.value)
+        for level in twin.levels
+        if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0
+    ]
+    if known:
+        return math.exp(sum(known) / len(known))
     share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
     white = twin.noise.white_fraction
     return (share + white) / (1.0 + white)
@@ -124,10 +139,27 @@ def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float, centre:
     return Estimate(value=math.exp(middle), low=math.exp(middle - below), high=math.exp(middle + above))
 
 
-def _is_extrapolated(posterior: SpectralPosterior, setting: Setting) -> bool:
-    lowest, highest = posterior.calibrated_kV
-    if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
-        return True
+def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
+    """In how many ways a setting lies outside what was calibrated, in words: kV, filters, level."""
+    posterior = twin.spectral
+    found = []
+    if posterior is not None:
+        lowest, highest = posterior.calibrated_kV
+        if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
+            found.append(f"kV ({lowest:g} to {highest:g} calibrated)")
+        if _filters_outside(posterior, setting):
+            found.append("filters")
+    points = [
+        float(point["signal_DN"])
+        for point in twin.evidence.get("photon_transfer", ())
+        if isinstance(point, Mapping) and point.get("used") and float(point.get("signal_DN", 0.0)) > 0
+    ]
+    if points and not min(points) / _FAR_BELOW <= signal_DN <= max(points) * _FAR_ABOVE:
+        found.append(f"level ({min(points):.3g} to {max(points):.3g} DN calibrated)")
+    return tuple(found)
+
+
+def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
     stacks: list[dict[str, float]] = []
     for text in posterior.calibrated_filters:
         stack: dict[str, float] = {}
@@ -166,7 +198,8 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     """Flatfield at a setting, with 95 % intervals.
 
     At a kV and filter that was measured the measured level is scaled to the load; elsewhere the posterior of the
-    spectral parameters is projected and the calibration's discrepancies are added (doubled where it extrapolates).
+    spectral parameters is projected, level and noise draw by draw, and the learned discrepancy of single levels is added
+    (as independent ones, one more for each way in which the setting lies outside: kV, filters, level).
 
     Raises:
         InputError: no tube load given, power above the tube's, or a twin that has neither this level nor a spectrum.
@@ -202,7 +235,10 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     factor = (1000.0 / distance) ** 2 * (pitch or 1.0) ** 2
 
     photons = kerma = None
-    extrapolated = False
+    outside: tuple[str, ...] = ()
+    share = slope_share(twin)
+    share_relative_sd = _slope_share_sd(twin) / share
+    quantum_draws, quantum_sd = np.ones(1), 0.0
     if posterior is not None:
         model = spectral_model_of(twin, highest_kV=setting.kV)
         signal = model.signal(posterior.samples, OpenBeam(kV=setting.kV, filters=setting.filters))
@@ -214,13 +250,18 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
             raise InputError(
                 "filter", received=text_from_filters(setting.filters), expected="layers that let some photons through"
             )
-        extrapolated = _is_extrapolated(posterior, setting)
-        widen = 2.0 if extrapolated else 1.0
+        rate_draws = signal.rate_DN_per_mAs * load * factor
+        outside = _outside(twin, setting, float(np.median(rate_draws)))
+        # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
+        widen = math.sqrt(1.0 + len(outside))
         level_sd = widen * posterior.level_discrepancy
         gain_sd = widen * posterior.gain_discrepancy
-        mean_frame = _estimate_from_draws(signal.rate_DN_per_mAs * load * factor, level_sd)
-        gain = _estimate_from_draws(signal.gain_DN, gain_sd)
+        mean_frame = _estimate_from_draws(rate_draws, level_sd)
+        gain = _estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, share_relative_sd))
         photons = _estimate_from_draws(signal.absorbed_per_mAs * load * factor, level_sd)
+        # level and gain are known together, not one by one: their product draw by draw
+        quantum_draws = signal.gain_DN * share * rate_draws
+        quantum_sd = math.hypot(level_sd, gain_sd)
         at_object = instrument.source_object_mm
         if setting.source_detector_mm is not None or at_object is None:
             warnings.append("air kerma is given at the detector: the object's distance at this setting is unknown")
@@ -233,32 +274,31 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
         value = rate.value * load * (there / distance) ** 2
         mean_frame = estimate_from_sd(value, relative * value)
         gain = level.gain_DN
-    share = slope_share(twin)
-    share_relative_sd = _slope_share_sd(twin) / share
+        outside = _outside(twin, setting, mean_frame.value)
     read = twin.noise.read_noise_DN
     frames = setting.averaged
-    quantum = gain.value * share * mean_frame.value
-    variance = quantum + twin.noise.read_variance_DN2
-    sd = math.sqrt(variance / frames)
-    # ends of mean, gain, share and read noise added in quadrature; a measured level knows its slope directly
+    # a measured level knows its slope directly
     if level is not None:
         slope = level.photon_transfer_slope_DN
-        quantum = slope.value * mean_frame.value
-        variance = quantum + twin.noise.read_variance_DN2
-        sd = math.sqrt(variance / frames)
-        noise_relative = [(slope.high - slope.low) / (2 * 1.959964) / slope.value]
-    else:
-        noise_relative = [_log_sd(gain), share_relative_sd]
-    quantum_relative = math.sqrt(sum(value**2 for value in [*noise_relative, _log_sd(mean_frame)]))
+        quantum_draws = np.array([slope.value * mean_frame.value])
+        quantum_sd = math.hypot(_log_sd(slope), _log_sd(mean_frame))
+    variance_draws = np.maximum(quantum_draws, 0.0) + max(twin.noise.read_variance_DN2, 1e-12)
+    variance = float(np.median(variance_draws))
+    quantum = max(variance - twin.noise.read_variance_DN2, 0.0)
     read_part = 2.0 * twin.noise.read_noise_DN.value * (read.high - read.low) / (2 * 1.959964)
-    variance_sd = math.hypot(quantum * quantum_relative, read_part)
-    sd_estimate = estimate_from_sd(sd, 0.5 * sd * variance_sd / variance if variance > 0 else 0.0, lowest=0.0)
+    variance_sd = math.hypot(quantum * quantum_sd, read_part)
+    sd_estimate = _estimate_from_draws(np.sqrt(variance_draws / frames), 0.5 * variance_sd / variance)
+    extrapolated = bool(outside)
     if instrument.bits is not None:
         room = 2.0**instrument.bits - 1 - twin.dark_DN.value
         if mean_frame.value > room:
             warnings.append(f"the detector saturates: {mean_frame.value:.4g} DN above dark, room for {room:.4g} DN")
     if extrapolated:
-        warnings.append("outside the calibrated range of kV or filters: the interval rests on the spectral model")
+        warnings.append(
+            f"outside the calibrated range of {', '.join(outside)}: the interval rests on the spectral model"
+            if posterior is not None
+            else f"outside the calibrated range of {', '.join(outside)}"
+        )
     return Prediction(
         setting=setting,
         mean_DN=mean_frame,

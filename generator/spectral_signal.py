@@ -3,14 +3,18 @@
 Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting
 fraction D(E)):
 
-    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^h exp(-sum mu t) (1000 / d)^2 a^2
+    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^h (Phi' / Phi)^s exp(-sum mu t) (1000 / d)^2 a^2
     signal  = gamma sum N m1            gain = (gamma / A_S) sum N m2 / sum N m1            absorbed = sum N D
 
-for energy-integrating detectors; a counting detector has m1 = m2 = D. gamma is in DN per keV absorbed.
+for energy-integrating detectors; a counting detector has m1 = m2 = D. gamma is in DN per keV absorbed, Phi' the other of
+SpekPy's models, e = kV_error + kV_tilt ln(kV / 60), and mu that of xraylib moved by shares of its differences to two other
+tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +27,7 @@ from ..spectra import (
     MAXIMUM_KV,
     MAXIMUM_KV_OF_ANODE,
     MINIMUM_KV,
+    MODELS,
     detector_response,
     energy_grid_keV,
     tube_fluence_interpolated,
@@ -39,14 +44,27 @@ FIXED_PARAMETERS = (
     "log_swank",
     "yield_exponent",
     "hardness_exponent",
+    "kV_tilt",
+    "spectrum_model",
+    "escape_scale",
+    "scintillator_table",
 )
+ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
+OTHER_TABLES = ("chantler", "penelope")
 _KV_ERRORS = np.linspace(-0.06, 0.06, 25)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
+_LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
+_LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
 
 
 def attenuation_scale_name(material: str) -> str:
     """Name of the parameter that scales a filter material's attenuation table."""
     return f"log_mu_{material}"
+
+
+def table_share_name(table: str, material: str) -> str:
+    """Name of the parameter that moves a material's attenuation towards another table."""
+    return f"{table}_{material}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +89,9 @@ class BeamSignal:
 class SpectralModel:
     """Tables of one tube and scintillator, from which signals of many parameter sets follow by sums over energy.
 
-    The state is a cache: what each kV and material looks like on the common energy grid.
+    `names` are the parameters, in the order of a parameter set; a set of fewer names (an older twin's) can be given, and
+    what it lacks counts as 0. `alternative` is another scintillator, which a parameter of value 1 puts in place of the
+    first where the sheet does not say. The state is a cache: what each kV and material looks like on the common grid.
     """
 
     def __init__(
@@ -82,39 +102,40 @@ class SpectralModel:
         model: str = "casim",
         inherent: Sequence[Filter] = (),
         scintillator: Sequence[Filter] = (Filter(material="CsI", thickness_mm=0.5),),
+        alternative: Sequence[Filter] = (),
         cover: Sequence[Filter] = (),
         counting: bool = False,
         filter_materials: Sequence[str] = (),
         highest_kV: float = 160.0,
+        names: Sequence[str] | None = None,
     ) -> None:
         self.anode = anode
         self.anode_angle_deg = anode_angle_deg
         self.model = model
         self.inherent = tuple(inherent)
         self.scintillator = tuple(scintillator)
+        self.alternative = tuple(alternative)
         self.cover = tuple(cover)
         self.counting = counting
         self.filter_materials = tuple(filter_materials)
-        self.names = (*FIXED_PARAMETERS, *(attenuation_scale_name(name) for name in self.filter_materials))
+        every = [*FIXED_PARAMETERS, *((ALTERNATIVE_SCINTILLATOR,) if self.alternative else ())]
+        for material in self.filter_materials:
+            every.append(attenuation_scale_name(material))
+            every += [table_share_name(table, material) for table in OTHER_TABLES]
+        self.names = tuple(every) if names is None else tuple(names)
         self._index = {name: position for position, name in enumerate(self.names)}
         self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
         self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
+        self._departures: dict[tuple[str, str], NDArray[np.float64]] = {}
         self._fluence: dict[float, NDArray[np.float64]] = {}
+        self._other_model: dict[float, NDArray[np.float64]] = {}
+        self._responses = [
+            _response_tables(layers, self.cover, self.counting, self.energies_keV.size)
+            for layers in (self.scintillator, self.alternative)
+            if layers
+        ]
         energies = self.energies_keV
-        first, second, share = [], [], []
-        for log_scale in _LOG_THICKNESS:
-            layers = tuple(
-                Filter(material=layer.material, thickness_mm=layer.thickness_mm * float(np.exp(log_scale)))
-                for layer in self.scintillator
-            )
-            response = detector_response(
-                scintillator=layers, cover=self.cover, counting=counting, energies_keV=energies
-            )
-            first.append(response.mean_deposited_keV)
-            second.append(response.mean_square_deposited_keV2)
-            share.append(response.interacting_fraction)
-        self._first, self._second, self._share = np.array(first), np.array(second), np.array(share)
         air = material_from_name("air")
         from ..materials import mass_energy_absorption_cm2_g
 
@@ -122,6 +143,13 @@ class SpectralModel:
         self._kerma = energies * mass_energy_absorption_cm2_g(air, energies) * 1.602176634e-13 * 1e6
         self._inherent = transmission(self.inherent, energies, bin_width_keV=BIN_WIDTH_KEV)
         self._depth: dict[Filter, NDArray[np.float64]] = {}
+
+    def _departure(self, material: str, table: str) -> NDArray[np.float64]:
+        """Another table's attenuation over xraylib's, less 1 (energy,)."""
+        key = (material, table)
+        if key not in self._departures:
+            self._departures[key] = _table_departure(material, table, self.energies_keV)
+        return self._departures[key]
 
     def mu(self, material: str) -> NDArray[np.float64]:
         """Linear attenuation (energy,), 1/mm."""
@@ -161,32 +189,76 @@ class SpectralModel:
             )
         return self._fluence[kV]
 
+    def _towards_other_model(self, kV: float) -> NDArray[np.float64]:
+        """Logarithm of the other of SpekPy's models over this one (energy,), held constant beyond the end point."""
+        if kV not in self._other_model:
+            lowest = MINIMUM_KV
+            ratio = np.zeros(self.energies_keV.size)
+            if kV >= lowest:
+                both = [
+                    tube_fluence_interpolated(
+                        kV,
+                        energies_keV=self.energies_keV,
+                        anode=self.anode,
+                        anode_angle_deg=self.anode_angle_deg,
+                        model=name,
+                    )
+                    for name in (self.model, next(name for name in MODELS if name != self.model))
+                ]
+                seen = (both[0] > 1e-9 * both[0].max()) & (both[1] > 0)
+                if np.any(seen):
+                    ratio[seen] = np.log(both[1][seen] / both[0][seen])
+                    last = int(np.flatnonzero(seen)[-1])
+                    ratio[last + 1 :] = ratio[last]
+            self._other_model[kV] = np.clip(ratio, -_LARGEST_MODEL_RATIO, _LARGEST_MODEL_RATIO)
+        return self._other_model[kV]
+
     def default_parameters(self) -> NDArray[np.float64]:
         """The parameter set of an uncalibrated line (parameter,): no error, 1 DN a keV, Swank factor 1."""
         return np.zeros(len(self.names))
 
+    def _kV_error(self, samples: NDArray[np.float64], kV: float) -> NDArray[np.float64]:
+        return self._column(samples, "kV_error") + self._column(samples, "kV_tilt") * math.log(kV / REFERENCE_KV)
+
     def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
-        kV_error = self._column(samples, "kV_error")
         nodes = self.fluence(beam.kV)
-        top = int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1
-        fluence = _interpolate(_KV_ERRORS, nodes[:, :top], kV_error)
+        top = min(int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1, self.energies_keV.size)
         energies = self.energies_keV[:top]
-        exponent = -self._column(samples, "inherent_filtration_mm_Al")[:, None] * self.mu("Al")[:top]
-        for layer in beam.filters:
-            name = attenuation_scale_name(layer.material)
-            scale = np.exp(self._column(samples, name)) if name in self._index else np.ones(len(samples))
-            exponent = exponent - scale[:, None] * self.depth(layer)[:top]
-        exponent = exponent + self._column(samples, "hardness_exponent")[:, None] * np.log(energies / REFERENCE_KEV)
-        exponent = (
-            exponent
-            + (
-                self._column(samples, "log_output")
-                + self._column(samples, "yield_exponent") * np.log(beam.kV / REFERENCE_KV)
-            )[:, None]
-        )
+        factors, rows = [], []
+        for layer, thickness in (
+            (Filter(material="Al", thickness_mm=1.0), self._column(samples, "inherent_filtration_mm_Al")),
+            *((layer, None) for layer in beam.filters),
+        ):
+            material = layer.material
+            if thickness is None:
+                depth = self.depth(layer)[:top]
+                amount = np.exp(self._column(samples, attenuation_scale_name(material)))
+            else:
+                depth, amount = self.mu(material)[:top], thickness
+            factors.append(amount)
+            rows.append(-depth)
+            for table in OTHER_TABLES:
+                name = table_share_name(table, material)
+                if name in self._index:
+                    factors.append(amount * self._column(samples, name))
+                    rows.append(-depth * self._departure(material, table)[:top])
+        factors.append(self._column(samples, "hardness_exponent"))
+        rows.append(np.log(energies / REFERENCE_KEV))
+        if "spectrum_model" in self._index:
+            factors.append(self._column(samples, "spectrum_model"))
+            rows.append(self._towards_other_model(beam.kV)[:top])
         width = energies[1] - energies[0]
-        return np.asarray(fluence * self._inherent[:top] * np.exp(exponent) * (width / 100.0))
+        factors.append(
+            self._column(samples, "log_output")
+            + self._column(samples, "yield_exponent") * np.log(beam.kV / REFERENCE_KV)
+            + np.log(width / 100.0)
+        )
+        rows.append(np.ones(top))
+        photons = np.exp(np.stack(factors, axis=1) @ np.stack(rows))
+        photons *= _interpolate(_KV_ERRORS, nodes[:, :top], self._kV_error(samples, beam.kV))
+        photons *= self._inherent[:top]
+        return np.asarray(photons)
 
     def signal(
         self, samples: NDArray[np.float64], beam: OpenBeam, through: NDArray[np.float64] | None = None
@@ -204,6 +276,19 @@ class SpectralModel:
             photons = photons * through[:top]
         return self._signal_of_photons(samples, photons)
 
+    def depth_of_parameters(self, layer: Filter, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Optical depth of a layer (energy,) with the scale and the table shares of one parameter set (parameter,)."""
+
+        def value(name: str) -> float:
+            return float(parameters[self._index[name]]) if name in self._index else 0.0
+
+        moved = np.ones(self.energies_keV.size)
+        for table in OTHER_TABLES:
+            share = value(table_share_name(table, layer.material))
+            if share != 0.0:
+                moved = moved + share * self._departure(layer.material, table)
+        return np.asarray(self.depth(layer) * moved * math.exp(value(attenuation_scale_name(layer.material))))
+
     def signal_of_stacks(
         self, parameters: NDArray[np.float64], *, kV: float, stacks: Sequence[Sequence[Filter]]
     ) -> BeamSignal:
@@ -218,21 +303,68 @@ class SpectralModel:
             crossed = np.zeros((len(stacks), len(layers)))
             for row, stack in enumerate(stacks):
                 for layer in stack:
-                    name = attenuation_scale_name(layer.material)
-                    scale = np.exp(parameters[self._index[name]]) if name in self._index else 1.0
-                    crossed[row, layers[layer]] += scale
-            photons = photons * np.exp(-crossed @ np.array([self.depth(layer)[:top] for layer in layers]))
+                    crossed[row, layers[layer]] += 1.0
+            depths = np.array([self.depth_of_parameters(layer, parameters)[:top] for layer in layers])
+            photons = photons * np.exp(-crossed @ depths)
         else:
             photons = np.repeat(photons, len(stacks), axis=0)
         return self._signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
 
+    def moment_weights(self, parameters: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
+        """What each energy of an open beam adds to signal (DN), quantum variance (DN^2) and photons absorbed.
+
+        Returns:
+            (3, energy) a mAs and mm2 of pixel at 1 m, on the first of `energies_keV`, for one parameter set (parameter,).
+            Behind an object of transmission T(E) the three sums are those of the rows times T.
+        """
+        samples = parameters[None, :]
+        photons = self.weights(samples, beam)[0]
+        first, second, share = self._moments(samples, len(photons))[:, 0]
+        log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
+        log_swank = float(self._column(samples, "log_swank")[0])
+        return np.stack(
+            [photons * first * np.exp(log_gamma), photons * second * np.exp(2 * log_gamma - log_swank), photons * share]
+        )
+
+    def _moments(self, samples: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Mean deposit, mean square deposit and interacting share (3, draw, energy) of each draw's scintillator."""
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        result = np.empty((3, len(samples), top))
+        for chosen, tables in zip((~other, other), self._responses, strict=False):
+            if not chosen.any():
+                continue
+            first, second, share, first_table, second_table, first_escape, second_escape = (
+                _interpolate(_LOG_THICKNESS, table[:, :top], log_thickness[chosen]) for table in tables
+            )
+            by_table = self._column(samples, "scintillator_table")[chosen, None]
+            by_escape = self._column(samples, "escape_scale")[chosen, None]
+            result[0, chosen] = first + by_table * first_table + by_escape * first_escape
+            result[1, chosen] = second + by_table * second_table + by_escape * second_escape
+            result[2, chosen] = share
+        return result
+
+    def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
+        top = photons.shape[1]
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        sums = np.empty((3, len(samples)))
+        for chosen, tables in zip((~other, other), self._responses, strict=False):
+            if not chosen.any():
+                continue
+            part = photons if chosen.all() else photons[chosen]
+            every = _sums_interpolated(_LOG_THICKNESS, tables[:, :, :top], log_thickness[chosen], part)
+            by_table = self._column(samples, "scintillator_table")[chosen]
+            by_escape = self._column(samples, "escape_scale")[chosen]
+            sums[:2, chosen] = every[:2] + by_table * every[3:5] + by_escape * every[5:7]
+            sums[2, chosen] = every[2]
+        return sums
+
     def _signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
         """What photons (draw, energy) give, with the scintillator and gains of samples (draw, parameter)."""
         top = photons.shape[1]
-        log_thickness = self._column(samples, "log_scintillator_thickness")
-        first = _sum_interpolated(_LOG_THICKNESS, self._first[:, :top], log_thickness, photons)
-        second = _sum_interpolated(_LOG_THICKNESS, self._second[:, :top], log_thickness, photons)
-        absorbed = _sum_interpolated(_LOG_THICKNESS, self._share[:, :top], log_thickness, photons)
+        first, second, absorbed = self._moment_sums(samples, photons)
         log_gamma = self._column(samples, "log_DN_per_keV")
         gamma = np.exp(log_gamma)
         excess = np.exp(log_gamma - self._column(samples, "log_swank"))
@@ -244,8 +376,145 @@ class SpectralModel:
             kerma_uGy_per_mAs=100.0 * photons @ self._kerma[:top],
         )
 
+    def log_derivatives(
+        self,
+        samples: NDArray[np.float64],
+        beam: OpenBeam,
+        names: Sequence[str],
+        through: NDArray[np.float64] | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithms of rate and gain (2, draw) of a beam, and how each of `names` moves them (draw, name) each.
+
+        The derivatives of ln(sum N m1) and ln(sum N m2 / sum N m1): means over the spectrum of what the parameter does
+        at each energy. They hold for parameters that act a little: tables, models, exponents, escape, scales, voltage.
+
+        Args:
+            samples: (draw, parameter), the point at which the derivatives are taken.
+            beam: kV and filters.
+            names: parameters, not the filtration or the scintillator's thickness.
+            through: transmission of an object (energy,), or None.
+
+        Returns:
+            (rate and gain) (2, draw), derivatives of the rate (draw, name), derivatives of the gain (draw, name).
+        """
+        photons = self.weights(samples, beam)
+        top = photons.shape[1]
+        if through is not None:
+            photons = photons * through[:top]
+        moments = self._moments(samples, top)
+        first, second = moments[:2]
+        by_first, by_second = photons * first, photons * second
+        sums = np.stack([by_first.sum(axis=1), by_second.sum(axis=1)])
+        gamma = self._column(samples, "log_DN_per_keV")
+        logs = np.stack(
+            [gamma + np.log(sums[0]), gamma - self._column(samples, "log_swank") + np.log(sums[1] / sums[0])]
+        )
+        rate = np.zeros((len(samples), len(names)))
+        gain = np.zeros((len(samples), len(names)))
+        # parameters of one row over energy, the same for all draws
+        rows = {name: row for name, row in ((name, self._row_of(name, beam, top)) for name in names) if row is not None}
+        if rows:
+            table = np.stack(list(rows.values()), axis=1)
+            columns = [list(names).index(name) for name in rows]
+            means = by_first @ table / sums[0][:, None]
+            rate[:, columns] = means
+            gain[:, columns] = by_second @ table / sums[1][:, None] - means
+        filtration = self._column(samples, "inherent_filtration_mm_Al")
+        for column, name in enumerate(names):
+            for table_name in OTHER_TABLES:
+                if name == table_share_name(table_name, "Al"):
+                    row = -self.mu("Al")[:top] * self._departure("Al", table_name)[:top]
+                    mean = by_first @ row / sums[0]
+                    rate[:, column] += filtration * mean
+                    gain[:, column] += filtration * (by_second @ row / sums[1] - mean)
+            if name in {"log_output", "log_DN_per_keV"}:
+                rate[:, column] = 1.0
+                gain[:, column] = float(name == "log_DN_per_keV")
+            elif name == "log_swank":
+                gain[:, column] = -1.0
+            elif name == "yield_exponent":
+                rate[:, column] = np.log(beam.kV / REFERENCE_KV)
+            elif name in {"scintillator_table", "escape_scale"}:
+                position = self.names.index(name)
+                step = np.zeros(len(self.names))
+                step[position] = 1.0
+                moved = self._moments(samples + step, top) - moments
+                mean = np.sum(photons * moved[0], axis=1) / sums[0]
+                rate[:, column] = mean
+                gain[:, column] = np.sum(photons * moved[1], axis=1) / sums[1] - mean
+            elif name == "kV_tilt":
+                step = np.zeros(len(self.names))
+                step[self.names.index("kV_error")] = 0.002
+                moved = self.weights(samples + step, beam) - self.weights(samples - step, beam)
+                if through is not None:
+                    moved = moved * through[:top]
+                scale = np.log(beam.kV / REFERENCE_KV) / 0.004
+                mean = np.sum(moved * first, axis=1) / sums[0] * scale
+                rate[:, column] = mean
+                gain[:, column] = np.sum(moved * second, axis=1) / sums[1] * scale - mean
+        return logs, rate, gain
+
+    def _row_of(self, name: str, beam: OpenBeam, top: int) -> NDArray[np.float64] | None:
+        """What a unit of a parameter adds to the logarithm of the photons at each energy (energy,)."""
+        if name == "hardness_exponent":
+            return np.log(self.energies_keV[:top] / REFERENCE_KEV)
+        if name == "spectrum_model":
+            return self._towards_other_model(beam.kV)[:top]
+        row = None
+        for layer in beam.filters:
+            if name == attenuation_scale_name(layer.material):
+                row = (0.0 if row is None else row) - self.depth(layer)[:top]
+            for table in OTHER_TABLES:
+                if name == table_share_name(table, layer.material):
+                    departure = self._departure(layer.material, table)[:top]
+                    row = (0.0 if row is None else row) - self.depth(layer)[:top] * departure
+        return row
+
     def _column(self, samples: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+        if name not in self._index:
+            return np.zeros(len(samples))
         return np.asarray(samples[:, self._index[name]])
+
+
+def _table_departure(material: str, table: str, energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Another table's attenuation over xraylib's, less 1 (energy,)."""
+    known = material_from_name(material)
+    ratio = mu_per_mm(known, energies_keV, table=table) / mu_per_mm(known, energies_keV)
+    # the tables' edges lie a few eV apart: a bin between them says nothing of the tables
+    return np.clip(ratio - 1.0, -_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
+
+
+@lru_cache(maxsize=16)
+def _response_tables(
+    scintillator: tuple[Filter, ...], cover: tuple[Filter, ...], counting: bool, bins: int
+) -> NDArray[np.float64]:
+    """What a photon leaves in a scintillator (quantity, node of thickness, energy), on the first bins of the grid.
+
+    Quantities: mean deposit, mean square deposit, interacting share; what the other attenuation tables add to the first
+    two; what full escape of K photons takes from the first two.
+    """
+    energies = energy_grid_keV(500.0)[:bins]
+
+    def tables(escape: bool) -> NDArray[np.float64]:
+        rows = []
+        for log_scale in _LOG_THICKNESS:
+            layers = tuple(
+                Filter(material=layer.material, thickness_mm=layer.thickness_mm * float(np.exp(log_scale)))
+                for layer in scintillator
+            )
+            found = detector_response(
+                scintillator=layers, cover=cover, counting=counting, energies_keV=energies, escape=escape
+            )
+            rows.append((found.mean_deposited_keV, found.mean_square_deposited_keV2, found.interacting_fraction))
+        return np.array(rows).transpose(1, 0, 2)
+
+    escaping, kept = tables(True), tables(False)
+    departure = np.mean([_table_departure(scintillator[0].material, name, energies) for name in OTHER_TABLES], axis=0)
+    # a larger coefficient at one energy is a thicker layer at that energy
+    by_table = np.gradient(escaping[:2], _LOG_THICKNESS, axis=1) * departure
+    result = np.concatenate([escaping, by_table, escaping[:2] - kept[:2]])
+    result.setflags(write=False)
+    return np.asarray(result)
 
 
 def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -263,16 +532,17 @@ def _interpolate(
     return np.asarray(table[below] * (1.0 - share)[:, None] + table[below + 1] * share[:, None])
 
 
-def _sum_interpolated(
-    nodes: NDArray[np.float64], table: NDArray[np.float64], at: NDArray[np.float64], weight: NDArray[np.float64]
+def _sums_interpolated(
+    nodes: NDArray[np.float64], tables: NDArray[np.float64], at: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """sum over energy of weight (draw, energy) times `table` interpolated at `at` (draw,)."""
+    """sum over energy of weight (draw, energy) times each of `tables` (table, node, energy) at `at`: (table, draw)."""
     below, share = _brackets(nodes, at)
     lowest = int(below.min())
-    every = weight @ table[lowest : int(below.max()) + 2].T  # the nodes in use: draws lie close together
+    used = tables[:, lowest : int(below.max()) + 2]  # the nodes in use: draws lie close together
+    every = (weight @ used.reshape(-1, used.shape[2]).T).reshape(len(at), used.shape[0], used.shape[1])
     rows = np.arange(len(at))
     column = below - lowest
-    return np.asarray(every[rows, column] * (1.0 - share) + every[rows, column + 1] * share)
+    return np.asarray((every[rows, :, column] * (1.0 - share)[:, None] + every[rows, :, column + 1] * share[:, None]).T)
 
 
 def gain_behind_object(

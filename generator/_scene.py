@@ -56,10 +56,14 @@ def find_borders(depth: FloatArray) -> Borders:
     from scipy.ndimage import maximum_filter, minimum_filter
 
     rows, columns = depth.shape
-    range_3 = maximum_filter(depth, 3, mode="nearest") - minimum_filter(depth, 3, mode="nearest")
-    range_5 = maximum_filter(depth, 5, mode="nearest") - minimum_filter(depth, 5, mode="nearest")
+    # borders of the frame go on as they come, so that a slope does not end there in a plateau
+    wide = np.pad(depth, 2, mode="reflect", reflect_type="odd")
+    range_3, range_5 = (
+        (maximum_filter(wide, size, mode="nearest") - minimum_filter(wide, size, mode="nearest"))[2:-2, 2:-2]
+        for size in (3, 5)
+    )
     sharpness = np.clip(2.0 * range_3 / np.maximum(range_5, 1e-12) - 1.0, 0.0, 1.0)
-    row, column = np.nonzero((range_3 > _BORDER_DEPTH) & (sharpness > 0))
+    row, column = np.nonzero((range_3 > _BORDER_DEPTH) & (sharpness > 1e-6))
     around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     near_row = np.clip(row[:, None] + around[:, 0], 0, rows - 1)
     near_column = np.clip(column[:, None] + around[:, 1], 0, columns - 1)

@@ -2,6 +2,7 @@
 
 import os
 
+import pytest
 from hypothesis import settings
 
 # small frames spend their time waiting for threads, and the workers of the test run fill the cores already
@@ -9,3 +10,91 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 settings.register_profile("house", deadline=None, derandomize=True)
 settings.load_profile("house")
+
+
+@pytest.fixture(scope="session")
+def series_line():
+    """A twin of 40 x 40 pixels set by hand, with spectrum: 40 and 90 kV behind 50 um Cu were measured; no bad pixels."""
+    import math
+
+    import numpy as np
+
+    from raytwin.acquisition.instrument import Instrument
+    from raytwin.acquisition.setting import filters_from_text
+    from raytwin.generator.psf import blur_variance_share
+    from raytwin.generator.spectral_signal import SpectralModel
+    from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, SpectralPosterior, Twin, estimate_from_sd
+
+    shape, sigma_px, white = (40, 40), 0.5, 0.01
+    copper = filters_from_text("Cu:0.05")
+    rng = np.random.default_rng(1)
+    model = SpectralModel(filter_materials=("Al", "Cu"))
+    best = np.zeros(len(model.names))
+    values = {"inherent_filtration_mm_Al": 0.8, "log_DN_per_keV": math.log(0.02), "log_swank": math.log(0.85)}
+    for name, value in values.items():
+        best[model.names.index(name)] = value
+    share = (blur_variance_share("aperture", sigma_px) + white) / (1 + white)
+    flat_shape = (1 + 0.02 * rng.standard_normal(shape)).astype(np.float32)
+    levels = tuple(
+        Level(
+            kV=kV,
+            filters=copper,
+            gain_DN=estimate_from_sd(gain, 0.01 * gain),
+            photon_transfer_slope_DN=estimate_from_sd(gain * share, 0.01 * gain * share),
+            rate_DN_per_mAs=estimate_from_sd(rate, 0.001 * rate),
+            source_detector_mm=1059.0,
+            saturation_DN=None,
+            flat_shape=flat_shape,
+            series=(f"flat_{kV:g}",),
+            role="calibration",
+        )
+        for kV, gain, rate in ((40.0, 6.0, 23000.0), (90.0, 10.0, 347000.0))
+    )
+    return Twin(
+        instrument=Instrument(
+            anode="W",
+            pixel_mm=0.15,
+            source_object_mm=990.0,
+            source_detector_mm=1059.0,
+            scintillator=filters_from_text("CsI:0.5"),
+            bits=16,
+            readout_ms=2.0,
+        ),
+        maps=DetectorMaps(
+            dark_DN=np.full(shape, 1200.0, dtype=np.float32),
+            dark_exposure_ms=20.0,
+            dark_DN_per_ms=np.full(shape, 0.1, dtype=np.float32),
+            gain_relative=(1 + 0.01 * rng.standard_normal(shape)).astype(np.float32),
+            read_variance_DN2=np.full(shape, 12.0**2 + 1 / 12, dtype=np.float32),
+            bad_pixels=np.zeros(shape, dtype=np.uint8),
+        ),
+        noise=NoiseModel(
+            psf_model="aperture",
+            psf_sigma_px=estimate_from_sd(sigma_px, 0.003),
+            white_fraction=white,
+            read_noise_DN=estimate_from_sd(12.0, 0.05),
+            quantised=True,
+        ),
+        dark_DN=estimate_from_sd(1200.0, 0.1),
+        levels=levels,
+        spectral=SpectralPosterior(
+            names=model.names,
+            samples=np.tile(best, (8, 1)),
+            best=best,
+            prior={},
+            undetermined=(),
+            anode="W",
+            anode_angle_deg=12.0,
+            model="casim",
+            inherent=(),
+            scintillator=filters_from_text("CsI:0.5"),
+            cover=(),
+            counting=False,
+            level_discrepancy=0.003,
+            gain_discrepancy=0.01,
+            calibrated_kV=(40.0, 90.0),
+            calibrated_filters=("Cu:0.05",),
+        ),
+        evidence={},
+        warnings=(),
+    )

@@ -1,0 +1,391 @@
+"""The forward model of a series without effects: levels, scenes, noise, borders, and samples against expectation."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition.setting import filters_from_text, setting_from_text
+from raytwin.errors import FileFormatError, InputError
+from raytwin.generator._scene import find_borders
+from raytwin.generator._spread import noise_pattern
+from raytwin.generator.effects import AppliedEffect
+from raytwin.generator.line_state import LineState
+from raytwin.generator.predict import predict_flatfield, slope_share, spectral_model_of
+from raytwin.generator.psf import noise_autocovariance_1d
+from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
+from raytwin.generator.spectral_signal import OpenBeam
+from raytwin.generator.twin_io import read_twin, write_twin
+
+SHAPE = (40, 40)
+MEASURED = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"
+
+
+def request(kind="flat", setting=MEASURED, **changes):
+    parsed = None if setting is None else setting_from_text(setting)
+    values = {
+        "kind": kind,
+        "setting": parsed,
+        "frames": 10,
+        "exposure_ms": 20.0 if parsed is None else parsed.exposure_ms,
+        "frame_interval_ms": 22.0,
+        "source_object_mm": 990.0,
+        "source_detector_mm": 1059.0,
+    }
+    return SeriesRequest(**{**values, **changes})
+
+
+def slab(water_mm=10.0, aluminium_mm=0.5):
+    return {"water_liquid": np.full(SHAPE, water_mm), "Al": np.full(SHAPE, aluminium_mm)}
+
+
+def product():
+    row, column = np.indices(SHAPE)
+    radius = np.hypot(row - 20, column - 20)
+    return {
+        "water_liquid": 20 * np.sqrt(np.clip(1 - (radius / 16) ** 2, 0, None)),
+        "Al": np.where((column > 24) & (row > 12), 3.0, 0.0),
+    }
+
+
+# ------------------------------------------------------------------------------------------------ level and noise
+
+
+@pytest.mark.parametrize("averaged", [1, 8])
+def test_a_flat_at_a_measured_level_is_the_predicted_flatfield(series_line, averaged):
+    asked = request(setting=f"{MEASURED},averaged={averaged}", frame_interval_ms=None)
+    found = expected_series(series_line, asked)
+    predicted = predict_flatfield(series_line, asked.setting)
+    shape = series_line.levels[0].flat_shape
+    np.testing.assert_allclose(found.signal_DN, predicted.mean_DN.value * shape, rtol=1e-5)
+    # one pixel of flat shape and relative gain 1; rounding of single exposures is in both
+    variance = found.quantum_variance_DN2 / (shape * series_line.maps.gain_relative)
+    quantum = predicted.sd_DN.value**2 - series_line.noise.read_variance_DN2 / averaged
+    white = found.white_variance_DN2 - series_line.noise.read_variance_DN2 / averaged
+    white = white / (shape * series_line.maps.gain_relative)
+    np.testing.assert_allclose(variance + white, quantum, rtol=1e-4)
+
+
+def test_an_unmeasured_beam_is_the_spectral_model_at_its_best(series_line):
+    setting = setting_from_text("kv=60,current_ma=0.5,exposure_ms=20,filter=Al:2")
+    found = expected_series(series_line, request(setting=str(setting)))
+    model = spectral_model_of(series_line)
+    beam = OpenBeam(kV=60.0, filters=setting.filters)
+    exact = model.signal(series_line.spectral.best[None, :], beam)
+    factor = setting.tube_load_mAs * (1000 / 1059) ** 2 * 0.15**2
+    assert np.median(found.signal_DN) == pytest.approx(
+        exact.rate_DN_per_mAs[0] * factor * np.median(series_line.levels[0].flat_shape), rel=1e-6
+    )
+    both = found.quantum_variance_DN2 + found.white_variance_DN2 - series_line.noise.read_variance_DN2
+    expected = exact.gain_DN[0] * slope_share(series_line) * found.signal_DN * series_line.maps.gain_relative
+    np.testing.assert_allclose(both, expected, rtol=1e-5)
+
+
+def test_a_slab_attenuates_as_the_exact_sum_over_energies(series_line):
+    asked = request("object", thickness_mm=slab())
+    found = expected_series(series_line, asked).signal_DN / expected_series(series_line, request()).signal_DN
+    model = spectral_model_of(series_line)
+    beam = OpenBeam(kV=90.0, filters=filters_from_text("Cu:0.05"))
+    weights = model.moment_weights(series_line.spectral.best, beam)[0]
+    top = weights.size
+    depth = 10.0 * model.mu("water_liquid")[:top] + 0.5 * model.mu("Al")[:top]
+    exact = float(weights @ np.exp(-depth) / weights.sum())
+    np.testing.assert_allclose(found, exact, rtol=1e-4)
+
+
+def test_signal_falls_with_the_square_of_the_distance(series_line):
+    near = expected_series(series_line, request())
+    far = expected_series(series_line, request(source_detector_mm=2 * 1059.0))
+    np.testing.assert_allclose(near.signal_DN, 4 * far.signal_DN, rtol=1e-9)
+
+
+def test_scales_of_the_spectrum_scale_signal_and_variance(series_line):
+    """gamma e^d: signal e^d, variance e^2d; the projection behind a scene is not made again."""
+    cache = ModelCache()
+    asked = request("object", thickness_mm=product())
+    base = expected_series(series_line, asked, cache=cache)
+    changed = series_line.spectral.best.copy()
+    changed[series_line.spectral.names.index("log_DN_per_keV")] += 0.02
+    found = expected_series(series_line, asked, parameters=changed, cache=cache)
+    np.testing.assert_allclose(found.signal_DN, base.signal_DN * math.exp(0.02), rtol=1e-9)
+    np.testing.assert_allclose(found.quantum_variance_DN2, base.quantum_variance_DN2 * math.exp(0.04), rtol=1e-9)
+
+
+def test_averaging_n_exposures_divides_all_noise_by_n(series_line):
+    one = expected_series(series_line, request())
+    many = expected_series(series_line, request(setting=f"{MEASURED},averaged=16", frame_interval_ms=352.0))
+    np.testing.assert_allclose(many.mean_DN, one.mean_DN, rtol=1e-12)
+    np.testing.assert_allclose(many.quantum_variance_DN2, one.quantum_variance_DN2 / 16, rtol=1e-12)
+    np.testing.assert_allclose(many.white_variance_DN2, one.white_variance_DN2 / 16, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["dark", "afterglow"])
+def test_without_beam_and_without_lag_there_is_the_dark_alone(series_line, kind):
+    found = expected_series(series_line, request(kind, setting=None, exposure_ms=100.0))
+    np.testing.assert_allclose(found.mean_DN, 1200.0 + 0.1 * 80.0, rtol=1e-6)
+    np.testing.assert_allclose(found.white_variance_DN2, 12.0**2 + 1 / 12, rtol=1e-6)
+    assert np.all(found.signal_DN == 0) and np.all(found.quantum_variance_DN2 == 0)
+
+
+def test_a_declared_open_level_stands_in_for_an_unknown_tube_load(series_line):
+    asked = request(setting="kv=90,exposure_ms=20,filter=Cu:0.05", open_signal_DN=5000.0)
+    found = expected_series(series_line, asked)
+    np.testing.assert_allclose(found.signal_DN, 5000.0 * series_line.levels[1].flat_shape, rtol=1e-6)
+
+
+def test_a_twin_without_spectrum_still_knows_its_measured_flats(series_line):
+    bare = replace(series_line, spectral=None)
+    one, other = expected_series(bare, request()), expected_series(series_line, request())
+    np.testing.assert_allclose(one.mean_DN, other.mean_DN, rtol=1e-9)
+    np.testing.assert_allclose(one.quantum_variance_DN2, other.quantum_variance_DN2, rtol=1e-9)
+
+
+def test_the_level_at_the_end_of_the_adc_is_flagged(series_line):
+    found = expected_series(series_line, request(setting="kv=90,power_w=45,exposure_ms=500,filter=Cu:0.05"))
+    assert found.saturated_share == 1.0
+    assert np.all(found.mean_DN <= 65535)
+
+
+# ------------------------------------------------------------------------------------------------ scenes
+
+
+def test_a_cache_never_takes_one_scene_for_another(series_line):
+    cache = ModelCache()
+    for water in (1.0, 5.0, 9.0) * 3:
+        # mappings are dropped at once, so that a later one may lie at the same address
+        found = expected_series(series_line, request("object", thickness_mm=slab(water)), cache=cache)
+        fresh = expected_series(series_line, request("object", thickness_mm=slab(water)))
+        np.testing.assert_allclose(found.mean_DN, fresh.mean_DN, rtol=1e-12)
+
+
+def test_a_small_cache_forgets_and_projects_again(series_line):
+    cache = ModelCache(budget_bytes=1)
+    scenes = [slab(1.0), slab(5.0)]
+    first = [expected_series(series_line, request("object", thickness_mm=item), cache=cache) for item in scenes]
+    again = [expected_series(series_line, request("object", thickness_mm=item), cache=cache) for item in scenes]
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.mean_DN, other.mean_DN)
+
+
+def slanted_edge(fine=10, sigma_px=0.5, angle=0.07):
+    """Opaque half plane: pixel means of the thickness, and the true picture after a continuous Gaussian spread."""
+    from scipy.ndimage import gaussian_filter
+
+    count = 40 * fine
+    row, column = (np.indices((count, count)) + 0.5) / fine - 20.0
+    covered = np.clip((column * math.cos(angle) + row * math.sin(angle) - 0.3) * fine + 0.5, 0, 1)
+
+    def pixels(image):
+        return image.reshape(40, fine, 40, fine).mean(axis=(1, 3))
+
+    return 2.0 * pixels(covered), pixels(gaussian_filter(1.0 - covered, sigma_px * fine, mode="reflect"))
+
+
+def test_a_pixel_cut_by_an_opaque_edge_shows_the_share_that_is_open(series_line):
+    """The mean of exp(-mu t) is not exp(-mu mean t): without care a thick plate's edge would stand half a pixel off."""
+    thickness, truth = slanted_edge()
+    flat = expected_series(series_line, request())
+    found = expected_series(series_line, request("object", thickness_mm={"W": thickness}))
+    ratio = (found.signal_DN / flat.signal_DN)[3:-3, 3:-3]
+    error = ratio - truth[3:-3, 3:-3]
+    assert abs(error.mean()) < 2e-4
+    near = np.abs(truth[3:-3, 3:-3] - 0.5) < 0.49
+    assert math.sqrt(np.mean(error[near] ** 2)) < 0.02
+    # the place of the edge in each row, from the row's sum: right on average within a hundredth of a pixel
+    assert abs(np.mean(ratio.sum(axis=1) - truth[3:-3, 3:-3].sum(axis=1))) < 0.01
+
+
+def test_a_smooth_object_has_no_borders_and_a_step_is_found_where_it_is():
+    row, column = np.indices((30, 30))
+    assert find_borders(0.05 * column).pixel.size == 0
+    depth = np.clip(column - 14.25, 0.0, 1.0) * 3.0
+    found = find_borders(depth)
+    assert np.array_equal(np.unique(found.pixel % 30), [15])
+    np.testing.assert_allclose(found.covered, 0.75)
+    np.testing.assert_allclose(found.sharpness, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------ noise and samples
+
+
+def test_the_general_noise_pattern_of_an_unchanged_spread_is_the_calibrated_one():
+    """The path that effects take, with a factor of 1, against the closed form of `psf`."""
+    one = np.ones((1, 1))
+    state = LineState(
+        parameters=None,
+        signal_DN=one,
+        variance_DN2=one,
+        flat_factor=one,
+        optical_transfers=(lambda f_row, f_column: np.ones(np.broadcast_shapes(f_row.shape, f_column.shape)),),
+    )
+    for model in ("aperture", "sampled"):
+        for sigma in (0.3, 0.5, 0.9):
+            found = noise_pattern(model, sigma, state)
+            half = noise_autocovariance_1d(model, sigma, 3)
+            assert found.share == pytest.approx(half[0] ** 2, rel=1e-6)
+            np.testing.assert_allclose(found.autocovariance, np.outer(half, half) / half[0] ** 2, atol=1e-6)
+
+
+def moments(frames, expected):
+    """Standardised mean (row, column), variance ratio, and covariance to the right over that expected, less 1."""
+    count = len(frames)
+    residual = frames - expected.mean_DN
+    for image, course in expected.trend_DN or ():
+        residual = residual - course[:, None, None] * image
+    lines = expected.row_variance_DN2 + expected.column_variance_DN2
+    variance = expected.quantum_variance_DN2 + expected.white_variance_DN2 + lines
+    spread = residual - residual.mean(axis=0)
+    return residual.mean(axis=0) / np.sqrt(variance / count), (spread**2).sum(axis=0) / (count - 1) / variance, spread
+
+
+def test_samples_have_the_expected_mean_variance_and_covariance(series_line):
+    asked = request("object", thickness_mm=product(), frames=400)
+    expected = expected_series(series_line, asked)
+    frames = np.stack(list(sample_series(series_line, asked, rng=np.random.default_rng(5)))).astype(np.float64)
+    z, ratio, spread = moments(frames, expected)
+    # 1600 pixels of which about one in four is independent of its neighbours
+    independent = z.size / 4
+    assert abs(z.std() - 1) < 4 / math.sqrt(2 * independent)
+    assert abs(ratio.mean() - 1) < 4 * math.sqrt(2 / 399 / independent)
+    for lag in ((0, 1), (1, 0), (1, 1)):
+        left = spread[:, : 40 - lag[0], : 40 - lag[1]]
+        right = spread[:, lag[0] :, lag[1] :]
+        quantum = expected.quantum_variance_DN2
+        seen = (left * right).mean() * 400 / 399
+        known = np.sqrt(quantum[: 40 - lag[0], : 40 - lag[1]] * quantum[lag[0] :, lag[1] :]).mean()
+        known *= expected.noise_autocovariance[lag]
+        error = (expected.quantum_variance_DN2 + expected.white_variance_DN2).mean() / math.sqrt(400 * independent)
+        assert abs(seen - known) < 4 * error
+
+
+def test_few_photons_are_counted_not_gaussian(series_line):
+    """At less than one quantum a pixel the third moment is that of Poisson quanta: variance x quantum x sum h^3."""
+    asked = request(setting="kv=90,power_w=0.01,exposure_ms=20,filter=Cu:0.05", frames=300)
+    quiet = replace(
+        series_line,
+        noise=replace(series_line.noise, quantised=False, white_fraction=0.0),
+        maps=replace(series_line.maps, read_variance_DN2=np.zeros(SHAPE, np.float32)),
+    )
+    expected = expected_series(quiet, asked)
+    frames = np.stack(list(sample_series(quiet, asked, rng=np.random.default_rng(2))))
+    residual = (frames - expected.mean_DN) / np.sqrt(expected.quantum_variance_DN2)
+    skewness = float((residual**3).mean())
+    assert skewness > 0.5
+    assert abs(float((residual**2).mean()) - 1) < 0.05
+
+
+def test_the_same_seed_gives_the_same_frames_and_another_seed_others(series_line):
+    asked = request("object", thickness_mm=product(), frames=2)
+
+    def frames(seed):
+        return np.stack(list(sample_series(series_line, asked, rng=np.random.default_rng(seed))))
+
+    np.testing.assert_array_equal(frames(1), frames(1))
+    assert np.any(frames(1) != frames(2))
+
+
+def test_samples_are_whole_numbers_within_the_adc(series_line):
+    asked = request(setting="kv=90,power_w=45,exposure_ms=400,filter=Cu:0.05", frames=1)
+    (frame,) = sample_series(series_line, asked, rng=np.random.default_rng(0))
+    assert frame.max() == 65535
+    assert np.array_equal(frame, np.rint(frame))
+
+
+def test_memory_is_handed_from_series_to_series(series_line):
+    lag = (AppliedEffect(id="image_lag", parameters={"strength": 5.0, "release_s": 1.0}),)
+    memory = LineMemory()
+    rng = np.random.default_rng(3)
+    exposed = request(frames=60)
+    list(sample_series(series_line, exposed, rng=rng, effects=lag, memory=memory))
+    assert memory.time_s == pytest.approx(60 * 0.022)
+    assert memory.trapped_DN.shape == (3, *SHAPE)
+    after = request("afterglow", setting=None, frames=20, start_s=60 * 0.022, previous=(exposed,))
+    seen = np.stack(list(sample_series(series_line, after, rng=rng, effects=lag, memory=memory)))
+    expected = expected_series(series_line, after, effects=lag)
+    assert expected.signal_DN.mean() > 50
+    assert abs((seen - expected.mean_DN).mean()) < 4 * 12.0 / math.sqrt(seen.size) + 1e-3 * expected.signal_DN.mean()
+
+
+# ------------------------------------------------------------------------------------------------ twin file
+
+
+def test_a_twin_with_effects_comes_back_from_its_file(series_line, tmp_path):
+    effects = (
+        AppliedEffect(id="object_scatter", parameters={"strength": 12.5, "width_mm": 30.0}),
+        AppliedEffect(id="composition_error", parameters={"strength": 2.0}, options={"material": "water_liquid"}),
+        AppliedEffect(id="kv_error", parameters={"strength": -1.0}, since="calibration"),
+    )
+    path = tmp_path / "twin.h5"
+    write_twin(path, replace(series_line, effects=effects))
+    assert read_twin(path).effects == effects
+
+
+def test_a_twin_file_without_effects_is_a_twin_without_effects(series_line, tmp_path):
+    write_twin(tmp_path / "twin.h5", series_line)
+    assert read_twin(tmp_path / "twin.h5").effects == ()
+
+
+@pytest.mark.parametrize(
+    "text", ["not json", '[{"id": "no_such_effect", "parameters": {}, "since": "always"}]', "[{}]"]
+)
+def test_a_twin_file_with_unreadable_effects_is_refused(series_line, tmp_path, text):
+    import h5py
+
+    path = tmp_path / "twin.h5"
+    write_twin(path, series_line)
+    with h5py.File(path, "r+") as file:
+        file.attrs["effects"] = text
+    with pytest.raises((FileFormatError, InputError), match=r"twin|effect"):
+        read_twin(path)
+
+
+def test_effects_of_the_twin_act_unless_others_are_given(series_line):
+    noisy = replace(series_line, effects=(AppliedEffect(id="excess_noise", parameters={"strength": 50.0}),))
+    base = expected_series(series_line, request())
+    own = expected_series(noisy, request())
+    np.testing.assert_allclose(own.quantum_variance_DN2, 1.5 * base.quantum_variance_DN2)
+    none = expected_series(noisy, request(), effects=())
+    np.testing.assert_allclose(none.quantum_variance_DN2, base.quantum_variance_DN2)
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "video"}, "kind of series: got video; expected one of dark, flat, object, afterglow"),
+        ({"frames": 0}, "frames of a series: got 0"),
+        ({"exposure_ms": math.nan}, "exposure_ms: got nan"),
+        ({"belt_axis": "diagonal"}, "belt_axis: got diagonal; expected row or column"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        request(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"setting": "kv=90,exposure_ms=20"}, "expected a tube load"),
+        ({"setting": None}, "beam of unknown level"),
+        ({"thickness_mm": {"Al": np.ones((3, 3))}}, r"thickness maps of a scene: got \(3, 3\)"),
+        ({"thickness_mm": {"Al": -np.ones(SHAPE)}}, "negative or not finite"),
+        ({"thickness_mm": {"unobtainium": np.ones(SHAPE)}}, "unobtainium"),
+    ],
+)
+def test_a_series_that_cannot_be_expected_says_why(series_line, changes, message):
+    with pytest.raises(InputError, match=message):
+        expected_series(series_line, request("object", **changes))
+
+
+def test_a_scene_needs_a_spectrum(series_line):
+    with pytest.raises(InputError, match="twin without spectral part"):
+        expected_series(replace(series_line, spectral=None), request("object", thickness_mm=slab()))
+
+
+def test_parameters_of_another_model_are_refused(series_line):
+    with pytest.raises(InputError, match="spectral parameters"):
+        expected_series(series_line, request(), parameters=np.zeros(2))

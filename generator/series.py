@@ -600,12 +600,14 @@ def sample_series(
             now = request.start_s + number * interval
             value = np.zeros(shape)
             if request.beam_on:
-                value = charge.mean + scale * charge.pattern.sample(before, quantum, shape, rng)
-                value += white * rng.standard_normal(shape)
+                noise = scale * charge.pattern.sample(before, quantum, shape, rng)
+                noise += white * rng.standard_normal(shape)
+                factor = 1.0
                 if state.output_rms > 0:
                     carried.output_error = _next_error(carried, now, state, rng)
                     carried.output_time_s = now
-                    value *= 1.0 + carried.output_error
+                    factor = max(1.0 + carried.output_error, 0.0)
+                value = factor * charge.mean + math.sqrt(factor) * noise
             if trapped is not None:
                 released = (1.0 - decay) * trapped
                 trapped = trapped - released + share * value

@@ -1,0 +1,716 @@
+"""The catalogue of effects: what each strength means, where each acts, and samples against expectation for all."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
+from raytwin.errors import InputError
+from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter, effect_of, in_order
+from raytwin.generator.effects.fluorescence import line_energy_keV
+from raytwin.generator.effects.registration import displacement_px
+from raytwin.generator.line_state import STAGES
+from raytwin.generator.predict import spectral_model_of
+from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
+from raytwin.generator.spectral_signal import OpenBeam
+
+SHAPE = (40, 40)
+MEASURED = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"
+SOFT = "kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05"
+# the catalogue of the project: id -> unit and plausible range of the strength
+CATALOGUE = {
+    "object_scatter": ("%", 1, 50),
+    "veiling_glare": ("%", 0.5, 5),
+    "focal_spot": ("mm", 0.05, 1.5),
+    "mtf_tail": ("%", 2, 40),
+    "k_fluorescence": ("%", 5, 40),
+    "image_lag": ("%", 0.02, 5),
+    "nonlinearity": ("%", 0.3, 5),
+    "dark_drift": ("DN", 1, 100),
+    "output_drift": ("%", 0.1, 3),
+    "kv_error": ("%", 0.5, 5),
+    "filtration_error": ("mm Al", 0.03, 1),
+    "heel": ("%", 1, 20),
+    "row_noise": ("read-noise sigmas", 0.05, 2),
+    "bad_pixels": ("%", 0.02, 2),
+    "excess_noise": ("%", 3, 100),
+    "quantisation": ("DN", 2, 64),
+    "motion_blur": ("px", 0.5, 10),
+    "misregistration": ("px", 0.1, 3),
+    "gain_map_error": ("%", 0.1, 3),
+    "composition_error": ("%", 0.5, 5),
+}
+CACHE = ModelCache()
+
+
+def request(kind="flat", setting=MEASURED, **changes):
+    parsed = None if setting is None else setting_from_text(setting)
+    values = {
+        "kind": kind,
+        "setting": parsed,
+        "frames": 10,
+        "exposure_ms": 20.0 if parsed is None else parsed.exposure_ms,
+        "frame_interval_ms": 22.0,
+        "source_object_mm": 700.0,
+        "source_detector_mm": 1059.0,
+    }
+    return SeriesRequest(**{**values, **changes})
+
+
+def make_product():
+    row, column = np.indices(SHAPE)
+    radius = np.hypot(row - 20, column - 20)
+    return {
+        "water_liquid": 20 * np.sqrt(np.clip(1 - (radius / 16) ** 2, 0, None)),
+        "Al": np.where((column > 24) & (row > 12), 3.0, 0.0),
+    }
+
+
+PRODUCT = make_product()
+BEHIND = {"kind": "object", "thickness_mm": PRODUCT}
+
+
+def applied(name, strength=None, since=None, options=None, **parameters):
+    effect = EFFECTS[name]
+    usual = "calibration" if effect.after_calibration else "always"
+    value = effect.strength.default if strength is None else strength
+    return (
+        AppliedEffect(
+            id=name, parameters={"strength": value, **parameters}, since=since or usual, options=options or {}
+        ),
+    )
+
+
+def expect(line, asked, effects=()):
+    return expected_series(line, asked, effects=effects, cache=CACHE)
+
+
+# ------------------------------------------------------------------------------------------------ the catalogue
+
+
+def test_the_catalogue_is_whole_and_its_strengths_have_the_stated_units_and_ranges():
+    assert set(EFFECTS) == set(CATALOGUE)
+    for name, (unit, low, high) in CATALOGUE.items():
+        strength = EFFECTS[name].strength
+        assert (strength.name, strength.unit, strength.low, strength.high) == ("strength", unit, low, high), name
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_entry_says_what_it_is_and_where_it_comes_from(name):
+    effect = EFFECTS[name]
+    assert effect.title and effect.reference and effect.stage in STAGES
+    assert len({item.name for item in effect.parameters}) == len(effect.parameters)
+    assert all(item.source for item in effect.parameters)
+
+
+def numbers(found):
+    """All that an expectation holds, one vector of standardised size."""
+    parts = [
+        found.mean_DN / 100,
+        found.quantum_variance_DN2 / 100,
+        found.white_variance_DN2 / 100,
+        found.noise_autocovariance,
+        np.array([found.row_variance_DN2, found.column_variance_DN2, found.bad_pixel_share, found.fixed_pattern_rms]),
+        np.array([found.frame_factor_rms * 100]),
+        found.temporal_correlation * 100,
+        *[image[..., None] * course / 10 for image, course in found.trend_DN or ()],
+    ]
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+LATER = {
+    "previous": (request(frames=30),),
+    "start_s": 0.7,
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("asked", [request(**BEHIND, **LATER), request(**LATER), request("dark", setting=None)])
+def test_strength_zero_is_no_effect_at_all(series_line, name, asked):
+    none = expect(series_line, asked)
+    zero = expect(series_line, asked, applied(name, 0.0))
+    np.testing.assert_array_equal(numbers(zero), numbers(none))
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name != "quantisation"])
+def test_effects_are_smooth_in_every_fitted_parameter(series_line, name):
+    """Central differences of step h and h/2 agree: a fit may use them."""
+    asked = request(**BEHIND, **LATER)
+    effect = EFFECTS[name]
+    for item in (entry for entry in effect.parameters if entry.fitted):
+        centre = math.sqrt(item.low * item.high) if item.log else item.default or 0.3 * item.high
+        step = 0.02 * centre
+
+        def slope(size, item=item, centre=centre):
+            ends = [
+                numbers(expect(series_line, asked, applied(name, **{item.name: centre + sign * size})))
+                for sign in (1, -1)
+            ]
+            return (ends[0] - ends[1]) / (2 * size)
+
+        coarse, fine = slope(step), slope(step / 2)
+        scale = np.linalg.norm(fine)
+        assert scale > 0 or item.name != "strength"
+        # rounding of single precision in the projection leaves 1e-6 of 100 DN
+        assert np.linalg.norm(coarse - fine) < 0.01 * scale + 1e-3 / step, item.name
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_that_came_after_calibration_leaves_the_calibrating_series_alone(series_line, name):
+    before = request(**BEHIND, after_calibration=False)
+    effect = applied(name, since="calibration")
+    np.testing.assert_array_equal(numbers(expect(series_line, before, effect)), numbers(expect(series_line, before)))
+
+
+def test_the_order_in_which_effects_are_given_does_not_matter(series_line):
+    asked = request(**BEHIND)
+    effects = applied("object_scatter") + applied("nonlinearity") + applied("kv_error") + applied("mtf_tail")
+    one, other = expect(series_line, asked, effects), expect(series_line, asked, effects[::-1])
+    np.testing.assert_array_equal(numbers(one), numbers(other))
+    stages = [STAGES.index(entry.stage) for _, entry, _ in in_order(effects)]
+    assert stages == sorted(stages)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_samples_have_the_expected_mean_variance_and_covariance(series_line, name):
+    """Strength at the top of its range; expected and sampled read one state, and this shows that both read all of it."""
+    earlier = request(frames=50)
+    asked = request(**BEHIND, frames=300, start_s=1.2, previous=(earlier,))
+    effects = applied(name, EFFECTS[name].strength.high)
+    expected = expect(series_line, asked, effects)
+    rng = np.random.default_rng(7)
+    frames = np.stack(
+        list(sample_series(series_line, asked, rng=rng, effects=effects, cache=CACHE, memory=None))
+    ).astype(np.float64)
+    residual = frames - expected.mean_DN
+    for image, course in expected.trend_DN or ():
+        residual = residual - course[:, None, None] * image
+    quantum = expected.quantum_variance_DN2
+    lines = expected.row_variance_DN2 + expected.column_variance_DN2
+    common = expected.frame_factor_rms**2 * expected.signal_DN**2
+    variance = quantum + expected.white_variance_DN2 + lines + common
+    count = len(frames)
+    good = np.ones(SHAPE, dtype=bool)
+    if name == "bad_pixels":
+        good = np.abs(residual.mean(axis=0)) < 6 * np.sqrt(variance / count)
+        share = 1 - good.mean()
+        assert abs(share - expected.bad_pixel_share) < 4 * math.sqrt(8 * expected.bad_pixel_share / good.size)
+    if name == "gain_map_error":
+        pattern = residual.mean(axis=0) / expected.signal_DN
+        assert pattern.std() == pytest.approx(expected.fixed_pattern_rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
+        residual = residual - residual.mean(axis=0)
+    if name == "output_drift":
+        factor = (residual / expected.signal_DN).mean(axis=(1, 2))
+        rho = expected.frame_factor_correlation
+        independent = count * (1 - rho[1]) / (1 + rho[1])
+        assert abs(factor.std() / expected.frame_factor_rms - 1) < 4 / math.sqrt(2 * independent)
+        residual = residual - factor[:, None, None] * expected.signal_DN
+        # the tube's mean output during these frames moves their variance along
+        variance = variance - common + factor.mean() * quantum
+        quantum = (1 + factor.mean()) * quantum
+    spread = residual - residual.mean(axis=0)
+    independent = good.sum() / 4  # neighbours share noise; rows share theirs
+    if name == "row_noise":
+        independent = SHAPE[0]
+    if name not in ("gain_map_error", "output_drift"):
+        z = residual.mean(axis=0) / np.sqrt(variance / count)
+        if name == "image_lag":
+            z = z / math.sqrt(1 + 2 * expected.temporal_correlation.sum())
+        assert abs(z[good].std() - 1) < 4 / math.sqrt(2 * independent) + 0.01
+        assert abs(z[good].mean()) < 4 / math.sqrt(independent)
+    ratio = (spread**2).sum(axis=0) / (count - 1) / variance
+    assert abs(ratio[good].mean() - 1) < 4 * math.sqrt(2 / (count - 1) / independent)
+    for down, right in ((0, 1), (1, 0)):
+        left, beside = np.s_[: 40 - down, : 40 - right], np.s_[down:, right:]
+        seen = (spread[:, *left] * spread[:, *beside]).mean(axis=0) * count / (count - 1)
+        known = np.sqrt(quantum[left] * quantum[beside]) * expected.noise_autocovariance[down, right]
+        known = known + (expected.row_variance_DN2 if right else expected.column_variance_DN2)
+        size = np.sqrt(variance[left] * variance[beside])
+        pair = good[left] & good[beside]
+        bias = 0.004 if name == "gain_map_error" else 0.0  # eta^2 of the variance
+        assert abs(((seen - known) / size)[pair].mean()) < 4 / math.sqrt(count * independent) + bias
+    between = (spread[1:] * spread[:-1]).mean(axis=0)
+    known = expected.temporal_correlation[0] * quantum
+    assert abs(((between - known) / variance)[good].mean() + 1 / count) < 4 / math.sqrt(count * independent) + 1 / count
+
+
+# ------------------------------------------------------------------------------------------------ scatter and glare
+
+
+def water_slab(line, strength, source_object_mm=None, width=50.0):
+    asked = request(
+        "object",
+        thickness_mm={"water_liquid": np.full(SHAPE, 20.0)},
+        source_object_mm=source_object_mm or line.instrument.source_object_mm,
+    )
+    primary = expect(line, asked).signal_DN
+    both = expect(line, asked, applied("object_scatter", strength, width_mm=width)).signal_DN
+    return (both - primary) / primary
+
+
+@pytest.mark.parametrize("width", [10.0, 50.0, 300.0])
+def test_scatter_over_primary_behind_20_mm_of_water_is_the_strength_at_the_field_s_centre(series_line, width):
+    ratio = water_slab(series_line, 20.0, width=width)
+    assert ratio[19:21, 19:21].mean() == pytest.approx(0.20, rel=0.005)
+    assert ratio[0, 0] < ratio[19, 19]
+
+
+def test_scatter_falls_with_the_air_gap_and_adds_its_own_quanta(series_line):
+    near, far = (water_slab(series_line, 20.0, mm, width=10.0)[20, 20] for mm in (990.0, 500.0))
+    assert far < 0.2 * near
+    asked = request("object", thickness_mm={"water_liquid": np.full(SHAPE, 20.0)})
+    base, more = expect(series_line, asked), expect(series_line, asked, applied("object_scatter", 20.0))
+    np.testing.assert_allclose(
+        more.quantum_variance_DN2 / base.quantum_variance_DN2, more.signal_DN / base.signal_DN, rtol=1e-6
+    )
+
+
+def test_there_is_no_scatter_without_an_object(series_line):
+    asked = request()
+    found = expect(series_line, asked, applied("object_scatter", 50.0))
+    np.testing.assert_array_equal(found.mean_DN, expect(series_line, asked).mean_DN)
+
+
+def test_scatter_without_a_known_gap_is_refused(series_line):
+    nowhere = replace(series_line, instrument=replace(series_line.instrument, source_object_mm=None))
+    asked = request(**BEHIND, source_object_mm=None)
+    with pytest.raises(InputError, match=r"source_object_mm: got unknown; .*object_scatter"):
+        expect(nowhere, asked, applied("object_scatter"))
+
+
+def disc(radius=8):
+    row, column = np.indices(SHAPE)
+    return {"W": np.where(np.hypot(row - 20, column - 20) <= radius, 2.0, 0.0)}
+
+
+def test_glare_fills_opaque_shadows_whatever_the_gap_and_leaves_flats_alone(series_line):
+    effect = applied("veiling_glare", 4.0, length_mm=2.0)
+    flat = expect(series_line, request())
+    np.testing.assert_allclose(expect(series_line, request(), effect).mean_DN, flat.mean_DN, rtol=1e-9)
+    centres = []
+    for distance in (500.0, 990.0):
+        asked = request("object", thickness_mm=disc(), source_object_mm=distance)
+        ratio = (expect(series_line, asked, effect).signal_DN - expect(series_line, asked).signal_DN) / flat.signal_DN
+        centres.append(ratio[20, 20])
+    assert centres[0] == pytest.approx(centres[1], rel=1e-9)
+    # a disc of radius a takes the share 1 - exp(-a / L) of the glare of an even field away
+    # the spread of light reaches the centre of the disc nowhere else
+    outside = math.exp(-8.5 * 0.15 / 2.0)
+    assert centres[0] == pytest.approx(0.04 * outside, rel=0.05)
+
+
+def test_a_smaller_disc_lets_more_glare_into_its_middle(series_line):
+    effect = applied("veiling_glare", 4.0, length_mm=2.0)
+    small, large = (
+        expect(series_line, request("object", thickness_mm=disc(radius)), effect).signal_DN[20, 20]
+        for radius in (5, 12)
+    )
+    assert small > large
+
+
+def test_glare_lowers_the_noise_by_the_square_of_what_stays(series_line):
+    found = expect(series_line, request(), applied("veiling_glare", 5.0, length_mm=10.0))
+    base = expect(series_line, request())
+    ratio = found.quantum_variance_DN2 / base.quantum_variance_DN2
+    np.testing.assert_allclose(ratio, 0.95**2, rtol=0.01)
+
+
+# ------------------------------------------------------------------------------------------------ sharpness
+
+
+def ripple(axis, order):
+    """A plate with a weak cosine of `order` half periods across the field: blur lowers its height by the transfer."""
+    place = (np.indices(SHAPE)[axis] + 0.5) / 40
+    return {"water_liquid": 10.0 + 0.05 * np.cos(np.pi * order * place)}
+
+
+def transfer(line, asked, effects, axis):
+    """Height of the ripple with effects over that without, and its frequency in cycles per pixel."""
+    order = 12
+    heights = []
+    for chosen in (effects, ()):
+        plate = replace(asked, thickness_mm=ripple(axis, order))
+        picture = expect(line, plate, chosen).signal_DN / expect(line, replace(asked, thickness_mm=None)).signal_DN
+        wave = np.cos(np.pi * order * (np.indices(SHAPE)[axis] + 0.5) / 40)
+        heights.append(float((picture * wave).mean()))
+    return heights[0] / heights[1], order / 80
+
+
+@pytest.mark.parametrize("source_object_mm", [990.0, 700.0, 530.0])
+def test_the_focal_spot_blurs_by_a_times_magnification_less_one(series_line, source_object_mm):
+    size_mm = 0.3
+    asked = request("object", source_object_mm=source_object_mm)
+    for axis in (0, 1):
+        found, frequency = transfer(series_line, asked, applied("focal_spot", size_mm), axis)
+        sigma_px = size_mm * (1059.0 / source_object_mm - 1.0) / 0.15 / 2.3548
+        assert found == pytest.approx(math.exp(-2 * (math.pi * sigma_px * frequency) ** 2), rel=1e-3)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_motion_blurs_along_the_belt_in_proportion_to_the_exposure(series_line, axis):
+    for exposure_ms in (20, 50):
+        setting = f"kv=90,power_w=45,exposure_ms={exposure_ms},filter=Cu:0.05"
+        for along in (0, 1):
+            asked = request("object", setting=setting, belt_axis=("row", "column")[axis], source_object_mm=990.0)
+            found, frequency = transfer(series_line, asked, applied("motion_blur", 4.0), along)
+            length = 4.0 * exposure_ms / 50.0 if along == axis else 0.0
+            assert found == pytest.approx(float(np.sinc(length * frequency)), rel=1e-3)
+
+
+def test_a_standing_belt_blurs_nothing(series_line):
+    asked = request(**BEHIND, belt_speed_mm_s=0.0)
+    np.testing.assert_array_equal(
+        expect(series_line, asked, applied("motion_blur", 5.0)).mean_DN, expect(series_line, asked).mean_DN
+    )
+
+
+@pytest.mark.parametrize("name", ["focal_spot", "motion_blur"])
+def test_blur_of_the_object_leaves_flats_and_the_noise_s_texture_alone(series_line, name):
+    base, found = expect(series_line, request(**BEHIND)), expect(series_line, request(**BEHIND), applied(name))
+    np.testing.assert_array_equal(found.noise_autocovariance, base.noise_autocovariance)
+    assert found.quantum_variance_DN2.sum() == pytest.approx(base.quantum_variance_DN2.sum(), rel=0.02)
+    np.testing.assert_array_equal(
+        expect(series_line, request(), applied(name)).mean_DN, expect(series_line, request()).mean_DN
+    )
+
+
+def test_an_mtf_tail_blurs_edges_and_noise_alike(series_line):
+    effect = applied("mtf_tail", 30.0, reach_px=1.0)
+    base, found = expect(series_line, request()), expect(series_line, request(), effect)
+    assert found.quantum_variance_DN2.mean() < 0.8 * base.quantum_variance_DN2.mean()
+    # what is lost in one pixel is found in the covariances: the sum over all lags is that of all frequencies, 1
+    assert found.noise_autocovariance[0, 3] > 5 * base.noise_autocovariance[0, 3]
+    for source_object_mm in (990.0, 530.0):
+        seen, frequency = transfer(series_line, request("object", source_object_mm=source_object_mm), effect, 0)
+        gauss = math.exp(-2 * (math.pi * 0.5 * frequency) ** 2)
+        known = 0.7 + 0.3 / (1 + (2 * math.pi * 1.0 * frequency) ** 2) / gauss
+        assert seen == pytest.approx(known, rel=1e-3)
+
+
+def test_k_photons_spread_only_above_the_edge(series_line):
+    effect = applied("k_fluorescence", 30.0)
+    # all photons of 30 kV are below 33.2 keV
+    soft = request(setting="kv=30,power_w=40,exposure_ms=20")
+    np.testing.assert_allclose(
+        expect(series_line, soft, effect).quantum_variance_DN2, expect(series_line, soft).quantum_variance_DN2
+    )
+    hard = expect(series_line, request(), effect).quantum_variance_DN2
+    assert np.median(hard / expect(series_line, request()).quantum_variance_DN2) < 0.97
+    np.testing.assert_allclose(
+        line_energy_keV(np.array([30.0, 34.0, 60.0]), filters_from_text("CsI:0.5")), [0.0, 28.6, 29.8], atol=0.2
+    )
+
+
+# ------------------------------------------------------------------------------------------------ time
+
+
+def test_the_first_frame_after_a_long_exposure_is_the_strength_of_the_lag(series_line):
+    effect = applied("image_lag", 2.0, release_s=0.1, spread=2.0)
+    exposed = request(frames=2000)
+    after = request("afterglow", setting=None, frames=1, start_s=2000 * 0.022, previous=(exposed,))
+    last = expect(series_line, exposed).signal_DN
+    np.testing.assert_allclose(expect(series_line, after, effect).signal_DN, 0.02 * last, rtol=1e-6)
+
+
+def test_lag_conserves_charge(series_line):
+    effect = applied("image_lag", 5.0, release_s=0.2, spread=3.0)
+    exposed = request(frames=20)
+    after = request("afterglow", setting=None, frames=3000, start_s=20 * 0.022, previous=(exposed,))
+    with_lag = expect(series_line, exposed, effect)
+    collected = 20 * with_lag.signal_DN + 3000 * expect(series_line, after, effect).signal_DN
+    np.testing.assert_allclose(collected, 20 * expect(series_line, exposed).signal_DN, rtol=1e-9)
+    # the trend adds to the mean without changing it
+    for _, course in with_lag.trend_DN:
+        assert abs(course.sum()) < 1e-9
+
+
+def test_lag_lowers_the_variance_and_correlates_frames_as_its_impulse_response_says(series_line):
+    effect = applied("image_lag", 5.0, release_s=0.05, spread=1.0)
+    base, found = expect(series_line, request()), expect(series_line, request(), effect)
+    decay = math.exp(-0.022 / 0.05)
+    impulse = np.concatenate([[0.95], 0.05 * (1 - decay) * decay ** np.arange(500)])
+    variance = float(np.sum(impulse**2))
+    np.testing.assert_allclose(found.quantum_variance_DN2, variance * base.quantum_variance_DN2, rtol=1e-9)
+    for lag in (1, 2, 3):
+        known = float(np.sum(impulse[lag:] * impulse[:-lag])) / variance
+        assert found.temporal_correlation[lag - 1] == pytest.approx(known, rel=1e-9)
+
+
+def test_averaged_exposures_lag_among_themselves(series_line):
+    effect = applied("image_lag", 5.0, release_s=0.05, spread=1.0)
+    asked = request(setting=f"{MEASURED},averaged=4", frame_interval_ms=88.0)
+    found, base = expect(series_line, asked, effect), expect(series_line, asked)
+    decay = math.exp(-0.022 / 0.05)
+    impulse = np.concatenate([[0.95], 0.05 * (1 - decay) * decay ** np.arange(500)])
+    mean = np.convolve(impulse, np.ones(4)) / 4
+    np.testing.assert_allclose(
+        found.quantum_variance_DN2 / base.quantum_variance_DN2, float(np.sum(mean**2)) * 4, rtol=1e-9
+    )
+
+
+def test_a_ghost_of_the_last_object_lies_in_the_next_flat(series_line):
+    effect = applied("image_lag", 3.0, release_s=1.0)
+    earlier = request(**BEHIND, frames=100)
+    asked = request(frames=1, start_s=2.2, previous=(earlier,))
+    ghost = expect(series_line, asked, effect).signal_DN / expect(series_line, asked).signal_DN
+    behind = expect(series_line, earlier).signal_DN
+    assert np.corrcoef(ghost.ravel(), behind.ravel())[0, 1] > 0.99
+
+
+def test_sampled_lag_conserves_what_the_frames_and_the_traps_hold(series_line):
+    effect = applied("image_lag", 5.0, release_s=0.5)
+    quiet = replace(
+        series_line,
+        noise=replace(series_line.noise, quantised=False),
+        maps=replace(series_line.maps, read_variance_DN2=np.zeros(SHAPE, np.float32)),
+    )
+    asked = request(frames=30)
+    memory = LineMemory()
+    with_lag = sum(sample_series(quiet, asked, rng=np.random.default_rng(1), effects=effect, memory=memory))
+    without = sum(sample_series(quiet, asked, rng=np.random.default_rng(1), effects=()))
+    np.testing.assert_allclose(with_lag + memory.trapped_DN.sum(axis=0), without, rtol=1e-5)
+
+
+def test_dark_drift_reaches_its_strength_at_the_session_s_end_and_longest_exposure(series_line):
+    effect = applied("dark_drift", 20.0, session_s=100.0, longest_exposure_ms=200.0, warm_up=0.5)
+    for exposure_ms, expected in ((200.0, 20.0), (50.0, 5.0)):
+        ends = [
+            expect(series_line, request("dark", setting=None, frames=1, exposure_ms=exposure_ms, start_s=time), effect)
+            for time in (0.0, 100.0)
+        ]
+        np.testing.assert_allclose(ends[1].mean_DN - ends[0].mean_DN, expected, rtol=1e-9)
+    lit = request(start_s=100.0, frames=1)
+    shift = expect(series_line, lit, effect).mean_DN - expect(series_line, lit).mean_DN
+    np.testing.assert_allclose(shift, 2.0, rtol=1e-6)
+
+
+def test_output_drift_is_one_factor_of_a_frame_with_its_correlation(series_line):
+    effect = applied("output_drift", 2.0, correlation_s=0.1)
+    found = expect(series_line, request(frames=50), effect)
+    assert found.frame_factor_rms == pytest.approx(0.02)
+    assert found.frame_factor_correlation[1] == pytest.approx(math.exp(-0.022 / 0.1))
+    assert expect(series_line, request("dark", setting=None), effect).frame_factor_rms == 0
+    averaged = expect(series_line, request(setting=f"{MEASURED},averaged=1000", frame_interval_ms=22000.0), effect)
+    assert averaged.frame_factor_rms == pytest.approx(0.02 * math.sqrt(2 * 0.1 / 22.0), rel=0.02)
+
+
+# ------------------------------------------------------------------------------------------------ beam
+
+
+def test_a_kV_error_is_the_model_at_the_other_voltage(series_line):
+    model, best = spectral_model_of(series_line), series_line.spectral.best[None, :]
+    for name, setting in (("hard", MEASURED), ("soft", SOFT)):
+        asked = request(setting=setting)
+        parsed = asked.setting
+        found = expect(series_line, asked, applied("kv_error", 2.0)).signal_DN / expect(series_line, asked).signal_DN
+        at, higher = (
+            model.signal(best, OpenBeam(kV=kV, filters=parsed.filters)).rate_DN_per_mAs[0]
+            for kV in (parsed.kV, 1.02 * parsed.kV)
+        )
+        np.testing.assert_allclose(found, higher / at, rtol=2e-3, err_msg=name)
+
+
+def test_a_kV_error_beyond_the_tables_is_refused(series_line):
+    with pytest.raises(InputError, match=r"strength of kv_error: got 9 %"):
+        expect(series_line, request(), applied("kv_error", 9.0))
+
+
+def test_a_filtration_error_is_another_sheet_of_aluminium(series_line):
+    model, best = spectral_model_of(series_line), series_line.spectral.best[None, :]
+    asked = request(setting=SOFT)
+    copper = asked.setting.filters
+    sheet = (*copper, Filter(material="Al", thickness_mm=0.5))
+    known = [model.signal(best, OpenBeam(kV=40.0, filters=layers)) for layers in (copper, sheet)]
+    base, found = expect(series_line, asked), expect(series_line, asked, applied("filtration_error", 0.5))
+    np.testing.assert_allclose(
+        found.signal_DN / base.signal_DN, known[1].rate_DN_per_mAs[0] / known[0].rate_DN_per_mAs[0], rtol=1e-6
+    )
+
+
+def test_a_composition_error_is_so_much_more_of_the_material(series_line):
+    layers = {"water_liquid": PRODUCT["water_liquid"], "Al": np.full(SHAPE, 1.0)}
+    thicker = {**layers, "water_liquid": 1.03 * layers["water_liquid"]}
+    known = expect(series_line, request("object", thickness_mm=thicker)).mean_DN
+    asked = request("object", thickness_mm=layers)
+    for options in ({}, {"material": "water_liquid"}):
+        found = expect(series_line, asked, applied("composition_error", 3.0, options=options))
+        # borders of the object are looked for in its thickness, and lie a hair elsewhere
+        np.testing.assert_allclose(found.mean_DN, known, rtol=1e-4)
+    other = expect(series_line, replace(asked, product_material="Al"), applied("composition_error", 3.0))
+    assert np.abs(other.mean_DN / known - 1).max() > 1e-3
+
+
+def across_field(line, asked, effects):
+    """Change of the signal from the first to the last row, and column, over its mean."""
+    ratio = expect(line, asked, effects).signal_DN / expect(line, asked).signal_DN
+    down, right = ratio[-1].mean() - ratio[0].mean(), ratio[:, -1].mean() - ratio[:, 0].mean()
+    return down / ratio.mean(), right / ratio.mean()
+
+
+def test_the_heel_changes_the_unfiltered_signal_by_its_strength_across_the_field(series_line):
+    bare = request(setting="kv=60,power_w=40,exposure_ms=20")
+    down, right = across_field(series_line, bare, applied("heel", 5.0, direction_deg=0.0))
+    assert down == pytest.approx(-0.05, abs=0.0015)
+    assert right == pytest.approx(0.0, abs=1e-3)
+    down, right = across_field(series_line, bare, applied("heel", 5.0, direction_deg=90.0))
+    assert right == pytest.approx(-0.05, abs=0.0015)
+    assert down == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("turned", "expected"), [(180.0, (0.05, 0.0)), (90.0, (0.0, 0.05)), (360.0, (-0.05, 0.0))])
+def test_a_turned_panel_sees_the_heel_turned(series_line, turned, expected):
+    bare = request(setting="kv=60,power_w=40,exposure_ms=20", panel_rotation_deg=turned)
+    assert across_field(series_line, bare, applied("heel", 5.0)) == pytest.approx(expected, abs=0.002)
+
+
+def test_a_heel_that_calibration_saw_is_in_its_flat_but_its_hardness_shows_behind_objects(series_line):
+    always = applied("heel", 10.0, since="always")
+    flat = request(setting=SOFT)
+    np.testing.assert_array_equal(expect(series_line, flat, always).mean_DN, expect(series_line, flat).mean_DN)
+    asked = request("object", setting=SOFT, thickness_mm={"Al": np.full(SHAPE, 3.0)})
+    down, _ = across_field(series_line, asked, always)
+    # behind aluminium the beam is harder, and the anode takes less of it: the calibrated gradient is too steep
+    assert 0.005 < down < 0.1
+    turned = replace(flat, panel_rotation_deg=180.0)
+    assert across_field(series_line, turned, always)[0] > 0.1
+
+
+# ------------------------------------------------------------------------------------------------ response and readout
+
+
+def test_nonlinearity_departs_by_its_strength_at_half_of_the_highest_level(series_line):
+    effect = applied("nonlinearity", 2.0, highest_signal_DN=40000.0)
+    asked = request(setting="kv=90,exposure_ms=20,filter=Cu:0.05", open_signal_DN=20000.0)
+    base, found = expect(series_line, asked), expect(series_line, asked, effect)
+    at = np.abs(base.signal_DN - 20000.0) < 100
+    np.testing.assert_allclose(found.signal_DN[at] / base.signal_DN[at], 0.98, rtol=2e-4)
+    # the slope of the response acts on the noise
+    np.testing.assert_allclose(found.quantum_variance_DN2[at] / base.quantum_variance_DN2[at], 0.96**2, rtol=1e-3)
+
+
+def test_nonlinearity_refers_to_the_full_scale_of_the_adc_unless_told(series_line):
+    room = 65535 - 1200.0
+    stated = expect(series_line, request(), applied("nonlinearity", 2.0, highest_signal_DN=room))
+    np.testing.assert_allclose(expect(series_line, request(), applied("nonlinearity", 2.0)).mean_DN, stated.mean_DN)
+
+
+def test_row_noise_is_so_many_read_noises_in_rows_or_columns(series_line):
+    rows = expect(series_line, request("dark", setting=None), applied("row_noise", 0.5))
+    assert (rows.row_variance_DN2, rows.column_variance_DN2) == (pytest.approx(36.0), 0.0)
+    columns = expect(series_line, request("dark", setting=None), applied("row_noise", 0.5, column_share=1.0))
+    assert (columns.row_variance_DN2, columns.column_variance_DN2) == (0.0, pytest.approx(36.0))
+
+
+def test_excess_noise_is_quantum_noise_alone(series_line):
+    base, found = expect(series_line, request()), expect(series_line, request(), applied("excess_noise", 40.0))
+    np.testing.assert_allclose(found.quantum_variance_DN2, 1.4 * base.quantum_variance_DN2)
+    np.testing.assert_array_equal(found.mean_DN, base.mean_DN)
+    dark = request("dark", setting=None)
+    np.testing.assert_array_equal(
+        expect(series_line, dark, applied("excess_noise", 40.0)).white_variance_DN2,
+        expect(series_line, dark).white_variance_DN2,
+    )
+
+
+@pytest.mark.parametrize("step", [2.0, 16.0, 40.0, 64.0])
+def test_rounding_to_coarse_steps_has_the_moments_of_a_rounded_gaussian(series_line, step):
+    """Mean and variance against the sum over all steps, where the noise is a fraction of a step: they swing with level."""
+    from scipy.stats import norm
+
+    for level in np.linspace(1200.0, 1264.0, 7):
+        maps = replace(series_line.maps, dark_DN=np.full(SHAPE, level, dtype=np.float32))
+        found = expect(replace(series_line, maps=maps), request("dark", setting=None), applied("quantisation", step))
+        grid = step * np.arange(0, 3000 // step)
+        sigma = math.sqrt(12.0**2)
+        weight = norm.cdf(grid + step / 2, level, sigma) - norm.cdf(grid - step / 2, level, sigma)
+        mean = float(weight @ grid)
+        assert found.mean_DN[0, 0] == pytest.approx(mean, abs=2e-3)
+        assert found.white_variance_DN2[0, 0] == pytest.approx(float(weight @ (grid - mean) ** 2), rel=1e-3)
+        assert found.quantisation_step_DN == step
+
+
+def test_patterns_are_fixed_by_their_seed(series_line):
+    quiet = request(setting=f"{MEASURED},averaged=400", frames=1)
+
+    def pattern(name, seed):
+        effect = applied(name, EFFECTS[name].strength.high, pattern_seed=seed)
+        (frame,) = sample_series(series_line, quiet, rng=np.random.default_rng(0), effects=effect, cache=CACHE)
+        (base,) = sample_series(series_line, quiet, rng=np.random.default_rng(0), effects=(), cache=CACHE)
+        return (frame - base).ravel()
+
+    for name in ("gain_map_error", "bad_pixels"):
+        same, again, other = pattern(name, 1), pattern(name, 1), pattern(name, 2)
+        np.testing.assert_array_equal(same, again)
+        assert np.corrcoef(same, other)[0, 1] < 0.3
+
+
+@pytest.mark.parametrize("name", ["gain_map_error", "bad_pixels"])
+def test_a_pattern_that_calibration_saw_is_no_effect(series_line, name):
+    always = applied(name, since="always")
+    np.testing.assert_array_equal(
+        numbers(expect(series_line, request(), always)), numbers(expect(series_line, request()))
+    )
+
+
+# ------------------------------------------------------------------------------------------------ registration
+
+
+def test_a_whole_pixel_of_misregistration_is_the_object_one_pixel_on(series_line):
+    effect = applied("misregistration", 2.0, direction_deg=90.0)
+    found = expect(series_line, request(**BEHIND), effect).signal_DN
+    moved = {name: np.roll(image, 2, axis=1) for name, image in PRODUCT.items()}
+    known = expect(series_line, request("object", thickness_mm=moved)).signal_DN
+    inside = np.s_[4:-4, 8:-8]
+    np.testing.assert_allclose(found[inside], known[inside], rtol=1e-3)
+
+
+@given(
+    strength=st.floats(0.01, 5.0),
+    direction=st.floats(0.0, 360.0),
+    magnification=st.floats(-90.0, 90.0),
+    rows=st.integers(2, 60),
+    columns=st.integers(2, 60),
+)
+def test_the_rms_displacement_is_the_strength_for_any_mix(strength, direction, magnification, rows, columns):
+    down, right = displacement_px(
+        (rows, columns), strength_px=strength, direction_deg=direction, magnification_deg=magnification
+    )
+    assert math.sqrt(np.mean(down**2 + right**2)) == pytest.approx(strength, rel=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_unknown_effects_and_parameters_are_named_with_the_nearest(series_line):
+    with pytest.raises(InputError, match=r"effect: got objekt_scatter; .*did you mean object_scatter"):
+        effect_of(AppliedEffect(id="objekt_scatter", parameters={}))
+    with pytest.raises(InputError, match=r"parameter of effect heel: got direction; .*did you mean direction_deg"):
+        expect(series_line, request(), applied("heel", direction=3.0))
+
+
+def test_effects_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="since: got yesterday; expected one of always, calibration"):
+        AppliedEffect(id="heel", parameters={}, since="yesterday")
+    with pytest.raises(InputError, match="strength of effect heel: got nan"):
+        AppliedEffect(id="heel", parameters={"strength": math.nan})
+    good = {"name": "strength", "unit": "%", "low": 1.0, "high": 2.0, "default": 1.5, "source": "x", "log": False}
+    with pytest.raises(InputError, match="expected low <= default <= high"):
+        Parameter(**{**good, "default": 3.0})
+    with pytest.raises(InputError, match="above 0 and unsigned"):
+        Parameter(**{**good, "log": True, "signed": True})
+    entry = {"id": "x", "title": "x", "reference": "x", "after_calibration": False, "change": EFFECTS["heel"].change}
+    with pytest.raises(InputError, match="stage: got nowhere"):
+        Effect(**entry, parameters=(Parameter(**good),), stage="nowhere")
+    with pytest.raises(InputError, match="no strength"):
+        Effect(**entry, parameters=(Parameter(**{**good, "name": "size"}),), stage="beam")
+
+
+def test_beam_effects_need_a_spectrum(series_line):
+    bare = replace(series_line, spectral=None)
+    for name in ("kv_error", "filtration_error", "heel"):
+        with pytest.raises(InputError, match="twin without spectral part"):
+            expect(bare, request(), applied(name))

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
         merge_frame_sums,
         sum_frames,
     )
+    from .next_measurement import (
+        NextMeasurement,
+        rank_measurements,
+    )
     from .noise_covariance import (
         NoiseCovariance,
         SpreadFit,
@@ -46,6 +50,7 @@ if TYPE_CHECKING:
 
 _LAZY = {
     "FrameSums": "frame_sums",
+    "NextMeasurement": "next_measurement",
     "NoiseCovariance": "noise_covariance",
     "PRIORS": "priors",
     "PhotonTransfer": "photon_transfer",
@@ -64,6 +69,7 @@ _LAZY = {
     "fit_spread": "noise_covariance",
     "geometry_factor": "spectral_fit",
     "merge_frame_sums": "frame_sums",
+    "rank_measurements": "next_measurement",
     "sampling_covariance": "noise_covariance",
     "sum_frames": "frame_sums",
     "validate_twin": "validate",
@@ -72,6 +78,7 @@ _LAZY = {
 __all__ = [
     "PRIORS",
     "FrameSums",
+    "NextMeasurement",
     "NoiseCovariance",
     "PhotonTransfer",
     "Prior",
@@ -89,6 +96,7 @@ __all__ = [
     "fit_spread",
     "geometry_factor",
     "merge_frame_sums",
+    "rank_measurements",
     "sampling_covariance",
     "sum_frames",
     "validate_twin",

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.setting import text_from_filters
 from ..errors import FitError
 from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
+from .next_measurement import rank_measurements
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .spectral_fit import fit_spectrum
 
@@ -20,6 +22,7 @@ def calibrate_twin(
     rng: np.random.Generator,
     progress: Callable[[str], None] | None = None,
     provenance: dict[str, Any] | None = None,
+    advise: bool = True,
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
@@ -28,6 +31,7 @@ def calibrate_twin(
         rng: source of randomness of the posterior's draws.
         progress: called with the name of each stage.
         provenance: kept in the twin.
+        advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
         InputError: the session cannot calibrate anything; the message says what is missing.
@@ -65,6 +69,7 @@ def calibrate_twin(
                 "data": fit.data,
                 "effective_draws": fit.effective_draws,
                 "undetermined": list(spectral.undetermined),
+                "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
                 "prior": dict(spectral.prior),
             }
             if fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data):
@@ -75,7 +80,7 @@ def calibrate_twin(
     else:
         warnings.append("no series states its kV: no spectral part, no prediction at other settings")
     evidence["bad_pixels"] = bad_pixel_counts(transfer)
-    return Twin(
+    twin = Twin(
         instrument=acquisition.instrument,
         maps=transfer.maps,
         noise=transfer.noise,
@@ -86,6 +91,11 @@ def calibrate_twin(
         warnings=tuple(warnings),
         provenance=provenance or {},
     )
+    if advise and spectral is not None:
+        tell("next measurement")
+        ranked = rank_measurements(twin)
+        twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
+    return twin
 
 
 def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
@@ -145,6 +155,7 @@ def calibration_answer(twin: Twin) -> dict[str, Any]:
             "reasons": twin.evidence.get("bad_pixels", {}),
         },
         "undetermined": list(spectral.undetermined) if spectral is not None else [],
+        "next_measurement": twin.evidence.get("next_measurement"),
         "evidence": dict(twin.evidence),
         "warnings": warnings,
     }

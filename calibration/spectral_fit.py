@@ -1,7 +1,7 @@
 """The spectral part of a twin: tube, filtration, scintillator and gain from levels, gains and transmissions.
 
 Only ratios between levels say anything of the spectrum, and flats alone leave much open; so the answer is a posterior.
-Filtration, scintillator thickness, tube voltage and the size of the discrepancies are drawn by importance sampling. All
+Filtration, scintillator thickness, tube voltage and the size of departures from the model are drawn by importance sampling. All
 else (scales, tables, exponents) acts on the logarithm of a level nearly linearly: for each draw it is integrated out
 exactly about that draw's own derivatives, and drawn back from its conditional Gaussian.
 """
@@ -27,9 +27,12 @@ from ..generator.twin import Level, SpectralPosterior
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
+    DEPARTURE_FACTOR,
+    DEPARTURES,
     GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
+    LOG_DEPARTURE_SD,
     LOG_DISCREPANCY_SD,
     PRIORS,
     TABLE_SHARE,
@@ -287,7 +290,8 @@ class _Posterior:
         self.fixed = dict(discrepancies)
         self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
         self.is_gain = np.array([item.kind == "gain" for item in data])
-        self.dimensions = len(self.shape) + len(self.learned)
+        self.dimensions = len(self.shape) + len(self.learned) + 1  # the last is the factor of the departures
+        self.departs = np.array([name.startswith(DEPARTURES) for name in self.linear_names])
         self.alternative = next(
             (i for i, place in enumerate(self.shape) if names[place] == ALTERNATIVE_SCINTILLATOR), None
         )
@@ -316,6 +320,11 @@ class _Posterior:
                 result[name] = centre * np.exp(LOG_DISCREPANCY_SD * u[:, column])
         return result
 
+    def linear_sd(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Prior standard deviations of the linear parameters (draw, linear), with each draw's factor of departures."""
+        factor = DEPARTURE_FACTOR * np.exp(LOG_DEPARTURE_SD * u[:, -1])
+        return np.asarray(self.sd[self.linear] * np.where(self.departs, factor[:, None], 1.0))
+
     def variances(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of each datum's logarithm (draw, datum)."""
         found = self.discrepancies(u)
@@ -324,7 +333,10 @@ class _Posterior:
 
     def expectation(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Logarithms that the model expects (draw, datum) and their derivatives (draw, datum, linear)."""
-        found = [self.model.log_derivatives(parameters, beam, self.linear_names) for beam in self.beams]
+        deposits = self.model.deposit_tables(parameters)
+        found = [
+            self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits) for beam in self.beams
+        ]
         value = np.empty((len(parameters), len(self.data)))
         slope = np.empty((len(parameters), len(self.data), len(self.linear)))
         for column, item in enumerate(self.data):
@@ -348,7 +360,7 @@ class _Posterior:
         """Log likelihood (draw,), parameters, and mean and lower root of the precision of the linear ones given u."""
         full = self.parameters(u)
         expected, slope = self.expectation(full)
-        slope = slope * self.sd[self.linear]
+        slope = slope * self.linear_sd(u)[:, None, :]
         variance = self.variances(u)
         misfit = self.value - expected
         weighted = slope / variance[:, :, None]
@@ -357,7 +369,7 @@ class _Posterior:
         right = np.einsum("ndk,nd->nk", weighted, misfit)
         half = np.linalg.solve(lower, right[:, :, None])[:, :, 0]
         mean = np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0]
-        logarithm = -0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1))
+        logarithm = np.asarray(-0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1)), dtype=float)
         logarithm -= 0.5 * np.sum(np.log(variance), axis=1)
         logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
         return logarithm, full, mean, lower
@@ -377,7 +389,7 @@ class _Posterior:
         if rng is not None:
             normal = rng.standard_normal(z.shape)
             z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
-        full[:, self.linear] += self.sd[self.linear] * z
+        full[:, self.linear] += self.linear_sd(u) * z
         # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
         names = list(self.model.names)
         swank, gain, output = (names.index(name) for name in ("log_swank", "log_DN_per_keV", "log_output"))
@@ -402,7 +414,7 @@ class _Posterior:
         weight = np.full(len(u), 1.0 / len(u))
         likelihood = self.log_likelihood(u)
         for _ in range(_ROUNDS):
-            temper = _next_temper(likelihood, log_ratio, last=temper, least=0.12 * len(u))
+            temper = _next_temper(likelihood, log_ratio, last=temper, least=0.1 * len(u))
             weight, effective = _weights(temper * likelihood + log_ratio)
             if temper >= 1.0 and effective > _ENOUGH:
                 break

@@ -52,6 +52,7 @@ FIXED_PARAMETERS = (
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
 OTHER_TABLES = ("chantler", "penelope")
 _KV_ERRORS = np.linspace(-0.06, 0.06, 25)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
+_ALL_NODES = slice(None)
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
 _LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
@@ -164,30 +165,33 @@ class SpectralModel:
             self._depth[layer] = -np.log(np.maximum(passed, 1e-300))
         return self._depth[layer]
 
-    def fluence(self, kV: float) -> NDArray[np.float64]:
-        """Unfiltered fluence at the nodes of the kV error (node, energy), photons / keV / cm2 / mAs at 1 m."""
+    def fluence(self, kV: float, nodes: slice = _ALL_NODES) -> NDArray[np.float64]:
+        """Unfiltered fluence at the nodes of the kV error (node, energy), photons / keV / cm2 / mAs at 1 m.
+
+        Only the nodes asked for are sure to be filled: each may cost spectra that nobody has computed yet.
+        """
         if kV not in self._fluence:
             if kV > self.highest_kV:
                 raise InputError(
                     "kV", received=f"{kV:g} kV", expected=f"at most {self.highest_kV:g} kV, this model's range"
                 )
-            # beyond the tube's table the nodes stand still; a kV outside it is refused at the node without error
-            lowest, highest = MINIMUM_KV, MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
-            if kV < lowest:
-                lowest = 0.0
-            self._fluence[kV] = np.array(
-                [
-                    tube_fluence_interpolated(
-                        min(max(kV * (1.0 + float(error)), lowest), highest),
-                        energies_keV=self.energies_keV,
-                        anode=self.anode,
-                        anode_angle_deg=self.anode_angle_deg,
-                        model=self.model,
-                    )
-                    for error in _KV_ERRORS
-                ]
-            )
-        return self._fluence[kV]
+            self._fluence[kV] = np.full((_KV_ERRORS.size, self.energies_keV.size), np.nan)
+        table = self._fluence[kV]
+        # beyond the tube's table the nodes stand still; a kV outside it is refused at the node without error
+        lowest, highest = MINIMUM_KV, MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
+        if kV < lowest:
+            lowest = 0.0
+        for node in range(*nodes.indices(_KV_ERRORS.size)):
+            if np.isnan(table[node, 0]):
+                table[node] = tube_fluence_interpolated(
+                    min(max(kV * (1.0 + float(_KV_ERRORS[node])), lowest), highest),
+                    energies_keV=self.energies_keV,
+                    anode=self.anode,
+                    anode_angle_deg=self.anode_angle_deg,
+                    model=self.model,
+                    for_sums=True,
+                )
+        return table
 
     def _towards_other_model(self, kV: float) -> NDArray[np.float64]:
         """Logarithm of the other of SpekPy's models over this one (energy,), held constant beyond the end point."""
@@ -222,7 +226,9 @@ class SpectralModel:
 
     def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
-        nodes = self.fluence(beam.kV)
+        kV_error = self._kV_error(samples, beam.kV)
+        below, _ = _brackets(_KV_ERRORS, kV_error)
+        nodes = self.fluence(beam.kV, slice(int(below.min()), int(below.max()) + 2))
         top = min(int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1, self.energies_keV.size)
         energies = self.energies_keV[:top]
         factors, rows = [], []
@@ -256,7 +262,7 @@ class SpectralModel:
         )
         rows.append(np.ones(top))
         photons = np.exp(np.stack(factors, axis=1) @ np.stack(rows))
-        photons *= _interpolate(_KV_ERRORS, nodes[:, :top], self._kV_error(samples, beam.kV))
+        photons *= _interpolate(_KV_ERRORS, nodes[:, :top], kV_error)
         photons *= self._inherent[:top]
         return np.asarray(photons)
 
@@ -319,30 +325,32 @@ class SpectralModel:
         """
         samples = parameters[None, :]
         photons = self.weights(samples, beam)[0]
-        first, second, share = self._moments(samples, len(photons))[:, 0]
+        first, second = self.deposit_tables(samples)[:2, 0, : len(photons)]
+        other = bool(self._column(samples, ALTERNATIVE_SCINTILLATOR)[0] > 0.5)
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        share = _interpolate(_LOG_THICKNESS, self._responses[int(other)][2, :, : len(photons)], log_thickness)[0]
         log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
         log_swank = float(self._column(samples, "log_swank")[0])
         return np.stack(
             [photons * first * np.exp(log_gamma), photons * second * np.exp(2 * log_gamma - log_swank), photons * share]
         )
 
-    def _moments(self, samples: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-        """Mean deposit, mean square deposit and interacting share (3, draw, energy) of each draw's scintillator."""
+    def deposit_tables(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What each draw's scintillator does at each energy (6, draw, energy): see `_response_tables`, the share left out.
+
+        The first two hold the draw's own table and escape parameters; the next ones are the derivatives by these.
+        """
         log_thickness = self._column(samples, "log_scintillator_thickness")
         other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
-        result = np.empty((3, len(samples), top))
+        found = np.empty((6, len(samples), self.energies_keV.size))
         for chosen, tables in zip((~other, other), self._responses, strict=False):
-            if not chosen.any():
-                continue
-            first, second, share, first_table, second_table, first_escape, second_escape = (
-                _interpolate(_LOG_THICKNESS, table[:, :top], log_thickness[chosen]) for table in tables
-            )
-            by_table = self._column(samples, "scintillator_table")[chosen, None]
-            by_escape = self._column(samples, "escape_scale")[chosen, None]
-            result[0, chosen] = first + by_table * first_table + by_escape * first_escape
-            result[1, chosen] = second + by_table * second_table + by_escape * second_escape
-            result[2, chosen] = share
-        return result
+            if chosen.any():
+                for row, table in enumerate((*tables[:2], *tables[3:])):
+                    found[row, chosen] = _interpolate(_LOG_THICKNESS, table, log_thickness[chosen])
+        by_table, by_escape = (self._column(samples, name)[:, None] for name in ("scintillator_table", "escape_scale"))
+        found[0] += by_table * found[2] + by_escape * found[4]
+        found[1] += by_table * found[3] + by_escape * found[5]
+        return found
 
     def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
@@ -381,7 +389,7 @@ class SpectralModel:
         samples: NDArray[np.float64],
         beam: OpenBeam,
         names: Sequence[str],
-        through: NDArray[np.float64] | None = None,
+        deposits: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Logarithms of rate and gain (2, draw) of a beam, and how each of `names` moves them (draw, name) each.
 
@@ -392,17 +400,15 @@ class SpectralModel:
             samples: (draw, parameter), the point at which the derivatives are taken.
             beam: kV and filters.
             names: parameters, not the filtration or the scintillator's thickness.
-            through: transmission of an object (energy,), or None.
+            deposits: `deposit_tables` of the same samples, where several beams share them.
 
         Returns:
             (rate and gain) (2, draw), derivatives of the rate (draw, name), derivatives of the gain (draw, name).
         """
         photons = self.weights(samples, beam)
         top = photons.shape[1]
-        if through is not None:
-            photons = photons * through[:top]
-        moments = self._moments(samples, top)
-        first, second = moments[:2]
+        tables = (self.deposit_tables(samples) if deposits is None else deposits)[:, :, :top]
+        first, second = tables[:2]
         by_first, by_second = photons * first, photons * second
         sums = np.stack([by_first.sum(axis=1), by_second.sum(axis=1)])
         gamma = self._column(samples, "log_DN_per_keV")
@@ -414,11 +420,11 @@ class SpectralModel:
         # parameters of one row over energy, the same for all draws
         rows = {name: row for name, row in ((name, self._row_of(name, beam, top)) for name in names) if row is not None}
         if rows:
-            table = np.stack(list(rows.values()), axis=1)
+            acts = np.stack(list(rows.values()), axis=1)
             columns = [list(names).index(name) for name in rows]
-            means = by_first @ table / sums[0][:, None]
+            means = by_first @ acts / sums[0][:, None]
             rate[:, columns] = means
-            gain[:, columns] = by_second @ table / sums[1][:, None] - means
+            gain[:, columns] = by_second @ acts / sums[1][:, None] - means
         filtration = self._column(samples, "inherent_filtration_mm_Al")
         for column, name in enumerate(names):
             for table_name in OTHER_TABLES:
@@ -435,23 +441,18 @@ class SpectralModel:
             elif name == "yield_exponent":
                 rate[:, column] = np.log(beam.kV / REFERENCE_KV)
             elif name in {"scintillator_table", "escape_scale"}:
-                position = self.names.index(name)
-                step = np.zeros(len(self.names))
-                step[position] = 1.0
-                moved = self._moments(samples + step, top) - moments
-                mean = np.sum(photons * moved[0], axis=1) / sums[0]
+                moved = tables[2:4] if name == "scintillator_table" else tables[4:6]
+                mean = np.einsum("de,de->d", photons, moved[0]) / sums[0]
                 rate[:, column] = mean
-                gain[:, column] = np.sum(photons * moved[1], axis=1) / sums[1] - mean
+                gain[:, column] = np.einsum("de,de->d", photons, moved[1]) / sums[1] - mean
             elif name == "kV_tilt":
                 step = np.zeros(len(self.names))
                 step[self.names.index("kV_error")] = 0.002
-                moved = self.weights(samples + step, beam) - self.weights(samples - step, beam)
-                if through is not None:
-                    moved = moved * through[:top]
-                scale = np.log(beam.kV / REFERENCE_KV) / 0.004
-                mean = np.sum(moved * first, axis=1) / sums[0] * scale
+                harder = self.weights(samples + step, beam) - self.weights(samples - step, beam)
+                scale = math.log(beam.kV / REFERENCE_KV) / 0.004
+                mean = np.einsum("de,de->d", harder, first) / sums[0] * scale
                 rate[:, column] = mean
-                gain[:, column] = np.sum(moved * second, axis=1) / sums[1] * scale - mean
+                gain[:, column] = np.einsum("de,de->d", harder, second) / sums[1] * scale - mean
         return logs, rate, gain
 
     def _row_of(self, name: str, beam: OpenBeam, top: int) -> NDArray[np.float64] | None:
@@ -529,7 +530,14 @@ def _interpolate(
 ) -> NDArray[np.float64]:
     """Rows of `table` (node, energy) at positions `at` (draw,), linear between nodes."""
     below, share = _brackets(nodes, at)
-    return np.asarray(table[below] * (1.0 - share)[:, None] + table[below + 1] * share[:, None])
+    lowest, highest = int(below.min()), int(below.max()) + 2
+    if len(at) < 2 * (highest - lowest):
+        return np.asarray(table[below] * (1.0 - share)[:, None] + table[below + 1] * share[:, None])
+    weights = np.zeros((len(at), highest - lowest))
+    rows = np.arange(len(at))
+    weights[rows, below - lowest] = 1.0 - share
+    weights[rows, below - lowest + 1] = share
+    return np.asarray(weights @ table[lowest:highest])
 
 
 def _sums_interpolated(

@@ -350,6 +350,7 @@ def run_system(seed: int, *, coarse: bool) -> dict[str, Any]:
                 twin = calibrate_twin(
                     Part(acquisition, chosen),  # type: ignore[arg-type]
                     rng=np.random.default_rng([seed, 79]),
+                    advise=False,
                 )
                 if twin.spectral is None:
                     rows.append({"protocol": protocol, "failed": list(twin.warnings)})

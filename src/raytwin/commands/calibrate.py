@@ -80,5 +80,7 @@ def _text(result: dict[str, Any], path: Path) -> str:
             f"gain, {name:<18} {level['gain_DN']:.4g} ({level['gain_DN_low']:.4g} to {level['gain_DN_high']:.4g}) DN,"
             f" slope as measured {level['photon_transfer_slope_DN']:.4g} DN"
         )
+    if result["next_measurement"]:
+        lines.append(f"next measurement    {result['next_measurement']['text']}")
     lines.append(f"twin written to {path}")
     return "\n".join(lines)

@@ -1,0 +1,222 @@
+"""Which one more measurement would narrow the predictions most: a linear Gaussian update of the posterior's draws."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
+from ..generator.predict import spectral_model_of
+from ..generator.spectral_signal import OpenBeam
+from ..generator.twin import Estimate, Twin
+from ..materials import material_from_name, transmission
+from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
+
+# what a person has at hand: plates for the beam, and a wedge of aluminium
+_PLATES = ("", "Cu:0.1", "Al:2", "Cu:0.5")
+_WEDGE_MM = (1.0, 2.0, 4.0, 8.0)
+_WEDGE_SD = 0.003  # of each step's transmission
+_DESIGN_PLATES = ("", "Cu:0.1", "Al:2")
+_REACH = 1.33  # design and candidates go so far above the highest measured kV
+_LONGEST = 10.0  # times the longest exposure measured
+_DIMMEST = 0.3  # of the dimmest flat's signal: less is not worth measuring
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NextMeasurement:
+    """One more measurement and what it does to the predictions.
+
+    Fields: text (a sentence); setting (what to dial in); layers (behind which the flat is taken step by step, where it is a
+    wedge; else none); shrinks_to (mean width of the intervals of level and noise over a grid of settings, of what it is
+    now); width_percent (mean half width of the level's interval now); kV and filters of the grid.
+    """
+
+    text: str
+    setting: Setting
+    layers: tuple[Filter, ...]
+    shrinks_to: float
+    width_percent: float
+    grid: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """`next_measurement` of `raytwin calibrate --json`."""
+        return {
+            "text": self.text,
+            "setting": str(self.setting),
+            "wedge": text_from_filters(self.layers) or None,
+            "shrinks_to": self.shrinks_to,
+            "width_percent_now": self.width_percent,
+            "grid": list(self.grid),
+        }
+
+
+def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
+    """Flats and wedges that could be measured next, the one that narrows the predictions most first.
+
+    With Y the logarithms of level and noise variance over a grid of settings and C those of the candidate, over the
+    posterior's draws:  var(Y | C) = var(Y) - cov(Y, C) (var(C) + R)^-1 cov(C, Y),  R the candidate's sampling noise and
+    the learned discrepancy. Linear and Gaussian: for one measured kV, whose posterior is skew, a rough guide.
+
+    Args:
+        twin: calibrated, with a spectral part and at least one level with a tube load.
+
+    Returns:
+        Candidates within the tube's power and range, none where the twin has no spectral part or no tube load.
+    """
+    posterior = twin.spectral
+    measured = [level for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None]
+    if posterior is None or not measured:
+        return ()
+    voltages = sorted({float(level.kV or 0.0) for level in measured})
+    every_kV = _voltages(voltages, posterior.anode)
+    model = spectral_model_of(twin, highest_kV=max(every_kV))
+    stacks = {filters_from_text(text) for text in posterior.calibrated_filters}
+    plates = sorted({*stacks, *(filters_from_text(text) for text in _PLATES)}, key=str)
+    design = sorted({*stacks, *(filters_from_text(text) for text in _DESIGN_PLATES)}, key=str)
+    signals: dict[OpenBeam, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    def logs(kV: float, filters: tuple[Filter, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        beam = OpenBeam(kV=kV, filters=filters)
+        if beam not in signals:
+            found = model.signal(posterior.samples, beam)
+            signals[beam] = (np.log(found.rate_DN_per_mAs), np.log(found.gain_DN))
+        return signals[beam]
+
+    known = {(float(level.kV or 0.0), frozenset(map(str, level.filters))) for level in measured}
+    grid = [
+        (kV, filters)
+        for kV in every_kV
+        for filters in design
+        if (kV, frozenset(map(str, filters))) not in known and _passes(filters, kV)
+    ]
+    rows = []
+    for kV, filters in grid:
+        rate, gain = logs(kV, filters)
+        rows += [rate, 0.5 * (rate + gain)]
+    wanted = np.array(rows)
+    wanted = wanted - wanted.mean(axis=1, keepdims=True)
+    draws = wanted.shape[1]
+    level_sd, gain_sd = posterior.level_discrepancy, posterior.gain_discrepancy
+    floor = np.tile([level_sd**2, 0.25 * (level_sd**2 + gain_sd**2)], len(grid))
+    before = np.mean(wanted**2, axis=1)
+    rate_noise = _median_relative_sd([level.rate_DN_per_mAs for level in measured])
+    gain_noise = _median_relative_sd([level.photon_transfer_slope_DN for level in measured])
+    candidates: list[tuple[Setting, tuple[Filter, ...], NDArray[np.float64], NDArray[np.float64]]] = []
+    for kV in every_kV:
+        for filters in plates:
+            if (kV, frozenset(map(str, filters))) in known or not _passes(filters, kV):
+                continue
+            setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
+            if setting is not None:
+                noise = np.array([math.hypot(rate_noise, level_sd), math.hypot(gain_noise, gain_sd)]) ** 2
+                candidates.append((setting, (), np.array(logs(kV, filters)), noise))
+    for level in measured:
+        kV, filters = float(level.kV or 0.0), level.filters
+        setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
+        if setting is None:
+            continue
+        steps = tuple(Filter(material="Al", thickness_mm=mm) for mm in _WEDGE_MM)
+        open_rate = logs(kV, filters)[0]
+        behind = np.array([logs(kV, (*filters, step))[0] - open_rate for step in steps])
+        candidates.append((setting, steps, behind, np.full(len(steps), _WEDGE_SD**2 + level_sd**2)))
+    ranked = []
+    half_width = 1.96 * np.sqrt(before + floor)
+    width = 100.0 * float(np.mean(half_width[::2]))
+    names = tuple(f"{kV:g} kV {text_from_filters(filters)}".strip() for kV, filters in grid)
+    for setting, steps, seen, noise in candidates:
+        centred = seen - seen.mean(axis=1, keepdims=True)
+        cross = wanted @ centred.T / draws
+        own = centred @ centred.T / draws + np.diag(noise + _RIDGE)
+        gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
+        after = 1.96 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
+        shrinks_to = float(np.mean(after) / np.mean(half_width))
+        ranked.append(
+            NextMeasurement(
+                text=_sentence(setting, steps, shrinks_to),
+                setting=setting,
+                layers=steps,
+                shrinks_to=shrinks_to,
+                width_percent=width,
+                grid=names,
+            )
+        )
+    return tuple(sorted(ranked, key=lambda item: item.shrinks_to))
+
+
+def _voltages(measured: Sequence[float], anode: str) -> tuple[float, ...]:
+    """Round tube voltages (kV) within reach: the measured ones, the middle of the widest gap, above, and below a single one."""
+    highest = MAXIMUM_KV_OF_ANODE.get(anode, 300.0)
+    found = set(measured)
+    if len(measured) > 1:
+        low, high = max(pairwise(measured), key=lambda pair: math.log(pair[1] / pair[0]))
+        middle = 5.0 * round(math.sqrt(low * high) / 5.0)
+        if low < middle < high:
+            found.add(middle)
+    else:
+        found.add(max(5.0 * round(0.6 * measured[0] / 5.0), MINIMUM_KV))
+    found.add(min(10.0 * round(_REACH * measured[-1] / 10.0), highest))
+    return tuple(sorted(found))
+
+
+def _passes(filters: tuple[Filter, ...], kV: float) -> bool:
+    """Whether a stack leaves a beam: a tenth of a per cent at 0.7 kV, in keV."""
+    for layer in filters:
+        material_from_name(layer.material)
+    return float(transmission(filters, np.array([max(0.7 * kV, 2.0)]))[0]) > 1e-3
+
+
+def _median_relative_sd(estimates: Sequence[Estimate | None]) -> float:
+    known = [item for item in estimates if item is not None and item.value > 0]
+    return float(np.median([(item.high - item.low) / (2 * 1.959964) / item.value for item in known]))
+
+
+def _exposed(twin: Twin, kV: float, filters: tuple[Filter, ...], rate_DN_per_mAs: float) -> Setting | None:
+    """The setting that brings a beam to the usual signal of the measured flats, or None where the tube cannot.
+
+    Args:
+        twin: with the flats' signals, loads and exposures in its evidence.
+        kV, filters: the beam.
+        rate_DN_per_mAs: of the beam, at 1 m and on 1 mm2.
+    """
+    points = [
+        point for point in twin.evidence.get("photon_transfer", ()) if point.get("used") and point.get("load_mAs")
+    ]
+    if not points:
+        return None
+    signals = [float(point["signal_DN"]) for point in points]
+    exposures = [float(point["exposure_ms"]) for point in points]
+    power_W = max(
+        1000.0 * float(point["load_mAs"]) / float(point["exposure_ms"]) * float(point["kV"]) for point in points
+    )
+    if twin.instrument.maximum_power_w is not None:
+        power_W = min(power_W, twin.instrument.maximum_power_w)
+    distance = twin.instrument.source_detector_mm or 1000.0
+    pitch = twin.instrument.pixel_mm or 1.0
+    rate = rate_DN_per_mAs * (1000.0 / distance) ** 2 * pitch**2
+    per_ms = rate * power_W / kV / 1000.0
+    exposure_ms = float(np.clip(np.median(signals) / per_ms, min(exposures), _LONGEST * max(exposures)))
+    if per_ms * exposure_ms < _DIMMEST * min(signals):
+        return None
+    # a bright beam at the shortest exposure takes less power
+    power_W *= min(1.0, max(signals) / (per_ms * exposure_ms))
+    return Setting(kV=kV, power_W=float(f"{power_W:.3g}"), exposure_ms=float(f"{exposure_ms:.2g}"), filters=filters)
+
+
+def _sentence(setting: Setting, steps: tuple[Filter, ...], shrinks_to: float) -> str:
+    behind = f"behind {text_from_filters(setting.filters)}" if setting.filters else "without filter"
+    percent = f"{100.0 * shrinks_to:.0f} %"
+    if steps:
+        thicknesses = ", ".join(f"{step.thickness_mm:g}" for step in steps)
+        return (
+            f"A wedge of {thicknesses} mm {steps[0].material} at {setting.kV:g} kV {behind}: it would take the intervals"
+            f" of other settings to {percent} of their width"
+        )
+    return (
+        f"Flats at {setting.kV:g} kV {behind} ({setting}): they would take the intervals of other settings to {percent}"
+        " of their width"
+    )

@@ -100,13 +100,17 @@ def light_of_many_photons(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def poisson_of_means(mean, key, stage, frame, keep, alias, out):  # type: ignore[no-untyped-def]
-    """Poisson numbers of a map of means."""
-    for row in prange(mean.shape[0]):
+def light_quanta(cell, rates, factor, light_variance, key, stage, frame, keep, alias, out):  # type: ignore[no-untyped-def]
+    """Photons of a rate (cell,) times `factor`, each with its light's spread: mean n, variance n (1 + light_variance)."""
+    for row in prange(cell.shape[0]):
         state = np.empty(4, dtype=np.uint64)
         seed_stream(state, key, stage, frame, row)
-        for column in range(mean.shape[1]):
-            out[row, column] = poisson(state, mean[row, column], keep, alias)
+        for column in range(cell.shape[1]):
+            mean = rates[cell[row, column]] * factor
+            count = poisson(state, mean, keep, alias) if mean > 0.0 else 0.0
+            if count > 0.0 and light_variance > 0.0:
+                count = max(count + math.sqrt(light_variance * count) * fast_normal(state), 0.0)
+            out[row, column] = count
 
 
 @njit(parallel=True, cache=True)

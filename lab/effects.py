@@ -12,9 +12,10 @@ from ..errors import InputError
 from .effect import FORM, EffectLaw, EffectRequest, Site
 from .effects_beam import BEAM_LAWS
 from .effects_detector import DETECTOR_LAWS
+from .effects_unknown import UNKNOWN_LAWS
 from .line import Planted
 
-EFFECTS: Mapping[str, EffectLaw] = {law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS)}
+EFFECTS: Mapping[str, EffectLaw] = {law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS, *UNKNOWN_LAWS)}
 
 
 def request_from_text(text: str) -> EffectRequest:

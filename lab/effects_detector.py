@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chain import FrameContext, Stage
+from .chain import SUBPIXELS, FrameContext, Stage
 from .effect import EffectLaw, EffectRequest, Site
-from .line import Planted
+from .line import Exposure, FineRates, Planted, fine_rates, light_of_arrivals
 from .system import DetectorMaps, LabSystem
 
 Array = NDArray[np.float64]
@@ -32,6 +32,7 @@ def gaussian_matrix(length: int, sigma_px: float) -> Map:
     upto = 1.0 - ndtr(edges)
     upto[:, 0], upto[:, -1] = 0.0, 1.0
     matrix: Map = np.diff(upto, axis=1).astype(np.float32)
+    matrix[matrix < 1e-12] = 0.0  # denormal numbers would make every product ten times slower
     matrix.setflags(write=False)
     return matrix
 
@@ -83,6 +84,79 @@ def _mtf_tail(request: EffectRequest, site: Site) -> Planted:
         "two Gaussians (60 and 40 % of the tail) behind the core's spread",
         {"sigma_inner_px": float(inner_px), "sigma_outer_px": float(outer_px)},
         stages=(("spread", Stage(name="mtf_tail", apply=tail)),),
+    )
+
+
+# --- photons that are caught elsewhere -----------------------------------------------------------------------------------
+
+K_EDGE_KEV = 34.5  # between iodine's 33.2 and caesium's 36.0
+K_LINE_KEV = 29.8
+# Share of the K photons, distance over the mean range, and direction of the first of four, in quarter turns.
+RINGS = ((0.55, 0.5, 0.0), (0.45, 1.6, 0.5))
+
+
+def _k_fluorescence(request: EffectRequest, site: Site) -> Planted:
+    share = request.strength / 100.0
+    range_mm = float(site.rng.uniform(0.12, 0.4))
+    fine_mm = site.system.pixel_mm / SUBPIXELS
+    offsets: list[tuple[float, int, int]] = []
+    for weight, distance, start in RINGS:
+        for quarter in range(4):
+            angle = 0.5 * math.pi * (quarter + start)
+            y, x = (distance * range_mm / fine_mm * turn for turn in (math.sin(angle), math.cos(angle)))
+            offsets.append((0.25 * weight, round(y), round(x)))
+
+    def split(rates: FineRates, exposure: Exposure) -> FineRates:
+        above = rates.deposit_keV > K_EDGE_KEV
+        if not above.any():
+            return rates
+        remote = rates.rates[:, above].sum(axis=1) * np.float32(share)
+        kept_keV = rates.rates[:, above] @ (rates.deposit_keV[above] - K_LINE_KEV) * share / np.maximum(remote, 1e-30)
+        left = np.where(above, np.float32(1.0 - share), np.float32(1.0)) * rates.rates
+        return replace(
+            fine_rates(rates.cell, left.astype(np.float32), rates.deposit_keV),
+            remote=remote.astype(np.float32),
+            remote_keV=kept_keV.astype(np.float32),
+        )
+
+    def stop(arrivals: FineRates, context: FrameContext) -> Map:
+        from ._loops import poisson_tables
+        from ._session_loops import light_quanta
+
+        light = light_of_arrivals(arrivals, context)
+        if arrivals.remote is None or arrivals.remote_keV is None:
+            return light
+        keep, alias = poisson_tables()
+        kept_keV = arrivals.remote_keV[arrivals.cell]
+        quanta = np.empty_like(light)
+        variance = 1.0 / context.system.light_swank - 1.0
+        factor = arrivals.load_mAs * context.summed / SUBPIXELS**2
+        rows, columns = light.shape
+        for number, (weight, down, right) in enumerate(offsets):
+            light_quanta(
+                arrivals.cell,
+                arrivals.remote,
+                factor * weight,
+                variance,
+                context.key,
+                20 + number,
+                context.frame,
+                keep,
+                alias,
+                quanta,
+            )
+            light += quanta * kept_keV
+            from_row = np.clip(np.arange(rows) - down, 0, rows - 1)
+            from_column = np.clip(np.arange(columns) - right, 0, columns - 1)
+            light += np.float32(K_LINE_KEV) * quanta[from_row][:, from_column]
+        return light
+
+    return _told(
+        request,
+        "photons above the K edges leave 29.8 keV in one of eight places around, on two rings",
+        {"range_mm": range_mm, "places": [list(place) for place in offsets]},
+        rates=split,
+        stages=(("-photons", Stage(name="photons", apply=stop)),),
     )
 
 
@@ -365,6 +439,7 @@ def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Bu
 DETECTOR_LAWS: tuple[EffectLaw, ...] = (
     _law("veiling_glare", "light that strays far", "%", (0.5, 5.0), _veiling_glare),
     _law("mtf_tail", "a wide tail of the optical spread", "%", (2.0, 40.0), _mtf_tail, since="calibration"),
+    _law("k_fluorescence", "K photons caught at a distance", "%", (5.0, 40.0), _k_fluorescence),
     _law("image_lag", "charge that is trapped and released later", "%", (0.02, 5.0), _image_lag),
     _law("nonlinearity", "a response that saturates softly", "%", (0.3, 5.0), _nonlinearity, signed=True),
     _law("dark_drift", "a dark level that drifts", "DN", (1.0, 100.0), _dark_drift),

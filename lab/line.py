@@ -31,14 +31,18 @@ class FineRates:
     """Photons on their way into the scintillator, by class and sub-pixel, with the sums that bright ones are drawn by.
 
     Fields: cell (fine row, fine column) index into `rates`; rates (cell, class) photons per pixel and mAs; deposit_keV
-    (class,); load_mAs of the frame; sums (cell, 3): sum of rate x deposit^k, k = 1, 2, 3.
+    (class,); load_mAs of the frame; totals (cell,) sum of the rates; sums (cell, 3) of rate x deposit^k, k = 1, 2, 3;
+    remote (cell,) rate of further photons that leave `remote_keV` (cell,) where they stop and the rest elsewhere (None: there are none).
     """
 
     cell: NDArray[np.int32]
     rates: NDArray[np.float32]
     deposit_keV: NDArray[np.float64]
     load_mAs: float
-    sums: NDArray[np.float64]
+    totals: NDArray[np.float32]
+    sums: NDArray[np.float32]
+    remote: NDArray[np.float32] | None = None
+    remote_keV: NDArray[np.float32] | None = None
 
     def spelled_out(self) -> NDArray[np.float32]:
         """Rates of every sub-pixel, (fine row, fine column, class)."""
@@ -49,9 +53,11 @@ def fine_rates(
     cell: NDArray[np.int32], rates: NDArray[np.float32], deposit_keV: NDArray[np.float64], *, load_mAs: float = 1.0
 ) -> FineRates:
     """Rates of cells with their sums."""
-    powers = np.stack([deposit_keV, deposit_keV**2, deposit_keV**3], axis=1)
-    sums = rates.astype(np.float64) @ powers
-    return FineRates(cell=cell, rates=rates, deposit_keV=deposit_keV, load_mAs=load_mAs, sums=sums)
+    powers = np.stack([deposit_keV**power for power in range(4)], axis=1).astype(np.float32)
+    sums = np.ascontiguousarray((rates @ powers).T)
+    return FineRates(
+        cell=cell, rates=rates, deposit_keV=deposit_keV, load_mAs=load_mAs, totals=sums[0], sums=sums[1:].T.copy()
+    )
 
 
 def rates_of_map(rates: NDArray[np.float32], like: FineRates) -> FineRates:
@@ -84,10 +90,10 @@ class Planted:
     """An effect as it acts: any of these hooks, each None where the effect does not act there.
 
     Fields: id, strength, unit, since (`always` or `calibration`: after the calibration series); law (in words);
-    parameters (inner ones, for the truth); system, maps: change the truth of the line; pose (of an object, its scene's
-    name given); layers: further path lengths in the beam; rates: change what arrives; per_exposure_ms: `rates` depends
-    on the exposure time; load: factor on the tube's output at a time (s); stages: (name of the base stage that it
-    follows or, with a leading `-`, replaces; stage).
+    parameters (inner ones, for the truth); system, maps: change the truth of the line; pose: of an object, with the
+    size of a pixel in its plane in mm; layers: further path lengths in the beam; rates: change what arrives;
+    per_exposure_ms: `rates` depends on the exposure time; load: factor on the tube's output at a time (s); stages:
+    (name of the base stage that it follows or, with a leading `-`, replaces; stage).
     """
 
     id: str
@@ -98,7 +104,7 @@ class Planted:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     system: Callable[[LabSystem], LabSystem] | None = None
     maps: Callable[[DetectorMaps], DetectorMaps] | None = None
-    pose: Callable[[str, Posed], Posed] | None = None
+    pose: Callable[[Posed, float], Posed] | None = None
     layers: Callable[[Exposure], Mapping[str, FineMap]] | None = None
     rates: Callable[[FineRates, Exposure], FineRates] | None = None
     per_exposure_ms: bool = False
@@ -106,7 +112,8 @@ class Planted:
     stages: tuple[tuple[str, Stage], ...] = ()
 
 
-def _photons(arrivals: FineRates, context: FrameContext) -> NDArray[np.float32]:
+def light_of_arrivals(arrivals: FineRates, context: FrameContext) -> NDArray[np.float32]:
+    """Light (keV) at the sub-pixels where photons stopped."""
     from ._loops import poisson_tables
     from ._session_loops import light_of_many_photons
 
@@ -115,7 +122,7 @@ def _photons(arrivals: FineRates, context: FrameContext) -> NDArray[np.float32]:
     light_of_many_photons(
         arrivals.cell,
         arrivals.rates,
-        arrivals.rates.sum(axis=1, dtype=np.float32),
+        arrivals.totals,
         arrivals.sums,
         arrivals.load_mAs * context.summed / SUBPIXELS**2,
         arrivals.deposit_keV,
@@ -172,7 +179,7 @@ def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[n
 
 
 SESSION_STAGES: tuple[Stage, ...] = (
-    Stage(name="photons", apply=_photons),
+    Stage(name="photons", apply=light_of_arrivals),
     Stage(name="spread", apply=_spread),
     Stage(name="electrons", apply=_electrons),
     Stage(name="readout", apply=_readout),
@@ -343,7 +350,8 @@ class Line:
 
 
 # All that a session may put into the beam, so that one table a beam serves every object.
-LINE_MATERIALS = ("chicken_breast", "rib_bone", "pmma", "water", "Al", "W", "K2HPO4@2.44")
+MINERAL = "K2HPO4@2.44"
+LINE_MATERIALS = ("chicken_breast", "rib_bone", "pmma", "water", "Al", "W", MINERAL)
 
 
 def _sum_of_layers(incidence: Incidence, lengths: Mapping[str, NDArray[np.float32]], piece: slice) -> NDArray[Any]:

@@ -508,7 +508,7 @@ def _work_off(
                 true = scene.true
                 for effect in line.active:
                     if effect.pose is not None:
-                        true = effect.pose(in_beam, true)
+                        true = effect.pose(true, at.pixel_mm / at.magnification)
                 thickness_mm = thickness_on_fine_grid(at, true)
             series[take.name] = _measure(writer, line, take, thickness_mm if take.scene else {}, advance)
     return series

@@ -1,0 +1,165 @@
+"""Effects that no catalogue of the twin holds: what a diagnosis must call unknown, with its place."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .chain import SUBPIXELS, FrameContext, Stage
+from .effect import EffectLaw, EffectRequest, Site
+from .effects_detector import Map, frame_rng, mixed_gaussians, planted
+from .line import Exposure, FineRates, Planted, rates_of_map
+from .system import DetectorMaps
+
+
+def _off_focal(request: EffectRequest, site: Site) -> Planted:
+    share, radius_mm = request.strength / 100.0, float(site.rng.uniform(5.0, 12.0))
+
+    def second_source(rates: FineRates, exposure: Exposure) -> FineRates:
+        if not exposure.scene:
+            return rates
+        system = exposure.system
+        wide_px = radius_mm * (system.magnification - 1.0) / system.pixel_mm
+        spelled = rates.spelled_out()
+        out = np.empty_like(spelled)
+        for number in range(spelled.shape[2]):
+            plane = np.ascontiguousarray(spelled[:, :, number])
+            blocks = plane.reshape(plane.shape[0] // SUBPIXELS, SUBPIXELS, plane.shape[1] // SUBPIXELS, SUBPIXELS)
+            wide = mixed_gaussians(blocks.mean(axis=(1, 3)), ((0.5, 0.35 * wide_px), (0.5, 0.8 * wide_px)))
+            smooth = np.repeat(np.repeat(wide, SUBPIXELS, axis=0), SUBPIXELS, axis=1)
+            out[:, :, number] = np.float32(1.0 - share) * plane + np.float32(share) * smooth
+        return rates_of_map(out, rates)
+
+    return _told(
+        request,
+        "a share of the photons comes from a wide spot around the focus",
+        {"radius_mm": radius_mm},
+        rates=second_source,
+    )
+
+
+def _tile_seams(request: EffectRequest, site: Site) -> Planted:
+    rng, shape = site.rng, (site.system.rows, site.system.columns)
+    tile = int(rng.choice([32, 48, 64]))
+    row_of, column_of = np.arange(shape[0]) // tile, np.arange(shape[1]) // tile
+    steps = rng.standard_normal((row_of[-1] + 1, column_of[-1] + 1))
+    steps = (steps - steps.mean()) / max(float(steps.std()), 1e-9) * request.strength / 100.0
+    gain = 1.0 + steps[row_of][:, column_of]
+    for axis, place in ((0, row_of), (1, column_of)):
+        seam = np.flatnonzero(np.diff(place))
+        seam = np.concatenate([seam, seam + 1])
+        # Pixels at a seam are narrower: they catch less.
+        np.moveaxis(gain, axis, 0)[seam] *= 1.0 - 4.0 * request.strength / 100.0
+    baseline_DN = 0.5 * request.strength * site.system.read_noise_DN
+
+    def change(maps: DetectorMaps) -> DetectorMaps:
+        return replace(maps, DN_per_electron=(maps.DN_per_electron * gain).astype(np.float32))
+
+    def wander(level_DN: Map, context: FrameContext) -> Map:
+        offsets = frame_rng(context, 13).standard_normal(steps.shape).astype(np.float32)
+        offsets *= np.float32(baseline_DN / math.sqrt(context.summed))
+        moved: Map = level_DN + offsets[row_of][:, column_of]
+        return moved
+
+    return _told(
+        request,
+        "tiles with gains of their own, narrow pixels at their seams and a baseline that wanders tile by tile",
+        {"tile_px": tile},
+        maps=change,
+        stages=(("readout", Stage(name="tile_seams", apply=wander)),),
+    )
+
+
+def _rts_pixels(request: EffectRequest, site: Site) -> Planted:
+    rng, shape = site.rng, (site.system.rows, site.system.columns)
+    count = max(1, round(request.strength / 100.0 * shape[0] * shape[1]))
+    places = rng.choice(shape[0] * shape[1], size=count, replace=False)
+    height_DN = (rng.uniform(3.0, 10.0, size=count) * site.system.read_noise_DN).astype(np.float32)
+    switches = 1.0 / rng.uniform(3.0, 15.0, size=count)
+
+    def jump(level_DN: Map, context: FrameContext) -> Map:
+        state = context.memory.get("rts_pixels")
+        drawn = frame_rng(context, 14).random(count)
+        state = (drawn < 0.5) if state is None else state ^ (drawn < switches)
+        context.memory["rts_pixels"] = state
+        out = level_DN.copy()
+        out.ravel()[places] += np.where(state, height_DN, np.float32(0.0))
+        return out
+
+    return _told(
+        request,
+        "pixels whose dark level jumps between two values and stays for some frames",
+        {"pixels": count},
+        stages=(("readout", Stage(name="rts_pixels", apply=jump, additive=False)),),
+    )
+
+
+def _digitised(level: NDArray[Any], context: FrameContext) -> NDArray[np.uint16]:
+    numbers: NDArray[np.uint16] = np.clip(np.rint(level), 0, context.system.saturation_DN).astype(np.uint16)
+    return numbers
+
+
+def _sharpening(request: EffectRequest, site: Site) -> Planted:
+    amount, sigma_px = request.strength / 100.0, float(site.rng.uniform(0.8, 2.0))
+
+    def sharpen(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
+        image = numbers.astype(np.float32)
+        return _digitised(image + np.float32(amount) * (image - mixed_gaussians(image, ((1.0, sigma_px),))), context)
+
+    return _told(
+        request,
+        "an unsharp mask in the firmware",
+        {"sigma_px": sigma_px},
+        stages=(("digitise", Stage(name="sharpening", apply=sharpen, additive=False)),),
+    )
+
+
+def _compression(request: EffectRequest, site: Site) -> Planted:
+    step = request.strength
+    # Fine detail is stored coarser, as in picture formats.
+    frequency = np.arange(8)
+    steps = step * (1.0 + 0.5 * (frequency[:, None] + frequency[None, :]))
+    steps[0, 0] = 1.0
+
+    def squeeze(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
+        from scipy.fft import dctn, idctn
+
+        rows, columns = numbers.shape
+        image = np.pad(numbers.astype(np.float32), ((0, -rows % 8), (0, -columns % 8)), mode="edge")
+        blocks = image.reshape(image.shape[0] // 8, 8, image.shape[1] // 8, 8).transpose(0, 2, 1, 3)
+        stored = np.rint(dctn(blocks, axes=(2, 3), norm="ortho") / steps) * steps
+        back = idctn(stored, axes=(2, 3), norm="ortho").transpose(0, 2, 1, 3).reshape(image.shape)
+        return _digitised(back[:rows, :columns], context)
+
+    return _told(
+        request,
+        "8 x 8 blocks of cosine waves in steps that grow with their frequency",
+        {},
+        stages=(("digitise", Stage(name="compression", apply=squeeze, additive=False)),),
+    )
+
+
+def _told(request: EffectRequest, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+    return planted(request, UNKNOWN_UNITS[request.id], law, parameters, **hooks)
+
+
+_Build = Callable[[EffectRequest, Site], Planted]
+
+
+def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, since: str) -> EffectLaw:
+    return EffectLaw(
+        id=f"unknown:{name}", title=title, unit=unit, low=span[0], high=span[1], since=since, build=build, known=False
+    )
+
+
+UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
+    _law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal, "always"),
+    _law("tile_seams", "tiles and their seams", "%", (0.2, 3.0), _tile_seams, "calibration"),
+    _law("rts_pixels", "random-telegraph pixels", "%", (0.3, 10.0), _rts_pixels, "calibration"),
+    _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
+    _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
+)
+UNKNOWN_UNITS = {law.id: law.unit for law in UNKNOWN_LAWS}

@@ -235,7 +235,12 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         )
     energies = energy_grid_keV(setting.kV)
     fluence = tube_fluence_interpolated(
-        setting.kV, energies_keV=energies, anode=line.anode, anode_angle_deg=line.anode_angle_deg, model=line.model
+        setting.kV,
+        energies_keV=energies,
+        anode=line.anode,
+        anode_angle_deg=line.anode_angle_deg,
+        model=line.model,
+        for_sums=True,
     )
     layers = (*line.inherent, *setting.filters)
     passed = transmission(layers, energies, library=library, bin_width_keV=BIN_WIDTH_KEV)

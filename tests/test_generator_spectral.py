@@ -1,5 +1,7 @@
 """Signals of the spectral model against direct sums over a spectrum; gains against published means of energy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,7 +10,13 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.errors import InputError
 from raytwin.generator.spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name, gain_behind_object
-from raytwin.spectra import air_kerma_uGy_per_mAs, detector_response, tube_spectrum
+from raytwin.spectra import (
+    air_kerma_uGy_per_mAs,
+    detector_response,
+    filtered_spectrum,
+    tube_fluence_interpolated,
+    tube_spectrum,
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +33,9 @@ def parameters(model, **values):
 
 def direct(kV, filters, *, scintillator="CsI:0.5", cover="", counting=False):
     """Signal (keV), sum of squares (keV2), interacting photons per mAs and mm2 at 1 m; kerma (uGy / mAs)."""
-    spectrum = tube_spectrum(kV=kV, filters=filters_from_text(filters))
+    bare = tube_spectrum(kV=kV)
+    weights = tube_fluence_interpolated(kV, energies_keV=bare.energies_keV, for_sums=True)
+    spectrum = filtered_spectrum(replace(bare, fluence=weights), filters_from_text(filters))
     response = detector_response(
         scintillator=filters_from_text(scintillator),
         cover=filters_from_text(cover),

@@ -1,30 +1,46 @@
-"""Generate dual-energy images at a setting from low-noise reference images: only the noise they lack is added.
+"""Generate dual-energy images at a setting from low-noise reference images, or from a description of products.
 
-REFERENCE is a dataset file, or an acquisition whose object series pair up by scene. At the kV and filter of the references
-current, exposure and averaging are free, as long as the target has less tube load. At another kV or filter every pixel is
-solved for two materials (--product-material and --foreign-material) and projected through the target's spectrum.
+REFERENCE is a dataset file, or an acquisition whose object series pair up by scene: only the noise they lack is added.
+At the kV and filter of the references current, exposure and averaging are free, as long as the target has less tube load.
+At another kV or filter every pixel is solved for two materials (--product-material and --foreign-material) and projected
+through the target's spectrum.
+
+REFERENCE may also be a description (.toml): products and foreign objects as shapes with ranges of sizes, or as thickness
+maps of your own, placed at random, projected and given the detector's noise (docs/descriptions.md has an example).
 """
 
 import argparse
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ._answer import answer, say
+
+if TYPE_CHECKING:
+    from ..acquisition import Setting
+    from ..generator.generate import GenerationSummary
+    from ..generator.twin import Twin
 
 EXAMPLE = """example:
   raytwin generate twin.h5 references.h5 -n 200 --seed 1 -o train_20ms.h5 \\
     --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
   raytwin generate twin.h5 references.h5 -n 200 --seed 1 -o other_kv.h5 \
     --low kv=60,power_w=40,exposure_ms=20,filter=Al:2 --high kv=120,power_w=45,exposure_ms=20,filter=Al:2
+  raytwin generate twin.h5 fillets.toml -n 200 --seed 1 -o fillets.h5 \
+    --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin generate`."""
     parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
-    parser.add_argument("reference", metavar="REFERENCE", type=Path, help="dataset or acquisition with references")
+    parser.add_argument(
+        "reference",
+        metavar="REFERENCE",
+        type=Path,
+        help="dataset or acquisition with references, or a description (.toml)",
+    )
     parser.add_argument("--low", metavar="SETTING", required=True, help="target setting at the low kV")
     parser.add_argument("--high", metavar="SETTING", required=True, help="target setting at the high kV")
     parser.add_argument("-n", "--images", type=int, required=True, help="number of image pairs")
@@ -52,16 +68,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference-low", metavar="SETTING", help="setting of the references where they do not say")
     parser.add_argument("--reference-high", metavar="SETTING", help="the same at the high kV")
     parser.add_argument("--no-counts", action="store_true", help="leave out the raw counts")
+    parser.add_argument(
+        "--tiff", metavar="DIR", type=Path, help="write the images as TIFF folders in the paper's layout too"
+    )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin generate`."""
-    from ..acquisition import open_acquisition, read_dataset, setting_from_text
-    from ..acquisition.pairs import dataset_from_acquisition
-    from ..errors import FileFormatError, InputError
-    from ..files import sha256_of_file
-    from ..generator.generate import generate_dataset
+    from ..acquisition import read_dataset, setting_from_text
+    from ..errors import InputError
     from ..generator.twin_io import read_twin
     from ..materials import material_from_name
 
@@ -71,6 +87,67 @@ def run(arguments: argparse.Namespace) -> int:
     material_from_name(arguments.foreign_material)
     if (arguments.reference_low is None) != (arguments.reference_high is None):
         raise InputError("--reference-low and --reference-high", received="one of the two", expected="both or neither")
+    if arguments.reference.suffix.lower() == ".toml":
+        summary = _from_description(twin, low, high, arguments)
+    else:
+        summary = _from_references(twin, low, high, arguments)
+    result = summary.as_dict()
+    if arguments.tiff is not None:
+        from ..acquisition.tiff_folder import write_tiff_folder
+
+        with read_dataset(arguments.output) as dataset:
+            written = write_tiff_folder(dataset, arguments.tiff)
+        result["tiff"] = {"folder": written.folder, "trees": list(written.trees)}
+        result["warnings"] += list(written.notes)
+    for warning in result["warnings"]:
+        say(f"warning: {warning}")
+    answer(result, as_json=arguments.json, text=_text(result, arguments.output))
+    return 0
+
+
+def _from_description(
+    twin: "Twin", low: "Setting", high: "Setting", arguments: argparse.Namespace
+) -> "GenerationSummary":
+    from ..errors import InputError
+    from ..files import sha256_of_file
+    from ..generator.describe import read_description
+    from ..generator.generate_described import generate_from_description
+
+    for name, given in (
+        ("--recipe", arguments.recipe != "raytwin"),
+        ("--split", arguments.split is not None),
+        ("--registration", arguments.registration is not None),
+        ("--reference-low", arguments.reference_low is not None),
+    ):
+        if given:
+            raise InputError(
+                name, received="a description as REFERENCE", expected="reference images: the option is about those"
+            )
+    with _bar(arguments.images) as bar:
+        return generate_from_description(
+            twin,
+            read_description(arguments.reference),
+            arguments.output,
+            low=low,
+            high=high,
+            images=arguments.images,
+            seed=arguments.seed,
+            bad_pixels=arguments.bad_pixels,
+            with_counts=not arguments.no_counts,
+            twin_sha256=sha256_of_file(arguments.twin),
+            progress=lambda done: bar.update(done - bar.n),
+        )
+
+
+def _from_references(
+    twin: "Twin", low: "Setting", high: "Setting", arguments: argparse.Namespace
+) -> "GenerationSummary":
+    from ..acquisition import open_acquisition, read_dataset, setting_from_text
+    from ..acquisition.pairs import dataset_from_acquisition
+    from ..errors import FileFormatError
+    from ..files import sha256_of_file
+    from ..generator.generate import generate_dataset
+
     fallback = None
     if arguments.reference_low is not None:
         fallback = (setting_from_text(arguments.reference_low), setting_from_text(arguments.reference_high))
@@ -85,7 +162,7 @@ def run(arguments: argparse.Namespace) -> int:
                 raise FileFormatError(
                     str(arguments.reference),
                     received=error.received,
-                    expected="a raytwin-dataset or raytwin-acquisition file",
+                    expected="a raytwin-dataset or raytwin-acquisition file, or a description (.toml)",
                 ) from None
             with acquisition:
                 reference_path = Path(scratch) / "reference.h5"
@@ -99,9 +176,8 @@ def run(arguments: argparse.Namespace) -> int:
                     with_counts=False,
                     bad_pixels=bad if bad.shape == longest[2] else None,
                 )
-        with read_dataset(reference_path) as reference:
-            bar = _bar(arguments.images)
-            summary = generate_dataset(
+        with read_dataset(reference_path) as reference, _bar(arguments.images) as bar:
+            return generate_dataset(
                 twin,
                 reference,
                 arguments.output,
@@ -120,12 +196,6 @@ def run(arguments: argparse.Namespace) -> int:
                 twin_sha256=sha256_of_file(arguments.twin),
                 progress=lambda done: bar.update(done - bar.n),
             )
-            bar.close()
-    result = summary.as_dict()
-    for warning in result["warnings"]:
-        say(f"warning: {warning}")
-    answer(result, as_json=arguments.json, text=_text(result, arguments.output))
-    return 0
 
 
 def _registration(text: str | None) -> tuple[float, float] | str | None:

@@ -52,6 +52,9 @@ if TYPE_CHECKING:
         Levels,
         predict_levels,
     )
+    from .projection import (
+        project_polychromatic,
+    )
     from .psf import (
         PSF_MODELS,
         blur_variance_share,
@@ -150,6 +153,7 @@ _LAZY = {
     "predict_flatfield": "predict",
     "predict_flatfields": "predict",
     "predict_levels": "predict_many",
+    "project_polychromatic": "projection",
     "published_delta_r": "contrast",
     "published_parameters": "as_published",
     "read_description": "describe",
@@ -214,6 +218,7 @@ __all__ = [
     "predict_flatfield",
     "predict_flatfields",
     "predict_levels",
+    "project_polychromatic",
     "published_delta_r",
     "published_parameters",
     "read_description",

@@ -32,7 +32,8 @@ class FineRates:
 
     Fields: cell (fine row, fine column) index into `rates`; rates (cell, class) photons per pixel and mAs; deposit_keV
     (class,); load_mAs of the frame; totals (cell,) sum of the rates; sums (cell, 3) of rate x deposit^k, k = 1, 2, 3;
-    remote (cell,) rate of further photons that leave `remote_keV` (cell,) where they stop and the rest elsewhere (None: there are none).
+    remote (cell,) rate of further photons that leave `remote_keV` (cell,) where they stop and the rest elsewhere (None:
+    there are none).
     """
 
     cell: NDArray[np.int32]
@@ -370,7 +371,8 @@ def _rates_of_lengths(incidence: Incidence, lengths: Mapping[str, NDArray[np.flo
     rates = np.empty((count, share.shape[1]), dtype=np.float32)
     for start in range(0, count, _CELLS_AT_ONCE):
         piece = slice(start, min(start + _CELLS_AT_ONCE, count))
-        exponent = _sum_of_layers(incidence, lengths, piece)
+        # Nothing of e^-60 is ever seen, and numbers too small for single precision slow every loop down.
+        exponent = np.maximum(_sum_of_layers(incidence, lengths, piece), np.float32(-60.0))
         np.matmul(photons * np.exp(exponent, out=exponent), share, out=rates[piece])
     return rates
 

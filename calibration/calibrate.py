@@ -14,6 +14,7 @@ from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
 from .next_measurement import rank_measurements
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .spectral_fit import fit_spectrum
+from .wedges import measure_transmissions, wedge_evidence
 
 
 def calibrate_twin(
@@ -58,8 +59,16 @@ def calibrate_twin(
             )
         elif len(voltages) == 1:
             warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
+        wedges = measure_transmissions(acquisition, transfer.maps)
+        evidence["wedges"] = wedge_evidence(wedges)
+        warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
         try:
-            fit = fit_spectrum(transfer.levels, acquisition.instrument, rng=rng)
+            fit = fit_spectrum(
+                transfer.levels,
+                acquisition.instrument,
+                rng=rng,
+                transmissions=[value for item in wedges for value in item.transmissions],
+            )
         except FitError as error:
             warnings.append(f"no spectral part: {error}")
         else:

@@ -55,8 +55,8 @@ PRIORS: dict[str, Prior] = {
     ),
     "hardness_exponent": Prior(
         centre=0.0,
-        sd=0.03,
-        reason="hardness beyond the models' difference, 2 % from 30 to 60 keV: roughness of the anode",
+        sd=0.02,
+        reason="hardness beyond the models' own difference: 1.4 % from 30 to 60 keV",
     ),
     "escape_scale": Prior(
         centre=0.0, sd=0.1, reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %"

@@ -365,11 +365,11 @@ class _Posterior:
         misfit = self.value - expected
         weighted = slope / variance[:, :, None]
         precision = np.eye(len(self.linear)) + np.swapaxes(slope, 1, 2) @ weighted
-        lower = np.linalg.cholesky(precision)
+        lower = np.asarray(np.linalg.cholesky(precision), dtype=np.float64)
         right = np.einsum("ndk,nd->nk", weighted, misfit)
         half = np.linalg.solve(lower, right[:, :, None])[:, :, 0]
-        mean = np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0]
-        logarithm = np.asarray(-0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1)), dtype=float)
+        mean = np.asarray(np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0], dtype=np.float64)
+        logarithm: NDArray[np.float64] = -0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1))
         logarithm -= 0.5 * np.sum(np.log(variance), axis=1)
         logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
         return logarithm, full, mean, lower

@@ -129,10 +129,13 @@ def _slope_share_sd(twin: Twin) -> float:
     return abs(ends[0] - ends[1]) / (2 * 1.959964)
 
 
-def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float, centre: float | None = None) -> Estimate:
-    """Median and 95 % interval of draws times a lognormal of `relative_sd`, by moments of the logarithm."""
-    logarithm = np.log(draws)
-    middle = float(np.median(logarithm)) if centre is None else math.log(centre)
+def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float) -> Estimate:
+    return estimate_from_log_draws(np.log(draws), relative_sd)
+
+
+def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) -> Estimate:
+    """Median and 95 % interval of exp(logarithm) (draw,) times a lognormal of `relative_sd`, in the draws' unit."""
+    middle = float(np.median(logarithm))
     low, high = np.quantile(logarithm, [0.025, 0.975])
     below = math.hypot(middle - min(low, middle), 1.959964 * relative_sd)
     above = math.hypot(max(high, middle) - middle, 1.959964 * relative_sd)

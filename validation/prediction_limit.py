@@ -1,10 +1,10 @@
 """Predictions at settings never measured, against the virtual lab's truth and against what any method could reach.
 
-    python validation/prediction_limit.py [--systems 200] [--first 1000] [--processes 2] [--adc fine|coarse]
-        [--folder build/prediction_limit] [--json FILE] [--no-next]
+    python validation/prediction_limit.py [--systems 200] [--first 1000] [--kind nominal|departing|coarse]
+        [--processes 1] [--folder build/prediction_limit] [--fresh] [--prepare] [--json FILE]
 
-Each system is drawn: tube filtration, scintillator, kV offset, output, gain, Swank factor, spread, read noise. One
-session a system holds darks and flats; a protocol is a part of them:
+Each system is drawn: tube filtration, scintillator, kV offset, output, gain, Swank factor, spread, read noise. One session a
+system holds darks and flats; a protocol is a part of them:
 
     A  40 and 90 kV behind 0.05 mm Cu             B  40 and 90 kV, with 0.05 mm Cu and without
     C  40, 70 and 110 kV, with and without        D  90 kV behind 0.05 mm Cu
@@ -17,7 +17,8 @@ derivatives: measured levels and noise with their sampling errors, priors of the
 for attenuation tables, spectrum models, escape, voltage and single levels' discrepancy. It is computed here from the
 lab's own sums over energy, without the twin's code; only the priors' widths are the twin's.
 
-Results of a system are kept as one line of a file in `--folder`, so that a run that was stopped goes on.
+`departing` lines show in full what the priors allow beside (see `Line`); `coarse` ones have an ADC whose step is half to
+four times the read noise. Sessions and results are kept in `--folder`, so that a run that was stopped goes on.
 """
 
 import argparse
@@ -25,11 +26,12 @@ import json
 import math
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +45,7 @@ from raytwin.acquisition.setting import Filter, Setting, filters_from_text, sett
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.priors import ATTENUATION_SCALE, GAIN_DISCREPANCY, LEVEL_DISCREPANCY, PRIORS, TABLE_SHARE
 from raytwin.generator.predict import predict_flatfield
+from raytwin.generator.twin import Twin
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.lab.bench import Bench
 from raytwin.lab.response import beam_of, compute_deposits
@@ -81,50 +84,110 @@ Z95 = 1.959964
 Array = NDArray[np.float64]
 
 
-def draw_system(seed: int, *, coarse: bool) -> LabSystem:
-    """The hidden system of a seed; with a coarse ADC one DN is half to four times the read noise."""
-    rng = np.random.default_rng([seed, 77])
-    system = sample_system(rng).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
-    system = replace(
-        system,
-        inherent_filtration=(
-            Filter(material="Al", thickness_mm=round(math.exp(rng.uniform(math.log(0.3), math.log(3))), 3)),
-        ),
-        scintillator_mm=rng.uniform(0.36, 0.66),
-        dead_pixels=0,
-        hot_pixels=0,
-    )
-    step = math.exp(rng.uniform(math.log(0.5), math.log(4.0)))
-    if coarse:
-        smaller = step * system.read_noise_DN
+class Line:
+    """A hidden line: its system, and how far it departs from what is dialled in.
+
+    A `nominal` line has one kV offset, true filters and a steady output. One that departs has another offset at each
+    kV, filters 1 % off their nominal thickness, a rough anode and an output that differs by 0.1 % from series to
+    series: the size that the priors take for a line that shows such things in full.
+    """
+
+    def __init__(self, seed: int, kind: str) -> None:
+        rng = np.random.default_rng([seed, 77])
+        system = sample_system(rng).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
+        aluminium = Filter(material="Al", thickness_mm=round(math.exp(rng.uniform(math.log(0.3), math.log(3.0))), 3))
         system = replace(
             system,
-            DN_per_electron=system.DN_per_electron / smaller,
-            read_noise_DN=system.read_noise_DN / smaller,
-            dark_DN=system.dark_DN / smaller,
-            dark_spread_DN=system.dark_spread_DN / smaller,
-            dark_current_DN_per_ms=system.dark_current_DN_per_ms / smaller,
+            inherent_filtration=(aluminium,),
+            scintillator_mm=rng.uniform(0.36, 0.66),
+            dead_pixels=0,
+            hot_pixels=0,
         )
-    return system
+        # one DN is half to four times the read noise
+        step = math.exp(rng.uniform(math.log(0.5), math.log(4.0)))
+        departures = rng.standard_normal(4)
+        if kind == "coarse":
+            smaller = step * system.read_noise_DN
+            system = replace(
+                system,
+                DN_per_electron=system.DN_per_electron / smaller,
+                read_noise_DN=system.read_noise_DN / smaller,
+                dark_DN=system.dark_DN / smaller,
+                dark_spread_DN=system.dark_spread_DN / smaller,
+                dark_current_DN_per_ms=system.dark_current_DN_per_ms / smaller,
+            )
+        self.system = system
+        self.tilt = self.output_sd = 0.0
+        self.scale = {}
+        if kind == "departing":
+            self.tilt = 0.002 * float(departures[0])
+            self.scale = {"Cu": 1.0 + 0.01 * float(departures[1]), "Al": 1.0 + 0.01 * float(departures[2])}
+            self.output_sd = 0.001
+            tungsten = Filter(material="W", thickness_mm=3e-4 * abs(float(departures[3])))
+            self.system = replace(system, inherent_filtration=(aluminium, tungsten))
+
+    def at(self, kV: float) -> LabSystem:
+        """The system at a tube voltage, whose offset may be its own; in quarters of a per cent, as spectra take long."""
+        offset = self.system.kV_offset_percent + 100.0 * self.tilt * math.log(kV / 60.0)
+        return replace(self.system, kV_offset_percent=round(4.0 * offset) / 4.0)
+
+    def true(self, setting: Setting) -> Setting:
+        """What is in the beam when a setting is dialled in."""
+        layers = tuple(
+            replace(layer, thickness_mm=layer.thickness_mm * self.scale.get(layer.material, 1.0))
+            for layer in setting.filters
+        )
+        return replace(setting, filters=layers)
 
 
-def measure(path: Path, system: LabSystem, seed: int, beams: Iterable[tuple[float, str]]) -> None:
+def measure(path: Path, line: Line, seed: int, beams: Iterable[tuple[float, str]], *, part: int = 0) -> None:
     """A session of darks and flats, one series a beam."""
-    bench = Bench(system, rng=np.random.default_rng([seed, 78]))
-    shape = (system.rows, system.columns)
-    with write_acquisition(path, system.instrument()) as writer:
+    rng = np.random.default_rng([seed, 78, part])
+    shape = (line.system.rows, line.system.columns)
+    with write_acquisition(path, line.system.instrument()) as writer:
 
         def put(name: str, frames: Iterable[Any], **attributes: Any) -> None:
             sink = writer.add_series(name, shape=shape, dtype=np.uint16, **attributes)
             for frame, began_s in frames:
                 sink.append(frame, time_s=began_s)
 
-        put("dark_0", bench.dark(DARK_MS, frames=FRAMES), kind="dark", exposure_ms=DARK_MS)
+        def dark(name: str) -> None:
+            frames = Bench(line.system, rng=rng).dark(DARK_MS, frames=FRAMES)
+            put(name, frames, kind="dark", exposure_ms=DARK_MS)
+
+        dark("dark_0")
         for kV, layers in beams:
-            setting = Setting(kV=kV, power_W=POWER_W[kV], exposure_ms=DARK_MS, filters=filters_from_text(layers))
+            power_W = POWER_W.get(kV, 50.0)
+            setting = Setting(kV=kV, power_W=power_W, exposure_ms=DARK_MS, filters=filters_from_text(layers))
+            real = line.true(setting)
+            real = replace(real, power_W=power_W * (1.0 + line.output_sd * float(rng.standard_normal())))
             name = f"flat_{kV:g}_{layers.replace(':', '') or 'open'}"
-            put(name, bench.expose(setting, frames=FRAMES), kind="flat", setting=setting)
-        put("dark_1", bench.dark(DARK_MS, frames=FRAMES), kind="dark", exposure_ms=DARK_MS)
+            put(name, Bench(line.at(kV), rng=rng).expose(real, frames=FRAMES), kind="flat", setting=setting)
+        dark("dark_1")
+
+
+def prepare(seed: int, kind: str, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """The session of a line, and what the lab knows of it: truths of the settings and derivatives at all beams."""
+    session, known = folder / f"{kind}_{seed}.h5", folder / f"{kind}_{seed}.json"
+    if not known.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        line = Line(seed, kind)
+        maps = detector_maps(line.system)
+        measure(session, line, seed, sorted({beam for protocol in PROTOCOLS.values() for beam in protocol}))
+        truths = [flat_truth(line.at(setting.kV), maps, line.true(setting)) for setting in SETTINGS]
+        beams = {(beam[0], filters_from_text(beam[1])) for protocol in PROTOCOLS.values() for beam in protocol}
+        beams |= {(setting.kV, setting.filters) for setting in SETTINGS}
+        forward = Forward(line.system)
+        lab = {
+            "truths": truths,
+            "unknowns": forward.names,
+            "derivatives": [
+                [kV, text_from_filters(filters), *(list(map(float, row)) for row in forward.derivatives(kV, filters))]
+                for kV, filters in sorted(beams, key=str)
+            ],
+        }
+        known.write_text(json.dumps(lab), encoding="utf-8")
+    return session, json.loads(known.read_text(encoding="utf-8"))
 
 
 class Part:
@@ -146,46 +209,36 @@ class Part:
         return tuple(item for item in self.series if item.kind in kinds)
 
 
+def prior_sd() -> dict[str, float]:
+    """Prior standard deviation of each unknown: the twin's widths, under the names of this script."""
+    tables = {"scale": ATTENUATION_SCALE.sd, "first table": TABLE_SHARE.sd, "second table": TABLE_SHARE.sd}
+    return {
+        # cut at 0, the prior is narrower than its sd says
+        "filtration": 0.72 * PRIORS["inherent_filtration_mm_Al"].sd,
+        "thickness": PRIORS["log_scintillator_thickness"].sd,
+        "voltage": PRIORS["kV_error"].sd,
+        "voltage tilt": PRIORS["kV_tilt"].sd,
+        "output": PRIORS["log_output"].sd,
+        "scale": 20.0,
+        "swank": PRIORS["log_swank"].sd,
+        "yield": PRIORS["yield_exponent"].sd,
+        "hardness": PRIORS["hardness_exponent"].sd,
+        "model": PRIORS["spectrum_model"].sd,
+        "escape": PRIORS["escape_scale"].sd,
+        "scintillator table": PRIORS["scintillator_table"].sd,
+        **{f"{material} {what}": sd for material in ("Al", "Cu") for what, sd in tables.items()},
+    }
+
+
 class Forward:
-    """Logarithms of level and gain of a lab system and their derivatives in all unknowns and nuisances."""
+    """Derivatives of level and gain of a lab system in all unknowns and nuisances, from the lab's sums over energy."""
 
     def __init__(self, system: LabSystem) -> None:
         self.system = system
-        # unknowns by name -> prior sd; those of the twin's priors, and 1 for what is free
-        self.sd = {
-            # cut at 0, the prior is narrower than its sd says
-            "filtration": 0.72 * PRIORS["inherent_filtration_mm_Al"].sd,
-            "thickness": PRIORS["log_scintillator_thickness"].sd,
-            "voltage": PRIORS["kV_error"].sd,
-            "voltage tilt": PRIORS["kV_tilt"].sd,
-            "output": PRIORS["log_output"].sd,
-            "scale": 20.0,
-            "swank": PRIORS["log_swank"].sd,
-            "yield": PRIORS["yield_exponent"].sd,
-            "hardness": PRIORS["hardness_exponent"].sd,
-            "model": PRIORS["spectrum_model"].sd,
-            "escape": PRIORS["escape_scale"].sd,
-            "scintillator table": PRIORS["scintillator_table"].sd,
-            **{
-                f"{material} {what}": sd
-                for material in ("Al", "Cu")
-                for what, sd in (
-                    ("scale", ATTENUATION_SCALE.sd),
-                    ("first table", TABLE_SHARE.sd),
-                    ("second table", TABLE_SHARE.sd),
-                )
-            },
-        }
-        self.names = list(self.sd)
-        self._kept: dict[tuple[float, tuple[Filter, ...]], tuple[Array, Array]] = {}
+        self.names = list(prior_sd())
 
     def derivatives(self, kV: float, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
         """d ln level and d ln gain by each unknown (unknown,) each, by central differences or means over the spectrum."""
-        if (kV, filters) not in self._kept:
-            self._kept[kV, filters] = self._derivatives(kV, filters)
-        return self._kept[kV, filters]
-
-    def _derivatives(self, kV: float, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
         rows = {name: np.zeros(2) for name in self.names}
         for name, step in (("filtration", 0.02), ("thickness", 0.02), ("voltage", 0.0025), ("escape", 0.05)):
             up, down = (self._sums(kV, filters, **{name: sign * step}) for sign in (1.0, -1.0))
@@ -298,34 +351,30 @@ def _other_spectrum_model(kV: float, anode_angle_deg: float, energy_keV: Array) 
 
 
 def information_limit(
-    forward: Forward,
-    truth: dict[str, float],
-    setting: Setting,
-    beams: Iterable[tuple[float, str]],
+    derivatives: dict[tuple[float, str], tuple[Array, Array]],
+    beam: tuple[float, str],
     errors: dict[tuple[float, str], tuple[float, float]],
     *,
+    sd: Array,
     discrepancies: tuple[float, float],
     read_share: float,
 ) -> tuple[float, float]:
-    """Relative standard deviations of mean and temporal noise at a setting that no linear estimate can undercut.
+    """Relative standard deviations of mean and temporal noise of a beam that no linear estimate can undercut.
 
     Args:
-        forward: derivatives of the system.
-        truth: of the setting.
-        setting: to predict.
-        beams: measured.
+        derivatives: of level and gain by the unknowns, of all beams.
+        beam: to predict.
         errors: of each measured beam, the relative sd of level and of gain.
+        sd: prior standard deviations of the unknowns.
         discrepancies: relative sd of a single level and gain beyond the unknowns, of measured and predicted beams.
         read_share: share of the setting's variance that is not quantum noise.
     """
-    prior = np.diag([1.0 / forward.sd[name] ** 2 for name in forward.names])
-    information = prior
-    for kV, layers in beams:
-        level, gain = forward.derivatives(kV, filters_from_text(layers))
-        for row, sd, extra in zip((level, gain), errors[kV, layers], discrepancies, strict=True):
-            information = information + np.outer(row, row) / (sd**2 + extra**2)
+    information = np.diag(1.0 / sd**2)
+    for measured, known in errors.items():
+        for row, own, extra in zip(derivatives[measured], known, discrepancies, strict=True):
+            information = information + np.outer(row, row) / (own**2 + extra**2)
     covariance = np.linalg.inv(information)
-    level, gain = forward.derivatives(setting.kV, setting.filters)
+    level, gain = derivatives[beam]
     mean = math.sqrt(level @ covariance @ level + discrepancies[0] ** 2)
     both = level + gain
     extra = discrepancies[0] ** 2 + discrepancies[1] ** 2
@@ -333,56 +382,49 @@ def information_limit(
     return mean, noise
 
 
-def run_system(seed: int, *, coarse: bool) -> dict[str, Any]:
+def calibrated(path: Path, beams: Iterable[tuple[float, str]] | None, seed: int) -> Twin:
+    """The twin of a session, or of the part of it that belongs to some beams."""
+    with open_acquisition(path) as acquisition:
+        part: Any = acquisition if beams is None else Part(acquisition, beams)
+        return calibrate_twin(part, rng=np.random.default_rng([seed, 79]), advise=False)
+
+
+def run_system(seed: int, *, kind: str, folder: Path) -> dict[str, Any]:
     """Everything that is kept of one system."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    system = draw_system(seed, coarse=coarse)
-    maps = detector_maps(system)
-    beams = sorted({beam for protocol in PROTOCOLS.values() for beam in protocol})
-    truths = [flat_truth(system, maps, setting) for setting in SETTINGS]
-    forward = Forward(system)
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "session.h5"
-        measure(path, system, seed, beams)
-        with open_acquisition(path) as acquisition:
-            for protocol, chosen in PROTOCOLS.items():
-                twin = calibrate_twin(
-                    Part(acquisition, chosen),  # type: ignore[arg-type]
-                    rng=np.random.default_rng([seed, 79]),
-                    advise=False,
+    session, lab = prepare(seed, kind, folder)
+    derivatives = {(kV, layers): (np.array(level), np.array(gain)) for kV, layers, level, gain in lab["derivatives"]}
+    sd = np.array([prior_sd()[name] for name in lab["unknowns"]])
+    rows: list[dict[str, Any]] = []
+    for protocol, chosen in PROTOCOLS.items():
+        twin = calibrated(session, chosen, seed)
+        if twin.spectral is None:
+            rows.append({"protocol": protocol, "failed": list(twin.warnings)})
+            continue
+        errors = {}
+        for level in twin.levels:
+            pair = (level.rate_DN_per_mAs, level.photon_transfer_slope_DN)
+            known = [(item.high - item.low) / (2 * Z95) / item.value for item in pair if item is not None]
+            errors[level.kV or 0.0, text_from_filters(level.filters)] = (known[0], known[1])
+        for number, (setting, truth) in enumerate(zip(SETTINGS, lab["truths"], strict=True)):
+            found = predict_flatfield(twin, setting)
+            quantum = truth["photon_transfer_slope_DN"] * truth["mean_DN"] / setting.averaged
+            row: dict[str, Any] = {"protocol": protocol, "setting": number, "extrapolated": found.extrapolated}
+            for name, extra in (("limit", (LEVEL_DISCREPANCY, GAIN_DISCREPANCY)), ("bare_limit", (0.0, 0.0))):
+                limits = information_limit(
+                    derivatives,
+                    (setting.kV, text_from_filters(setting.filters)),
+                    errors,
+                    sd=sd,
+                    discrepancies=extra,
+                    read_share=max(0.0, 1.0 - quantum / truth["sd_DN"] ** 2),
                 )
-                if twin.spectral is None:
-                    rows.append({"protocol": protocol, "failed": list(twin.warnings)})
-                    continue
-                errors = {}
-                for level in twin.levels:
-                    rate, slope = level.rate_DN_per_mAs, level.photon_transfer_slope_DN
-                    assert rate is not None
-                    key = (level.kV or 0.0, text_from_filters(level.filters))
-                    errors[key] = tuple((e.high - e.low) / (2 * Z95) / e.value for e in (rate, slope))
-                for number, (setting, truth) in enumerate(zip(SETTINGS, truths, strict=True)):
-                    found = predict_flatfield(twin, setting)
-                    quantum = truth["photon_transfer_slope_DN"] * truth["mean_DN"] / setting.averaged
-                    read_share = max(0.0, 1.0 - quantum / truth["sd_DN"] ** 2)
-                    limits = {
-                        name: information_limit(
-                            forward, truth, setting, chosen, errors, discrepancies=extra, read_share=read_share
-                        )
-                        for name, extra in (
-                            ("limit", (LEVEL_DISCREPANCY, GAIN_DISCREPANCY)),
-                            ("bare_limit", (0.0, 0.0)),
-                        )
-                    }
-                    row: dict[str, Any] = {"protocol": protocol, "setting": number, "extrapolated": found.extrapolated}
-                    for index, name in enumerate(("mean_DN", "sd_DN")):
-                        estimate = getattr(found, name)
-                        row[name] = [truth[name], estimate.value, estimate.low, estimate.high]
-                        row[f"{name}_limit"] = limits["limit"][index]
-                        row[f"{name}_bare_limit"] = limits["bare_limit"][index]
-                    rows.append(row)
-                rows.append({"protocol": protocol, "errors": [[*key, *value] for key, value in errors.items()]})
-    return {"seed": seed, "coarse": coarse, "rows": rows}
+                row[f"mean_DN_{name}"], row[f"sd_DN_{name}"] = limits
+            for name in ("mean_DN", "sd_DN"):
+                estimate = getattr(found, name)
+                row[name] = [truth[name], estimate.value, estimate.low, estimate.high]
+            rows.append(row)
+        rows.append({"protocol": protocol, "errors": [[*key, *value] for key, value in errors.items()]})
+    return {"seed": seed, "kind": kind, "rows": rows}
 
 
 def summarise(results: list[dict[str, Any]], *, draws: int = 1000) -> list[dict[str, Any]]:
@@ -451,39 +493,36 @@ def print_table(table: list[dict[str, Any]]) -> None:
         )
 
 
-def _job(seed: int, coarse: bool) -> dict[str, Any]:
-    return run_system(seed, coarse=coarse)
-
-
-def run(seeds: Iterable[int], *, coarse: bool, processes: int = 1, folder: Path | None = None) -> list[dict[str, Any]]:
-    """Results of all seeds, those kept in the folder included."""
+def run(
+    seeds: Iterable[int], *, kind: str, folder: Path, processes: int = 1, fresh: bool = False
+) -> list[dict[str, Any]]:
+    """Results of all seeds; those kept in the folder are not computed again, unless `fresh`."""
     done: dict[int, dict[str, Any]] = {}
-    file = None if folder is None else folder / ("coarse.jsonl" if coarse else "fine.jsonl")
-    if file is not None and file.exists():
-        for line in file.read_text(encoding="utf-8").splitlines():
+    file = folder / f"{kind}_results.jsonl"
+    if fresh:
+        file.unlink(missing_ok=True)
+    if file.exists():
+        for text in file.read_text(encoding="utf-8").splitlines():
             try:
-                result = json.loads(line)
+                result = json.loads(text)
             except json.JSONDecodeError:
                 continue  # cut off when the run was stopped
             done[result["seed"]] = result
     wanted = list(seeds)
     missing = [seed for seed in wanted if seed not in done]
-
-    def keep(result: dict[str, Any]) -> None:
-        done[result["seed"]] = result
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with file.open("a", encoding="utf-8") as out:
-                out.write(json.dumps(result) + "\n")
-
-    if processes > 1:
-        with ProcessPoolExecutor(processes) as pool:
-            jobs = [pool.submit(_job, seed, coarse) for seed in missing]
-            for job in tqdm(as_completed(jobs), total=len(jobs), disable=None, file=sys.stderr):
-                keep(job.result())
-    else:
-        for seed in tqdm(missing, disable=None, file=sys.stderr):
-            keep(run_system(seed, coarse=coarse))
+    folder.mkdir(parents=True, exist_ok=True)
+    job = partial(run_system, kind=kind, folder=folder)
+    with ExitStack() as stack, file.open("a", encoding="utf-8") as out:
+        # a process of its own keeps the spectra that it has computed
+        finished = (
+            map(job, missing)
+            if processes == 1
+            else stack.enter_context(ProcessPoolExecutor(processes)).map(job, missing)
+        )
+        for result in tqdm(finished, total=len(missing), disable=None, file=sys.stderr):
+            done[result["seed"]] = result
+            out.write(json.dumps(result) + "\n")
+            out.flush()
     return [done[seed] for seed in wanted]
 
 
@@ -493,15 +532,24 @@ def main() -> int:
     parser.add_argument("--systems", type=int, default=200)
     parser.add_argument("--first", type=int, default=1000, help="first seed; development used seeds below 1000")
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--adc", choices=("fine", "coarse"), default="fine")
-    parser.add_argument("--folder", type=Path, help="where finished systems are kept")
+    parser.add_argument("--kind", choices=("nominal", "departing", "coarse"), default="nominal")
+    parser.add_argument("--folder", type=Path, default=Path("build/prediction_limit"), help="sessions and results")
+    parser.add_argument("--fresh", action="store_true", help="calibrate again; the lab's sessions are kept")
+    parser.add_argument("--prepare", action="store_true", help="only measure the sessions")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     started = time.perf_counter()
     seeds = range(arguments.first, arguments.first + arguments.systems)
-    results = run(seeds, coarse=arguments.adc == "coarse", processes=arguments.processes, folder=arguments.folder)
+    if arguments.prepare:
+        for seed in tqdm(seeds, disable=None, file=sys.stderr):
+            prepare(seed, arguments.kind, arguments.folder)
+        return 0
+    results = run(
+        seeds, kind=arguments.kind, folder=arguments.folder, processes=arguments.processes, fresh=arguments.fresh
+    )
     table = summarise(results)
-    print(f"{len(results)} systems, {arguments.adc} ADC, {time.perf_counter() - started:.0f} s")
+    print(f"{len(results)} {arguments.kind} systems, {time.perf_counter() - started:.0f} s")
     print_table(table)
     if arguments.json is not None:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)

@@ -45,6 +45,7 @@ _FINAL_DRAWS = 2048
 _ROUNDS = 12
 _KEPT = 512
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
+_WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
 _STUDENT_DEGREES = 5.0
 _MIXTURE = (0.75, 0.2, 0.05)
 _Z95 = 1.959964
@@ -378,6 +379,7 @@ class _Posterior:
         """Log likelihood of draws (draw, dimension), the linear parameters integrated out; -inf out of bounds."""
         shapes = u[:, : len(self.shape)]
         inside = np.all((shapes >= self.low[self.shape]) & (shapes <= self.high[self.shape]), axis=1)
+        inside &= np.all(np.abs(u[:, len(self.shape) :]) <= _WIDEST_SIZE, axis=1)
         result = np.full(len(u), -np.inf)
         if inside.any():
             result[inside] = self._conditional(u[inside])[0]

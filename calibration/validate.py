@@ -1,9 +1,12 @@
-"""Predictions of a twin against measured flats: per series, with intervals that include the series' sampling noise."""
+"""Predictions of a twin against measured flats and wedges, with intervals that include the measurement's own noise.
+
+The levels that calibrated a twin fit it too well to judge it; leaving each out in turn shows what it predicts without it.
+"""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +18,18 @@ from ..generator.predict import predict_flatfield
 from ..generator.psf import noise_autocovariance_1d
 from ..generator.twin import Estimate, Twin
 from .frame_sums import effective_frames, sum_frames
+from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _LAGS = 24  # px; farther neighbours share no light
+_COLOURS = {
+    "calibrated with": "#6b7280",
+    "not seen": "#1f5fa8",
+    "extrapolated": "#d9822b",
+    "left out": "#2e7d4f",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,29 +78,79 @@ class ValidationRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WedgeRow:
+    """One step of a wedge or slab: measured and predicted transmission (no unit), the measurement's noise included."""
+
+    series: str
+    kV: float
+    filters: str
+    layers: str
+    measured: float
+    predicted: Estimate
+    used_in_calibration: bool
+
+    @property
+    def inside(self) -> bool:
+        """Measured transmission inside the interval."""
+        return self.predicted.low <= self.measured <= self.predicted.high
+
+    def as_dict(self) -> dict[str, Any]:
+        """A row of `wedges` in `raytwin validate --json`."""
+        return {
+            "series": self.series,
+            "kV": self.kV,
+            "filter": self.filters,
+            "layers": self.layers,
+            "used_in_calibration": self.used_in_calibration,
+            "measured_transmission": self.measured,
+            "transmission": self.predicted.as_dict(),
+            "error_percent": 100.0 * (self.predicted.value / self.measured - 1.0),
+            "inside": self.inside,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Validation:
-    """All rows and what was left out."""
+    """All rows and what was left out; wedges where the acquisition has some, left_out where that was asked for."""
 
     rows: tuple[ValidationRow, ...]
     skipped: tuple[str, ...]
+    wedges: tuple[WedgeRow, ...] = ()
+    left_out: tuple[ValidationRow, ...] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The answer of `raytwin validate --json`."""
-        errors = [abs(row.predicted_mean_DN.value / row.measured_mean_DN - 1.0) for row in self.rows]
-        noise = [abs(row.predicted_sd_DN.value / row.measured_sd_DN - 1.0) for row in self.rows]
-        return {
+        answer: dict[str, Any] = {
             "rows": [row.as_dict() for row in self.rows],
-            "median_abs_error_percent": {
-                "mean": 100.0 * float(np.median(errors)),
-                "sd": 100.0 * float(np.median(noise)),
-            },
-            "coverage": {
-                "mean": float(np.mean([row.inside_mean for row in self.rows])),
-                "sd": float(np.mean([row.inside_sd for row in self.rows])),
-                "rows": len(self.rows),
-            },
+            **_summary(self.rows),
             "skipped": list(self.skipped),
         }
+        if self.wedges:
+            errors = [abs(row.predicted.value / row.measured - 1.0) for row in self.wedges]
+            answer["wedges"] = {
+                "rows": [row.as_dict() for row in self.wedges],
+                "median_abs_error_percent": 100.0 * float(np.median(errors)),
+                "coverage": float(np.mean([row.inside for row in self.wedges])),
+            }
+        if self.left_out is not None:
+            answer["leave_one_out"] = {
+                "rows": [row.as_dict() for row in self.left_out],
+                **(_summary(self.left_out) if self.left_out else {}),
+            }
+        return answer
+
+
+def _summary(rows: Sequence[ValidationRow]) -> dict[str, Any]:
+    errors = [abs(row.predicted_mean_DN.value / row.measured_mean_DN - 1.0) for row in rows]
+    noise = [abs(row.predicted_sd_DN.value / row.measured_sd_DN - 1.0) for row in rows]
+    return {
+        "median_abs_error_percent": {"mean": 100.0 * float(np.median(errors)), "sd": 100.0 * float(np.median(noise))},
+        "coverage": {
+            "mean": float(np.mean([row.inside_mean for row in rows])),
+            "sd": float(np.mean([row.inside_sd for row in rows])),
+            "rows": len(rows),
+        },
+    }
 
 
 def validate_twin(
@@ -176,13 +239,160 @@ def validate_twin(
                 extrapolated=predicted.extrapolated,
             )
         )
-    if not rows:
+    wedges = _wedge_rows(twin, acquisition, skipped, same_session=same_session)
+    if not rows and not wedges:
         raise InputError(
             f"acquisition {acquisition.path}",
             received="; ".join(skipped) or "no flats",
             expected="at least one flat with kV, exposure and tube load that the twin can predict",
         )
-    return Validation(rows=tuple(rows), skipped=tuple(skipped))
+    return Validation(rows=tuple(rows), skipped=tuple(skipped), wedges=wedges)
+
+
+def _wedge_rows(
+    twin: Twin, acquisition: AcquisitionFile, skipped: list[str], *, same_session: bool
+) -> tuple[WedgeRow, ...]:
+    if twin.spectral is None:
+        return ()
+    rows = []
+    for entry in measure_transmissions(acquisition, twin.maps, evaluation=True):
+        if entry.skipped:
+            skipped.append(entry.skipped)
+        role = next(item.role for item in acquisition.series if item.name == entry.series)
+        for item in entry.transmissions:
+            predicted = predict_transmission(twin, kV=item.kV, filters=item.filters, layers=item.layers)
+            rows.append(
+                WedgeRow(
+                    series=item.series,
+                    kV=item.kV,
+                    filters=text_from_filters(item.filters),
+                    layers=text_from_filters(item.layers),
+                    measured=item.value,
+                    predicted=_widened(predicted, item.relative_sd * item.value),
+                    used_in_calibration=same_session and role != "evaluation",
+                )
+            )
+    return tuple(rows)
+
+
+def leave_one_out(
+    twin: Twin, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
+) -> tuple[ValidationRow, ...]:
+    """Each level (kV and filter) of a twin predicted from the others: the spectrum is fitted again without it.
+
+    Level and noise are those of the level's mean tube load; the intervals include the level's own sampling noise, and a
+    wedge measured at the level's kV and filter is left out with it.
+
+    Args:
+        twin: calibrated; levels without kV or tube load are passed over.
+        rng: source of randomness of the fits.
+        progress: called with the name of each level.
+
+    Returns:
+        One row a level; none where fewer than two levels can be used.
+
+    Raises:
+        FitError: a posterior that cannot be drawn.
+    """
+    from .spectral_fit import fit_spectrum
+
+    tell = progress or (lambda name: None)
+    usable = [level for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None]
+    if twin.spectral is None or len(usable) < 2:
+        return ()
+    points = [
+        point for point in twin.evidence.get("photon_transfer", ()) if point.get("used") and point.get("load_mAs")
+    ]
+    loads = {str(point["series"]): (float(point["load_mAs"]), float(point["exposure_ms"])) for point in points}
+    transmissions = transmissions_of_evidence(twin)
+    rows = []
+    for level in usable:
+        tell(level.name)
+        others = tuple(item for item in twin.levels if item is not level)
+        kept = [item for item in transmissions if (item.kV, item.filters) != (level.kV, level.filters)]
+        fit = fit_spectrum(others, twin.instrument, rng=rng, transmissions=kept, model_name=twin.spectral.model)
+        mine = [loads[name] for name in level.series if name in loads]
+        load_mAs = float(np.mean([load for load, _ in mine])) if mine else 1.0
+        exposure_ms = float(np.median([exposure for _, exposure in mine])) if mine else 1000.0
+        setting = Setting(
+            kV=level.kV or 0.0,
+            exposure_ms=exposure_ms,
+            current_mA=float(f"{load_mAs / exposure_ms * 1000.0:.6g}"),
+            filters=level.filters,
+            source_detector_mm=level.source_detector_mm,
+        )
+        without = replace(
+            twin,
+            levels=others,
+            spectral=fit.posterior,
+            instrument=replace(twin.instrument, maximum_power_w=None),
+        )
+        predicted = predict_flatfield(without, setting)
+        rate, slope = level.rate_DN_per_mAs, level.photon_transfer_slope_DN
+        if rate is None:
+            continue
+        mean = rate.value * load_mAs
+        variance = slope.value * mean + twin.noise.read_variance_DN2
+        mean_sd = (rate.high - rate.low) / (2 * 1.959964) * load_mAs
+        slope_sd = (slope.high - slope.low) / (2 * 1.959964)
+        rows.append(
+            ValidationRow(
+                series=level.name,
+                setting=setting,
+                role="left out",
+                used_in_calibration=False,
+                measured_mean_DN=mean,
+                measured_sd_DN=math.sqrt(variance),
+                predicted_mean_DN=_widened(predicted.mean_DN, mean_sd),
+                predicted_sd_DN=_widened(predicted.sd_DN, 0.5 * slope_sd * mean / math.sqrt(variance)),
+                extrapolated=predicted.extrapolated,
+            )
+        )
+    return tuple(rows)
+
+
+def plot_validation(result: Validation) -> "Figure":
+    """Errors of predicted level, noise and transmission in per cent, with their 95 % intervals, row by row."""
+    from matplotlib.figure import Figure
+
+    left_out = result.left_out or ()
+    groups: list[tuple[str, str, float, Estimate, str]] = []
+    for row in result.rows:
+        name = f"{row.setting.kV:g} kV {text_from_filters(row.setting.filters)}".strip()
+        name += f", {row.setting.exposure_ms:g} ms"
+        kind = "calibrated with" if row.used_in_calibration else "extrapolated" if row.extrapolated else "not seen"
+        groups.append((name, "level", row.measured_mean_DN, row.predicted_mean_DN, kind))
+        groups.append((name, "noise", row.measured_sd_DN, row.predicted_sd_DN, kind))
+    for row in left_out:
+        groups.append((row.series, "level", row.measured_mean_DN, row.predicted_mean_DN, "left out"))
+        groups.append((row.series, "noise", row.measured_sd_DN, row.predicted_sd_DN, "left out"))
+    for step in result.wedges:
+        kind = "calibrated with" if step.used_in_calibration else "not seen"
+        groups.append((f"{step.kV:g} kV {step.layers}", "transmission", step.measured, step.predicted, kind))
+    panels = [what for what in ("level", "noise", "transmission") if any(group[1] == what for group in groups)]
+    tallest = max(sum(group[1] == what for group in groups) for what in panels)
+    figure = Figure(figsize=(4.6 * len(panels), 1.2 + tallest * min(0.22, 12.0 / tallest)), layout="constrained")
+    for axes, what in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        mine = [group for group in groups if group[1] == what]
+        for position, (_, _, measured, predicted, kind) in enumerate(mine):
+            error, low, high = (
+                100.0 * (value / measured - 1.0) for value in (predicted.value, predicted.low, predicted.high)
+            )
+            axes.plot([low, high], [position, position], color=_COLOURS[kind], lw=1.5, solid_capstyle="butt")
+            axes.plot(error, position, "o", color=_COLOURS[kind], ms=4)
+        axes.axvline(0.0, color="#6b7280", lw=0.8)
+        every = math.ceil(len(mine) / 55)  # names of more rows would overlap
+        axes.set_yticks(range(0, len(mine), every), [group[0] for group in mine][::every], fontsize=7)
+        axes.invert_yaxis()
+        axes.set_xlabel(f"error of the {what} (%)")
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+        if what == panels[0]:
+            seen = dict.fromkeys(group[4] for group in groups)
+            for kind in seen:
+                axes.plot([], [], "o-", color=_COLOURS[kind], ms=4, lw=1.5, label=kind)
+            figure.legend(loc="outside upper left", ncols=len(seen), frameon=False, fontsize=8)
+    return figure
 
 
 def _widened(estimate: Estimate, sd: float) -> Estimate:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
-from ..acquisition.setting import Filter, text_from_filters
+from ..acquisition.setting import Filter, filters_from_text, text_from_filters
 from ..errors import InputError
 from ..generator.predict import estimate_from_log_draws, spectral_model_of
 from ..generator.spectral_signal import OpenBeam, attenuation_scale_name
@@ -192,15 +192,15 @@ def _steps(thickness_mm: dict[str, NDArray[np.float32]]) -> tuple[NDArray[np.int
     for number in range(int(inside.max()) + 1):
         members = planes.reshape(len(names), -1)[:, inside == number]
         means = members.mean(axis=1) if members.size else np.zeros(len(names))
-        steps.append({name: float(mean) for name, mean in zip(names, means, strict=True)})
+        steps.append({name: float(f"{mean:.4g}") for name, mean in zip(names, means, strict=True)})
     return inside.reshape(edge.shape), steps
 
 
 def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], layers: Sequence[Filter]) -> Estimate:
     """Transmission of layers behind filters at a kV, no unit, with its 95 % interval.
 
-    T = sum(N T_layers m1) / sum(N m1) over the posterior's draws; scales cancel. A material whose attenuation the
-    calibration did not carry adds the differences between its tables and the tolerance of its thickness.
+    T = sum(N T_layers m1) / sum(N m1) over the posterior's draws; scales cancel. Thicknesses are taken as exact. A
+    material whose attenuation the calibration did not carry adds the differences between its tables and its density's.
 
     Raises:
         InputError: a twin without spectral part, or an unknown material.
@@ -210,7 +210,6 @@ def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], la
     draws = posterior.samples
     behind = model.signal(draws, OpenBeam(kV=kV, filters=(*filters, *layers))).rate_DN_per_mAs
     before = model.signal(draws, OpenBeam(kV=kV, filters=tuple(filters))).rate_DN_per_mAs
-    value = float(np.median(behind / before))
     extra = [posterior.level_discrepancy]
     for layer in layers:
         if attenuation_scale_name(layer.material) in model.names:
@@ -224,8 +223,23 @@ def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], la
         for table in ("chantler", "penelope"):
             moved = optical_depth([layer], used, table=table) - depth
             extra.append(TABLE_SHARE.sd * float(np.sum(weight * moved) / np.sum(weight)))
-    extra.append(THICKNESS_SD * math.log(max(value, 1e-12)))
     return estimate_from_log_draws(np.log(behind / before), math.hypot(*extra))
+
+
+def transmissions_of_evidence(twin: Twin) -> tuple[Transmission, ...]:
+    """The transmissions that a twin was calibrated with, from its evidence."""
+    return tuple(
+        Transmission(
+            kV=float(row["kV"]),
+            filters=filters_from_text(row["filter"]),
+            layers=filters_from_text(row["layers"]),
+            value=float(row["transmission"]),
+            relative_sd=float(row["relative_sd"]),
+            series=str(row["series"]),
+        )
+        for row in twin.evidence.get("wedges") or ()
+        if "transmission" in row
+    )
 
 
 def wedge_evidence(measured: Sequence[MeasuredTransmissions]) -> list[dict[str, Any]]:

@@ -1,45 +1,105 @@
-"""Compare a twin's predictions with measured flats, series by series.
+"""Compare a twin's predictions with measured flats and wedges, series by series.
 
-Series held back for evaluation are compared where there are any, else all flats. Intervals include the measured series'
-own sampling noise.
+Series held back for evaluation are compared where there are any, else all flats; wedges and slabs with thickness maps by
+their transmissions. Intervals include the measured series' own sampling noise. With `--leave-one-out` the spectrum is also
+fitted again without each of the twin's levels in turn, which is then predicted from the others.
 """
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
+from ..files import whole_file
 from ._answer import answer, say
 
 EXAMPLE = """example:
   raytwin validate twin.h5 session.h5
+  raytwin validate twin.h5 session.h5 --leave-one-out --plot errors.png
 """
+
+_FORMATS = (".png", ".pdf", ".svg")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin validate`."""
     parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats")
+    parser.add_argument(
+        "--leave-one-out", action="store_true", help="predict each level of the twin from its other levels"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the fits that leave a level out (default 0)")
+    parser.add_argument("--plot", metavar="FILE", type=Path, help="draw the errors (png, pdf or svg)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin validate`."""
+    from dataclasses import replace
+
+    import numpy as np
+    from tqdm import tqdm
+
     from ..acquisition import open_acquisition
-    from ..calibration.validate import validate_twin
+    from ..calibration.validate import leave_one_out, plot_validation, validate_twin
     from ..generator.twin_io import read_twin
 
+    if arguments.plot is not None and arguments.plot.suffix.lower() not in _FORMATS:
+        raise InputError("--plot", received=arguments.plot.name, expected="a name that ends in " + ", ".join(_FORMATS))
     twin = read_twin(arguments.twin)
     with open_acquisition(arguments.acquisition) as acquisition:
-        result = validate_twin(twin, acquisition).as_dict()
+        validation = validate_twin(twin, acquisition)
+    if arguments.leave_one_out:
+        with tqdm(total=len(twin.levels), disable=None, file=sys.stderr, desc="leaving out", unit="level") as bar:
+            left_out = leave_one_out(
+                twin, rng=np.random.default_rng(arguments.seed), progress=lambda name: bar.update() and None
+            )
+        validation = replace(validation, left_out=left_out)
+        if not left_out:
+            say("nothing can be left out: fewer than two levels with kV and tube load")
+    result = validation.as_dict()
     for line in result["skipped"]:
         say(f"skipped: {line}")
+    if arguments.plot is not None:
+        with whole_file(arguments.plot) as temporary:
+            plot_validation(validation).savefig(temporary, format=arguments.plot.suffix[1:].lower(), dpi=150)
+        result["plot"] = str(arguments.plot)
     answer(result, as_json=arguments.json, text=_text(result))
     return 0
 
 
 def _text(result: dict[str, Any]) -> str:
+    lines = _table(result["rows"]) if result["rows"] else []
+    if result["rows"]:
+        lines.append(_summary(result))
+    if "wedges" in result:
+        lines.append(f"{'wedge':<52} {'measured':>9} {'predicted (95 %)':>28}  inside")
+        for row in result["wedges"]["rows"]:
+            value = row["transmission"]
+            lines.append(
+                f"{row['kV']:g} kV {row['layers']} ({row['series']})".ljust(52)
+                + f" {row['measured_transmission']:9.4f} {value['value']:.4f} ({value['low']:.4f}-{value['high']:.4f})".ljust(
+                    39
+                )
+                + f"  {'yes' if row['inside'] else 'NO'}"
+            )
+        lines.append(
+            f"median error {result['wedges']['median_abs_error_percent']:.2f} %; inside the interval:"
+            f" {100 * result['wedges']['coverage']:.0f} % of {len(result['wedges']['rows'])} steps"
+        )
+    if result.get("leave_one_out", {}).get("rows"):
+        lines.append("each level predicted from the others:")
+        lines += _table(result["leave_one_out"]["rows"])
+        lines.append(_summary(result["leave_one_out"]))
+    if "plot" in result:
+        lines.append(f"errors drawn in {result['plot']}")
+    return "\n".join(lines)
+
+
+def _table(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"{'setting':<52} {'mean DN':>9} {'predicted (95 %)':>28} {'sd DN':>8} {'predicted (95 %)':>26}  inside"]
-    for row in result["rows"]:
+    for row in rows:
         mean, sd = row["mean_DN"], row["sd_DN"]
         inside = ("yes" if row["inside"]["mean"] else "NO") + "/" + ("yes" if row["inside"]["sd"] else "NO")
         lines.append(
@@ -48,9 +108,12 @@ def _text(result: dict[str, Any]) -> str:
             + f" {row['measured_sd_DN']:8.2f} {sd['value']:8.2f} ({sd['low']:.2f}-{sd['high']:.2f})".ljust(36)
             + f"  {inside}"
         )
+    return lines
+
+
+def _summary(result: dict[str, Any]) -> str:
     error, coverage = result["median_abs_error_percent"], result["coverage"]
-    lines.append(
+    return (
         f"median error: mean {error['mean']:.2f} %, sd {error['sd']:.2f} %; inside the interval: mean"
         f" {100 * coverage['mean']:.0f} %, sd {100 * coverage['sd']:.0f} % of {coverage['rows']} series"
     )
-    return "\n".join(lines)

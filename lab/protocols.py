@@ -346,6 +346,8 @@ def run_protocol(
     system: LabSystem | None = None,
     geometry: str | None = None,
     effects: Sequence["EffectRequest"] = (),
+    leave_out: Sequence[str] = (),
+    only: Sequence[str] | None = None,
     begin: Callable[[int], None] = lambda frames: None,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
@@ -365,7 +367,9 @@ def run_protocol(
         session: another number is another day: other noise and other products on the same system.
         system: a system to measure with, instead of the seed's.
         geometry: `fine` or `coarse` (the default), for the long sessions.
-        effects: to be planted, in the long sessions.
+        effects: to be planted, in the long sessions; their inner parameters are the seed's in every protocol and session.
+        leave_out, only: groups of series that are not taken, or taken alone with the darks, in the long sessions; see
+            `session.GROUPS`.
         begin, advance: called with the number of frames to come, and after each.
 
     Returns:
@@ -396,10 +400,18 @@ def run_protocol(
             session=session,
             system=system,
             effects=tuple(effects),
+            leave_out=leave_out,
+            only=only,
             begin=begin,
             advance=advance,
         )
-    _only_in("a long session (full, short or products)", geometry=geometry, effects=effects or None)
+    _only_in(
+        "a long session (full, short or products)",
+        geometry=geometry,
+        effects=effects or None,
+        leave_out=leave_out or None,
+        only=only,
+    )
     if system is None:
         system = system_of_seed(
             seed,
@@ -470,6 +482,8 @@ def _run_session(
     session: int,
     system: LabSystem | None,
     effects: tuple["EffectRequest", ...],
+    leave_out: Sequence[str],
+    only: Sequence[str] | None,
     begin: Callable[[int], None],
     advance: Callable[[], None],
 ) -> dict[str, Any]:
@@ -482,8 +496,18 @@ def _run_session(
     if system is None:
         system = session_system(seed, rows=rows, columns=columns, geometry=bench)
     place = 100 + list(SESSIONS).index(protocol)
-    plan_rng, noise_rng, effect_rng = (np.random.default_rng([seed, place, session, part]) for part in (0, 1, 2))
-    plan = make_session(protocol, system=system, geometry=bench, rng=plan_rng, frames=frames, products=products)
+    plan_rng, noise_rng = (np.random.default_rng([seed, place, session, part]) for part in (0, 1))
+    effect_rng = np.random.default_rng([seed, 99])
+    plan = make_session(
+        protocol,
+        system=system,
+        geometry=bench,
+        rng=plan_rng,
+        frames=frames,
+        products=products,
+        leave_out=leave_out,
+        only=only,
+    )
     planted = plant(effects, Site(system=system, geometry=bench, plan=plan, rng=effect_rng))
     return measure_session(
         path,

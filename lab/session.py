@@ -150,6 +150,39 @@ class SessionPlan:
         )
 
 
+# Groups of series that may be left out, or taken alone: kinds of objects, and these.
+GROUPS = (
+    "afterglow",
+    "wedge",
+    "slab",
+    "edge",
+    "disc",
+    "product",
+    "turned",
+    "near",
+    "open_flats",
+    "filtered_flats",
+    "middle_exposures",
+    "low_kV",
+    "high_kV",
+)
+
+
+def groups_of(take: SessionTake, scenes: Mapping[str, SessionScene], geometry: Geometry) -> frozenset[str]:
+    """The groups that a series belongs to; darks belong to none and are always taken."""
+    found = {scenes[take.scene].kind} if take.scene else set()
+    if take.kind in ("dark", "afterglow"):
+        return frozenset({take.kind} - {"dark"})
+    if take.kind == "flat":
+        found.add("turned" if take.panel_rotation_deg else "filtered_flats" if take.setting.filters else "open_flats")
+        if take.setting.exposure_ms not in EVALUATION_EXPOSURES_MS:
+            found.add("middle_exposures")
+    if take.source_object_mm is not None:
+        found.add("near")
+    found.add("low_kV" if take.setting.kV == geometry.kVs[0] else "high_kV")
+    return frozenset(found)
+
+
 class _Planner:
     """Collects the series and objects of a session; every object lies and is a little otherwise than stated."""
 
@@ -403,11 +436,22 @@ def make_session(
     rng: np.random.Generator,
     frames: int | None = None,
     products: int | None = None,
+    leave_out: Sequence[str] = (),
+    only: Sequence[str] | None = None,
 ) -> SessionPlan:
     """The plan of a long session by name.
 
+    Args:
+        protocol: of `SESSIONS`.
+        system, geometry: the line.
+        rng: draws products and poses; what is left out does not change what else is drawn.
+        frames: per series (50); objects have fewer.
+        products: how many.
+        leave_out: groups of series that are not taken, of `GROUPS`.
+        only: groups of series to take alone, with the darks; None: all.
+
     Raises:
-        InputError: an unknown name, fewer than 4 frames or 1 product, or a detector too small for the objects.
+        InputError: an unknown name or group, fewer than 4 frames or 1 product, or a detector too small for the objects.
     """
     if protocol not in SESSIONS:
         raise InputError("protocol", received=repr(protocol), expected="one of " + ", ".join(SESSIONS))
@@ -425,7 +469,15 @@ def make_session(
         )
     planner = _Planner(rng, system, geometry, frames)
     SESSIONS[protocol](planner, products)
-    return SessionPlan(takes=tuple(planner.takes), scenes=planner.scenes)
+    for name in (*leave_out, *(only or ())):
+        if name not in GROUPS:
+            raise InputError("group of series", received=repr(name), expected="one of " + ", ".join(GROUPS))
+    takes = []
+    for take in planner.takes:
+        groups = groups_of(take, planner.scenes, geometry)
+        if not groups & set(leave_out) and (only is None or take.kind == "dark" or groups & set(only)):
+            takes.append(take)
+    return SessionPlan(takes=tuple(takes), scenes=planner.scenes)
 
 
 def measure_session(
@@ -463,7 +515,9 @@ def measure_session(
             settings=[take.setting for take in plan.takes if take.kind in ("flat", "object")],
             exposures_ms=[take.setting.exposure_ms for take in plan.takes],
         ),
-        "scenes": {name: _pose(scene.true) for name, scene in plan.scenes.items()},
+        "scenes": {
+            name: _pose(scene.true) for name, scene in plan.scenes.items() if any(t.scene == name for t in plan.takes)
+        },
         "series": series,
     }
     with whole_file(truth_path) as temporary:

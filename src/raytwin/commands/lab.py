@@ -67,6 +67,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--geometry", metavar="NAME", help="long sessions: coarse (0.4 mm pixels, the default) or fine (0.12 mm)"
     )
+    parser.add_argument(
+        "--leave-out",
+        action="append",
+        default=[],
+        metavar="GROUP",
+        help="long sessions: series not to take (wedge, slab, edge, disc, product, near, afterglow, turned, low_kV,"
+        " high_kV, open_flats, filtered_flats, middle_exposures); repeatable",
+    )
+    parser.add_argument(
+        "--only",
+        action="append",
+        metavar="GROUP",
+        help="long sessions: take these series alone, with the darks; repeatable",
+    )
     parser.add_argument("--json", action="store_true", help="print the truth as JSON")
 
 
@@ -122,6 +136,8 @@ def run(arguments: argparse.Namespace) -> int:
             session=arguments.session,
             geometry=arguments.geometry,
             effects=effects,
+            leave_out=arguments.leave_out,
+            only=arguments.only,
             begin=begin,
             advance=advance,
         )

@@ -111,6 +111,7 @@ def twin():
         warnings=(),
     )
     levels = []
+    share = (blur_variance_share("aperture", SIGMA) + WHITE) / (1 + WHITE)
     for kV in (40.0, 90.0):
         predicted = predict_flatfield(bare, Setting(kV=kV, current_mA=1.0, exposure_ms=1000.0, filters=COPPER))
         levels.append(
@@ -118,7 +119,7 @@ def twin():
                 kV=kV,
                 filters=COPPER,
                 gain_DN=predicted.gain_DN,
-                photon_transfer_slope_DN=predicted.gain_DN,
+                photon_transfer_slope_DN=estimate_from_sd(share * predicted.gain_DN.value, 0.01),
                 rate_DN_per_mAs=predicted.mean_DN,
                 source_detector_mm=1059.0,
                 saturation_DN=None,

@@ -46,10 +46,14 @@ Transfer = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LagLaw:
-    """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,)."""
+    """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,).
+
+    pause_share: of what is released in a pause between series, the share that the next series' first exposure reads.
+    """
 
     trapped: tuple[float, ...]
     time_s: tuple[float, ...]
+    pause_share: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +70,7 @@ class LineState:
 
     Fields:
         parameters: (parameter,) of the spectral model, or None where the twin has none.
+        kV_factor: on the tube voltage, beyond what the parameters say of it.
         attenuation_scale: material of the scene -> factor on its attenuation.
         signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
             even illumination, before any spread.
@@ -85,6 +90,7 @@ class LineState:
     """
 
     parameters: FloatArray | None
+    kV_factor: float = 1.0
     attenuation_scale: Mapping[str, float] = field(default_factory=dict)
     signal_DN: FloatArray
     variance_DN2: FloatArray

@@ -251,7 +251,13 @@ def final_state(
                 context = replace(_context(twin, request, applied, None), model=model)
                 state = effect.change(state, numbers, context)
         projection = cache.projection(
-            twin, request, model, state.parameters, state.attenuation_scale, use_measured_level=use_measured_level
+            twin,
+            request,
+            model,
+            state.parameters,
+            state.attenuation_scale,
+            kV_factor=state.kV_factor,
+            use_measured_level=use_measured_level,
         )
         state = replace(state, signal_DN=projection.signal_DN, variance_DN2=projection.variance_DN2)
     return _apply(state, twin, request, active, projection)
@@ -305,10 +311,16 @@ def _decays(law: LagLaw, interval_s: float) -> FloatArray:
     return np.exp(-interval_s / np.asarray(law.time_s, dtype=np.float64))
 
 
+def _paused(law: LagLaw, trapped: FloatArray, pause_s: float) -> tuple[FloatArray, FloatArray]:
+    """Charge in the traps (trap, row, column) after a pause, and what the next exposure reads of that released in it."""
+    left = trapped * _decays(law, max(pause_s, 0.0))[:, None, None]
+    return left, law.pause_share * np.sum(trapped - left, axis=0)
+
+
 def _trapped_before(
     twin: Twin, request: SeriesRequest, law: LagLaw, calls: Mapping[str, object], cache: ModelCache
-) -> FloatArray:
-    """Charge in the traps (trap, row, column) at the begin of the series, from the exposures before it, DN."""
+) -> tuple[FloatArray, FloatArray]:
+    """Charge in the traps (trap, row, column) at the begin of the series, and what its first exposure finds, DN."""
     trapped = np.zeros((len(law.trapped), *twin.maps.shape))
     share = np.asarray(law.trapped)[:, None, None]
     clock: float | None = None
@@ -316,7 +328,7 @@ def _trapped_before(
         interval = earlier.interval_s(twin.instrument.readout_ms)
         exposures = earlier.frames * earlier.exposures_per_frame
         if clock is not None:
-            trapped = trapped * _decays(law, max(earlier.start_s - clock, 0.0))[:, None, None]
+            trapped, _ = _paused(law, trapped, earlier.start_s - clock)
         decay = _decays(law, interval)[:, None, None]
         left = decay**exposures
         trapped = trapped * left
@@ -325,18 +337,9 @@ def _trapped_before(
             brought = _charge(twin, earlier, state).mean
             trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
         clock = earlier.start_s + exposures * interval
-    if clock is not None:
-        trapped = trapped * _decays(law, max(request.start_s - clock, 0.0))[:, None, None]
-    return trapped
-
-
-def _lag_weights(law: LagLaw, decay: FloatArray, count: int) -> FloatArray:
-    """Share of an exposure that it and the following ones read (count,)."""
-    trapped = np.asarray(law.trapped)
-    later = np.arange(count - 1)
-    return np.concatenate(
-        [[1.0 - trapped.sum()], np.sum((trapped * (1.0 - decay))[:, None] * decay[:, None] ** later, axis=0)]
-    )
+    if clock is None:
+        return trapped, np.zeros(twin.maps.shape)
+    return _paused(law, trapped, request.start_s - clock)
 
 
 def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
@@ -440,7 +443,7 @@ def expected_series(
     if state.lag is not None:
         law = state.lag
         decay = _decays(law, interval)
-        before = _trapped_before(twin, request, law, calls, cache)
+        before, found = _trapped_before(twin, request, law, calls, cache)
         number = np.arange(exposures)
         for trapped, left, held in zip(law.trapped, decay, before, strict=True):
             # y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i]
@@ -448,6 +451,10 @@ def expected_series(
             course = _frame_means(left**number, averaged)
             signal = signal + course.mean() * amount
             trend.append((amount, course - course.mean()))
+        if law.pause_share > 0 and request.previous:
+            course = _frame_means((number == 0).astype(np.float64), averaged)
+            signal = signal + course.mean() * found
+            trend.append((found, course - course.mean()))
     covariance = _temporal_covariance(state.lag, decay, averaged)
     bend = state.bend_per_DN
     slope: FloatArray | float = 1.0
@@ -573,13 +580,13 @@ def sample_series(
     carried = LineMemory(time_s=request.start_s) if memory is None else memory
     trapped = None
     decay = np.zeros(0)
+    found = np.zeros(shape)
     if state.lag is not None:
         decay = _decays(state.lag, interval)[:, None, None]
         if carried.trapped_DN is None:
-            trapped = _trapped_before(twin, request, state.lag, calls, cache)
+            trapped, found = _trapped_before(twin, request, state.lag, calls, cache)
         else:
-            pause = _decays(state.lag, max(request.start_s - carried.time_s, 0.0))
-            trapped = carried.trapped_DN * pause[:, None, None]
+            trapped, found = _paused(state.lag, carried.trapped_DN, request.start_s - carried.time_s)
         share = np.asarray(state.lag.trapped)[:, None, None]
     gain = None if state.gain_pattern is None or not request.beam_on else _pattern(state.gain_pattern, shape)
     bad = _new_bad_pixels(state, shape)
@@ -612,6 +619,8 @@ def sample_series(
                 released = (1.0 - decay) * trapped
                 trapped = trapped - released + share * value
                 value = value * (1.0 - share.sum()) + released.sum(axis=0)
+                if number == 0:
+                    value = value + found
             if gain is not None:
                 value = value * gain
             value = value * (1.0 - state.bend_per_DN * value)

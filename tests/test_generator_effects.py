@@ -428,6 +428,24 @@ def test_lag_conserves_charge(series_line):
         assert abs(course.sum()) < 1e-9
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_what_is_released_in_a_pause_is_found_in_the_next_frame_as_far_as_the_panel_is_not_read(series_line, share):
+    effect = applied("image_lag", 5.0, release_s=0.2, spread=1.0, pause_share=share)
+    exposed = request(frames=400)
+    pause_s = 0.5
+    after = request("dark", setting=None, frames=3, start_s=400 * 0.022 + pause_s, previous=(exposed,))
+    found = expect(series_line, after, effect)
+    first, second = (found.signal_DN + sum(image * course[n] for image, course in found.trend_DN) for n in (0, 1))
+    held = 0.05 * expect(series_line, exposed).signal_DN / (1 - math.exp(-0.022 / 0.2))
+    left = held * math.exp(-pause_s / 0.2)
+    decay = math.exp(-0.022 / 0.2)
+    np.testing.assert_allclose(first, left * (1 - decay) + share * (held - left), rtol=1e-9)
+    np.testing.assert_allclose(second, left * decay * (1 - decay), rtol=1e-9)
+    memory = LineMemory(trapped_DN=np.stack([held] * 3) / 3, time_s=400 * 0.022)
+    sampled = next(sample_series(series_line, after, rng=np.random.default_rng(0), effects=effect, memory=memory))
+    assert (sampled - 1200.0).mean() == pytest.approx(first.mean(), abs=4 * 12 / 40)
+
+
 def test_lag_lowers_the_variance_and_correlates_frames_as_its_impulse_response_says(series_line):
     effect = applied("image_lag", 5.0, release_s=0.05, spread=1.0)
     base, found = expect(series_line, request()), expect(series_line, request(), effect)
@@ -514,9 +532,17 @@ def test_a_kV_error_is_the_model_at_the_other_voltage(series_line):
         np.testing.assert_allclose(found, higher / at, rtol=2e-3, err_msg=name)
 
 
+def test_large_kV_errors_go_on_where_small_ones_end(series_line):
+    """At 5.5 % the count changes to a voltage 5 % off: no step in level, gain or hardness."""
+    for asked in (request(), request(**BEHIND)):
+        below, above = (expect(series_line, asked, applied("kv_error", value)) for value in (5.4999, 5.5001))
+        np.testing.assert_allclose(above.mean_DN, below.mean_DN, rtol=1e-4)
+        np.testing.assert_allclose(above.quantum_variance_DN2, below.quantum_variance_DN2, rtol=1e-4)
+
+
 def test_a_kV_error_beyond_the_tables_is_refused(series_line):
-    with pytest.raises(InputError, match=r"strength of kv_error: got 9 %"):
-        expect(series_line, request(), applied("kv_error", 9.0))
+    with pytest.raises(InputError, match=r"strength of kv_error: got 12 %"):
+        expect(series_line, request(), applied("kv_error", 12.0))
 
 
 def test_a_filtration_error_is_another_sheet_of_aluminium(series_line):

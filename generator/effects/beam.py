@@ -17,7 +17,9 @@ from ..line_state import FloatArray, LineContext, LineState
 from ..spectral_signal import OpenBeam
 from .effect import Effect, Parameter
 
-_FINEST_KV_ERROR = 0.06  # the spectral model's table of tube voltage errors ends here
+# the spectral model's table of tube voltage errors ends at 6 %; larger ones are counted from a voltage 5 % off
+_TABLE_END = 0.055
+_REBASED = 0.05
 
 
 def _shifted(state: LineState, context: LineContext, name: str, amount: float, effect: str) -> LineState:
@@ -35,17 +37,19 @@ def _shifted(state: LineState, context: LineContext, name: str, amount: float, e
 def _shift_kV(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if parameters["strength"] == 0:
         return state
-    error = parameters["strength"] / 100.0
     before = 0.0
     if context.model is not None and state.parameters is not None:
         before = float(state.parameters[context.model.names.index("kV_error")])
-    if abs(before + error * (1.0 + before)) > _FINEST_KV_ERROR:
+    total = (1.0 + before) * (1.0 + parameters["strength"] / 100.0) - 1.0
+    factor = 1.0 if abs(total) <= _TABLE_END else 1.0 + math.copysign(_REBASED, total)
+    rest = (1.0 + total) / factor - 1.0
+    if abs(rest) > _TABLE_END:
         raise InputError(
             "strength of kv_error",
             received=f"{parameters['strength']:g} % on top of a calibrated {100 * before:.2g} %",
-            expected=f"together within {100 * _FINEST_KV_ERROR:g} % of the tube voltage",
+            expected="together within 10 % of the tube voltage",
         )
-    return _shifted(state, context, "kV_error", error * (1.0 + before), "kv_error")
+    return replace(_shifted(state, context, "kV_error", rest - before, "kv_error"), kV_factor=state.kV_factor * factor)
 
 
 KV_ERROR = Effect(

@@ -3,7 +3,8 @@
     y_n = (1 - phi) x_n + sum_i (1 - a_i) R_i,n       R_i,n+1 = a_i R_i,n + phi_i x_n       a_i = exp(-interval / tau_i)
 
 Charge is conserved: a steady exposure reads x. After a long exposure the first beam-off frame reads phi x. Three traps
-of equal share at tau / s, tau and tau s; s = 1 is one exponential, a large s resembles a power law.
+of equal share at tau / s, tau and tau s; s = 1 is one exponential, a large s resembles a power law. What is released while
+nothing is exposed is thrown away by a panel that keeps being read, and found in the next frame by one that is not.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,11 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
     if trapped == 0:
         return state
     middle, spread = parameters["release_s"], parameters["spread"]
-    law = LagLaw(trapped=(trapped / 3.0,) * 3, time_s=(middle / spread, middle, middle * spread))
+    law = LagLaw(
+        trapped=(trapped / 3.0,) * 3,
+        time_s=(middle / spread, middle, middle * spread),
+        pause_share=parameters["pause_share"],
+    )
     return replace(state, lag=law)
 
 
@@ -45,13 +50,23 @@ IMAGE_LAG = Effect(
             log=True,
         ),
         Parameter(
+            name="pause_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="charge released in a pause that the next frame reads; 0: the panel is read on, 1: it is not",
+            log=False,
+        ),
+        Parameter(
             name="spread",
             unit="",
             low=1.0,
             high=10.0,
-            default=3.0,
+            default=5.0,
             source="ratio of neighbouring release times; measured decays follow sums of exponentials or power laws",
             log=True,
+            fitted=False,
         ),
     ),
     stage="lag",

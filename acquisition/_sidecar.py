@@ -11,8 +11,7 @@ from typing import Any
 
 from ..errors import FileFormatError, InputError
 from ._image_files import RawLayout, natural_key
-from .acquisition_io import _LAYERS
-from .instrument import Instrument
+from .instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
 from .setting import filters_from_text
 
 NAME = "raytwin.toml"
@@ -96,17 +95,17 @@ def instrument_of(tables: Mapping[str, Any], *, where: str) -> Instrument:
     check_words(table, (field.name for field in fields(Instrument)), where=where)
     values: dict[str, Any] = {}
     for word, value in table.items():
-        if word in _LAYERS:
+        if word in LAYER_FIELDS:
             values[word] = filters_from_text(text_of(table, word, where=where) or "")
-        elif word in ("anode", "detector", "belt_axis"):
+        elif word in TEXT_FIELDS:
             values[word] = text_of(table, word, where=where)
-        elif word == "counting":
+        elif word in BOOLEAN_FIELDS:
             if not isinstance(value, bool):
-                raise InputError(f"{where}, counting", received=repr(value), expected="true or false")
+                raise InputError(f"{where}, {word}", received=repr(value), expected="true or false")
             values[word] = value
-        elif word == "bits":
+        elif word in WHOLE_FIELDS:
             if isinstance(value, bool) or not isinstance(value, int):
-                raise InputError(f"{where}, bits", received=repr(value), expected="a whole number")
+                raise InputError(f"{where}, {word}", received=repr(value), expected="a whole number")
             values[word] = value
         else:
             values[word] = number_of(table, word, where=where)

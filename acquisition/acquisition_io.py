@@ -26,7 +26,7 @@ from ._hdf5 import (
     text_attribute,
     whole_attribute,
 )
-from .instrument import Instrument
+from .instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
 from .setting import Filter, Setting, filters_from_text, text_from_filters
 
 FORMAT = "raytwin-acquisition"
@@ -39,8 +39,6 @@ PIECE_BYTES = 64 * 2**20
 
 _LARGEST_EXACT_FLOAT32 = 2**24
 _CHUNK_BYTES = 2**17
-_LAYERS = ("inherent_filtration", "scintillator", "detector_cover")
-_TEXTS = ("anode", "detector", "belt_axis")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,6 +343,7 @@ def _series(group: Any, name: str, *, path: str) -> Series:
                 filters=filters,
                 averaged=averaged,
                 source_detector_mm=source_detector_mm,
+                binning=whole_attribute(node, "binning", where=where, lowest=1) or 1,
             )
     corrected = frozenset(word for word in (text_attribute(node, "corrected", where=where) or "").split("+") if word)
     if not corrected <= set(CORRECTIONS):
@@ -480,16 +479,17 @@ def _instrument(node: Any, *, path: str) -> Instrument:
     where = f"{path}, instrument"
     values: dict[str, Any] = {}
     for field in fields(Instrument):
-        if field.name in _LAYERS:
+        if field.name in LAYER_FIELDS:
             values[field.name] = _layers(node, field.name, where=where)
-        elif field.name in _TEXTS:
+        elif field.name in TEXT_FIELDS:
             values[field.name] = text_attribute(node, field.name, where=where) or None
-        elif field.name in ("counting", "bits"):
+        elif field.name in (*WHOLE_FIELDS, *BOOLEAN_FIELDS):
             values[field.name] = whole_attribute(node, field.name, where=where)
         else:
             values[field.name] = number_attribute(node, field.name, where=where)
-    if values["counting"] is not None:
-        values["counting"] = bool(values["counting"])
+    for name in BOOLEAN_FIELDS:
+        if values[name] is not None:
+            values[name] = bool(values[name])
     with _named(path):
         return Instrument(**values)
 
@@ -784,18 +784,20 @@ def _write_instrument(group: Any, instrument: Instrument) -> None:
     for field in fields(Instrument):
         value = getattr(instrument, field.name)
         if value is not None:
-            group.attrs[field.name] = text_from_filters(value) if field.name in _LAYERS else value
+            group.attrs[field.name] = text_from_filters(value) if field.name in LAYER_FIELDS else value
 
 
 def _attributes_of(setting: Setting) -> dict[str, Any]:
     attributes = {
         field.name: getattr(setting, field.name)
         for field in fields(Setting)
-        if field.name not in ("filters", "averaged")
+        if field.name not in ("filters", "averaged", "binning")
     }
     attributes["filter"] = text_from_filters(setting.filters)
     if setting.averaged != 1:
         attributes["averaged"] = int(setting.averaged)
+    if setting.binning != 1:
+        attributes["binning"] = int(setting.binning)
     return attributes
 
 

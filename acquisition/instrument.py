@@ -7,6 +7,11 @@ from ..errors import InputError
 from .setting import Filter
 
 DETECTORS = ("area", "line", "tdi")
+BINNINGS = ("mean", "sum", "charge")
+LAYER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover", "interlayer", "back_scintillator")
+TEXT_FIELDS = ("anode", "detector", "belt_axis", "binning_adds")
+WHOLE_FIELDS = ("bits", "tdi_stages")
+BOOLEAN_FIELDS = ("counting", "readout_overlaps")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,7 +21,12 @@ class Instrument:
     Fields: anode (element symbol), anode_angle_deg, inherent_filtration (layers from the vendor's sheet),
     source_object_mm, source_detector_mm, pixel_mm (pitch), detector (`area`, `line`, `tdi`), counting (photon-counting
     rather than energy-integrating), scintillator (layers), detector_cover (layers), focal_spot_mm, bits (of the ADC),
-    maximum_power_w, readout_ms, belt_axis (`row` or `column`).
+    maximum_power_w, maximum_kV, maximum_current_mA, focal_power_w_per_mm (power that the tube takes for each mm of focal
+    spot); readout_ms, readout_overlaps (the detector reads one frame while it exposes the next); tdi_stages (lines over
+    which a TDI detector adds up); maximum_counts_per_s (of a counting pixel, before counts pile up); interlayer and
+    back_scintillator (layers behind the scintillator of a dual-layer panel: dead ones, then the second sensitive one);
+    binning_adds (`mean`: pixels averaged after readout; `sum`: added after readout; `charge`: added before readout);
+    belt_axis (`row` or `column`).
     """
 
     anode: str | None = None
@@ -32,7 +42,16 @@ class Instrument:
     focal_spot_mm: float | None = None
     bits: int | None = None
     maximum_power_w: float | None = None
+    maximum_kV: float | None = None
+    maximum_current_mA: float | None = None
+    focal_power_w_per_mm: float | None = None
     readout_ms: float | None = None
+    readout_overlaps: bool | None = None
+    tdi_stages: int | None = None
+    maximum_counts_per_s: float | None = None
+    interlayer: tuple[Filter, ...] | None = None
+    back_scintillator: tuple[Filter, ...] | None = None
+    binning_adds: str | None = None
     belt_axis: str | None = None
 
     def __post_init__(self) -> None:
@@ -46,8 +65,35 @@ class Instrument:
                 raise InputError(f"instrument {field.name}", received=value, expected="a finite positive number")
         if self.detector is not None and self.detector not in DETECTORS:
             raise InputError("instrument detector", received=self.detector, expected="one of " + ", ".join(DETECTORS))
+        if self.binning_adds is not None and self.binning_adds not in BINNINGS:
+            raise InputError(
+                "instrument binning_adds", received=self.binning_adds, expected="one of " + ", ".join(BINNINGS)
+            )
+        if self.tdi_stages is not None and self.detector not in (None, "tdi"):
+            raise InputError(
+                "instrument tdi_stages",
+                received=f"{self.tdi_stages} for a detector of kind {self.detector}",
+                expected="no stages, or the detector kind tdi",
+            )
+        if self.maximum_counts_per_s is not None and self.counting is False:
+            raise InputError(
+                "instrument maximum_counts_per_s",
+                received=f"{self.maximum_counts_per_s:g} counts/s for an integrating detector",
+                expected="no count limit, or counting = true",
+            )
+        if self.interlayer is not None and self.back_scintillator is None:
+            raise InputError(
+                "instrument interlayer",
+                received="+".join(map(str, self.interlayer)) or "no layer",
+                expected="back_scintillator beside it: the layer behind it that takes the second image",
+            )
         if self.belt_axis not in (None, "row", "column"):
             raise InputError("instrument belt_axis", received=self.belt_axis, expected="row or column")
+
+    @property
+    def dual_layer(self) -> bool:
+        """A second sensitive layer behind the first takes an image of its own."""
+        return bool(self.back_scintillator)
 
     @property
     def magnification(self) -> float | None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 from ..errors import InputError
 
+LARGEST_BINNING = 64
+
 
 def _number(value: float) -> str:
     """The shortest text that reads back as the same number, without the '+' that joins filters."""
@@ -66,8 +68,11 @@ def text_from_filters(filters: Iterable[Filter]) -> str:
 class Setting:
     """What a person dials in for one series of frames.
 
-    Fields: kV (tube voltage); current_mA or power_W (at most one is needed; power = kV x mA); exposure_ms (one frame);
-    filters (in the beam's order); averaged (frames averaged into one); source_detector_mm (None: the instrument's).
+    Fields: kV (tube voltage); current_mA or power_W (at most one is needed; power = kV x mA); exposure_ms (one frame; of
+    a line detector one line, of a TDI detector all its stages together); filters (in the beam's order); averaged (frames
+    averaged into one); source_detector_mm (None: the instrument's); binning (b x b pixels combined into one);
+    frame_interval_ms (from the start of one frame or line to the next; None: as fast as the detector goes);
+    belt_speed_mm_s (None: unknown or at rest).
     """
 
     kV: float
@@ -77,6 +82,9 @@ class Setting:
     filters: tuple[Filter, ...] = ()
     averaged: int = 1
     source_detector_mm: float | None = None
+    binning: int = 1
+    frame_interval_ms: float | None = None
+    belt_speed_mm_s: float | None = None
 
     def __post_init__(self) -> None:
         for name, unit in (
@@ -85,12 +93,16 @@ class Setting:
             ("current_mA", "mA"),
             ("power_W", "W"),
             ("source_detector_mm", "mm"),
+            ("frame_interval_ms", "ms"),
+            ("belt_speed_mm_s", "mm/s"),
         ):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
         if self.averaged < 1 or self.averaged != int(self.averaged):
             raise InputError("averaged", received=self.averaged, expected="a whole number of frames, 1 or more")
+        if not 1 <= self.binning <= LARGEST_BINNING or self.binning != int(self.binning):
+            raise InputError("binning", received=self.binning, expected=f"a whole number from 1 to {LARGEST_BINNING}")
         if self.current_mA is not None and self.power_W is not None:
             implied_W = self.kV * self.current_mA
             if abs(implied_W - self.power_W) > 0.01 * self.power_W:
@@ -127,6 +139,12 @@ class Setting:
             words.append(f"averaged={self.averaged}")
         if self.source_detector_mm is not None:
             words.append(f"source_detector_mm={_number(self.source_detector_mm)}")
+        if self.binning != 1:
+            words.append(f"binning={self.binning}")
+        for name in ("frame_interval_ms", "belt_speed_mm_s"):
+            value = getattr(self, name)
+            if value is not None:
+                words.append(f"{name}={_number(value)}")
         return ",".join(words)
 
 
@@ -147,15 +165,15 @@ def setting_from_text(text: str) -> Setting:
             raise InputError(
                 "setting",
                 received=f"{part!r} in {text!r}",
-                expected="each of kv, power_w or current_ma, exposure_ms, filter, averaged, source_detector_mm"
-                " at most once, as word=value joined by commas",
+                expected="each of kv, power_w or current_ma, exposure_ms, filter, averaged, source_detector_mm, binning,"
+                " frame_interval_ms, belt_speed_mm_s at most once, as word=value joined by commas",
                 remedy="for example kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05",
             )
         if name == "filters":
             values[name] = filters_from_text(value)
             continue
         try:
-            values[name] = int(value) if name == "averaged" else float(value)
+            values[name] = int(value) if name in ("averaged", "binning") else float(value)
         except ValueError:
             raise InputError(f"setting, {word}", received=repr(value), expected="a number") from None
     for name in ("kV", "exposure_ms"):

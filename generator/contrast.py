@@ -34,6 +34,7 @@ from ..spectra import (
     energy_grid_keV,
     tube_fluence_interpolated,
 )
+from .binning import refuse_binning
 from .predict import predict_flatfield, spectral_model_of
 from .psf import PSF_MODELS, blur_variance_share, noise_autocovariance_1d
 from .spectral_signal import OpenBeam
@@ -608,6 +609,7 @@ def _contrasts(
     beams: dict[Setting, _Beam] = {}
 
     def slabs(setting: Setting, table: str) -> _Slabs:
+        refuse_binning(setting)
         if setting not in beams:
             if isinstance(line, UncalibratedLine):
                 beams[setting] = _beam_of_line(line, setting, library)

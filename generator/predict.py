@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
+from .binning import binned_pixel, binned_variance_share
+from .line_limits import check_count_rate, check_limits
 from .psf import blur_variance_share
 from .spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
@@ -123,6 +125,13 @@ def slope_share(twin: Twin) -> float:
     return (share + white) / (1.0 + white)
 
 
+def binned_over_single(twin: Twin, binning: int) -> float:
+    """Photon-transfer slope of the mean of b x b pixels, times b^2, over that of one pixel; no unit, 1 or more."""
+    white = twin.noise.white_fraction
+    model, sigma_px = twin.noise.psf_model, twin.noise.psf_sigma_px.value
+    return (binned_variance_share(model, sigma_px, binning) + white) / (blur_variance_share(model, sigma_px) + white)
+
+
 def _slope_share_sd(twin: Twin) -> float:
     sigma = twin.noise.psf_sigma_px
     ends = [blur_variance_share(twin.noise.psf_model, value) for value in (sigma.low, sigma.high)]
@@ -179,24 +188,6 @@ def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
     return False
 
 
-def check_limits(twin: Twin, setting: Setting) -> None:
-    """Raise where the declared instrument cannot be set so.
-
-    Raises:
-        InputError: more power than the tube takes.
-    """
-    instrument = twin.instrument
-    current = setting.tube_current_mA
-    power = None if current is None else current * setting.kV
-    if power is not None and instrument.maximum_power_w is not None and power > 1.001 * instrument.maximum_power_w:
-        raise InputError(
-            "setting",
-            received=f"{power:.4g} W",
-            expected=f"at most the tube's {instrument.maximum_power_w:g} W",
-            remedy="lower the current or the tube voltage",
-        )
-
-
 def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     """Flatfield at a setting, with 95 % intervals.
 
@@ -204,16 +195,18 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
     spectral parameters is projected, level and noise draw by draw, and the learned discrepancy of single levels is added
     (as independent ones, one more for each way in which the setting lies outside: kV, filters, level).
 
+    With binning, mean, noise and photons are those of a binned pixel, gain and slope remain those of one pixel.
+
     Raises:
-        InputError: no tube load given, power above the tube's, or a twin that has neither this level nor a spectrum.
+        InputError: no tube load given, a setting beyond the line's limits (`line_limits`), or a twin that has neither this
+            level nor a spectrum.
     """
-    check_limits(twin, setting)
+    warnings = list(check_limits(twin.instrument, setting))
     load = setting.tube_load_mAs
     if load is None:
         raise InputError(
             "setting", received=str(setting), expected="a tube load", remedy="give --current-ma or --power-w"
         )
-    warnings: list[str] = []
     level = twin.level_at(setting)
     posterior = twin.spectral
     instrument = twin.instrument
@@ -285,17 +278,28 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
         slope = level.photon_transfer_slope_DN
         quantum_draws = np.array([slope.value * mean_frame.value])
         quantum_sd = math.hypot(_log_sd(slope), _log_sd(mean_frame))
-    variance_draws = np.maximum(quantum_draws, 0.0) + max(twin.noise.read_variance_DN2, 1e-12)
+    binned = binned_pixel(setting.binning, instrument.binning_adds)
+    if setting.binning > 1:
+        quantum_draws = quantum_draws * binned_over_single(twin, setting.binning) * binned.quantum
+        mean_frame = mean_frame.times(binned.signal)
+        photons = photons.times(binned.pixels) if photons is not None else None
+        if instrument.binning_adds is None:
+            warnings.append("binning is taken as the mean of pixels after readout; declare binning_adds if it is not")
+    read_variance = twin.noise.read_variance_DN2 * binned.electronic
+    variance_draws = np.maximum(quantum_draws, 0.0) + max(read_variance, 1e-12)
     variance = float(np.median(variance_draws))
-    quantum = max(variance - twin.noise.read_variance_DN2, 0.0)
-    read_part = 2.0 * twin.noise.read_noise_DN.value * (read.high - read.low) / (2 * 1.959964)
+    quantum = max(variance - read_variance, 0.0)
+    read_part = 2.0 * twin.noise.read_noise_DN.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
     variance_sd = math.hypot(quantum * quantum_sd, read_part)
     sd_estimate = _estimate_from_draws(np.sqrt(variance_draws / frames), 0.5 * variance_sd / variance)
     extrapolated = bool(outside)
     if instrument.bits is not None:
         room = 2.0**instrument.bits - 1 - twin.dark_DN.value
-        if mean_frame.value > room:
-            warnings.append(f"the detector saturates: {mean_frame.value:.4g} DN above dark, room for {room:.4g} DN")
+        held = mean_frame.value / binned.signal * binned.at_the_adc
+        if held > room:
+            warnings.append(f"the detector saturates: {held:.4g} DN above dark, room for {room:.4g} DN")
+    if photons is not None and instrument.counting:
+        check_count_rate(instrument, setting, photons.value)
     if extrapolated:
         warnings.append(
             f"outside the calibrated range of {', '.join(outside)}: the interval rests on the spectral model"

@@ -33,6 +33,10 @@ class Estimate:
                 expected="low <= value <= high, finite",
             )
 
+    def times(self, factor: float) -> "Estimate":
+        """Value and interval times a known factor of 0 or more."""
+        return Estimate(value=factor * self.value, low=factor * self.low, high=factor * self.high)
+
     def as_dict(self) -> dict[str, float]:
         """`{value, low, high}`."""
         return {"value": self.value, "low": self.low, "high": self.high}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.instrument import Instrument
+from ..acquisition.instrument import LAYER_FIELDS, Instrument
 from ..acquisition.setting import filters_from_text, text_from_filters
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
@@ -18,7 +18,6 @@ from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, 
 FORMAT = "raytwin-twin"
 VERSION = 1
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels")
-_FILTER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover")
 
 
 def _put_estimate(group: Any, name: str, estimate: Estimate | None) -> None:
@@ -70,7 +69,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
         for entry in fields(Instrument):
             value = getattr(twin.instrument, entry.name)
             if value is not None:
-                instrument.attrs[entry.name] = text_from_filters(value) if entry.name in _FILTER_FIELDS else value
+                instrument.attrs[entry.name] = text_from_filters(value) if entry.name in LAYER_FIELDS else value
         maps = file.create_group("maps")
         for name in _MAPS:
             maps.create_dataset(name, data=getattr(twin.maps, name), compression="gzip", shuffle=True)
@@ -160,7 +159,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
     for name, value in file["instrument"].attrs.items():
         if name not in names:
             continue
-        if name in _FILTER_FIELDS:
+        if name in LAYER_FIELDS:
             values[name] = filters_from_text(_text(value))
         elif isinstance(value, str | bytes):
             values[name] = _text(value)

@@ -390,3 +390,28 @@ def test_the_same_content_makes_the_same_bytes(tmp_path):
     for name in ("a.h5", "b.h5"):
         small(tmp_path / name)
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_a_line_s_description_and_binning_come_back_from_the_file(tmp_path):
+    described = Instrument(
+        detector="tdi",
+        tdi_stages=64,
+        readout_ms=0.05,
+        readout_overlaps=True,
+        maximum_kV=120.0,
+        maximum_current_mA=2.0,
+        focal_power_w_per_mm=900.0,
+        interlayer=(Filter(material="Cu", thickness_mm=1.0),),
+        back_scintillator=(Filter(material="Gd2O2S@7.32", thickness_mm=0.3),),
+        binning_adds="charge",
+    )
+    setting = Setting(
+        kV=60, current_mA=1, exposure_ms=128, binning=2, belt_speed_mm_s=100.0, frame_interval_ms=2.0
+    )
+    with write_acquisition(tmp_path / "a.h5", described) as writer:
+        writer.add_series("flat", kind="flat", frames=np.zeros((2, 4, 5), np.uint16), setting=setting)
+    with open_acquisition(tmp_path / "a.h5") as acquisition:
+        assert acquisition.instrument == described
+        (series,) = acquisition.series
+        assert series.setting.binning == 2
+        assert (series.belt_speed_mm_s, series.frame_interval_ms) == (100.0, 2.0)

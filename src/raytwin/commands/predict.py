@@ -22,12 +22,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposure-ms", type=float, required=True, help="exposure of one frame, ms")
     parser.add_argument("--averaged", type=int, default=1, help="frames averaged (default 1)")
     parser.add_argument("--source-detector-mm", type=float, help="distance, where it differs from the calibration's")
+    parser.add_argument(
+        "--binning", type=int, default=1, metavar="B", help="B x B pixels combined into one (default 1)"
+    )
+    parser.add_argument(
+        "--frame-interval-ms", type=float, help="from one frame or line to the next, checked with readout"
+    )
+    parser.add_argument("--belt-speed-mm-s", type=float, help="checked with the exposure of line and TDI detectors")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin predict`."""
     from ..acquisition import Setting, filter_from_text
+    from ..generator.dual_layer import predict_back_layer
+    from ..generator.line_limits import frames_per_s
     from ..generator.predict import predict_flatfield
     from ..generator.twin_io import read_twin
     from ..materials import material_from_name
@@ -40,10 +49,17 @@ def run(arguments: argparse.Namespace) -> int:
         filters=tuple(filter_from_text(text) for text in arguments.filter),
         averaged=arguments.averaged,
         source_detector_mm=arguments.source_detector_mm,
+        binning=arguments.binning,
+        frame_interval_ms=arguments.frame_interval_ms,
+        belt_speed_mm_s=arguments.belt_speed_mm_s,
     )
     for layer in setting.filters:
         material_from_name(layer.material)
-    result = predict_flatfield(read_twin(arguments.twin), setting).as_dict()
+    twin = read_twin(arguments.twin)
+    result = predict_flatfield(twin, setting).as_dict()
+    result["frames_per_s"] = frames_per_s(twin.instrument, setting)
+    if twin.instrument.dual_layer and twin.spectral is not None:
+        result["back_layer"] = predict_back_layer(twin, setting).as_dict()
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result))
@@ -65,5 +81,7 @@ def _text(result: dict[str, Any]) -> str:
             "not known" if value is None else f"{value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g}) {unit}"
         )
         lines.append(f"{name:<17} {text}")
+    for name, value in result.get("back_layer", {}).items():
+        lines.append(f"back layer, {name}: {value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g})")
     lines.append(f"extrapolated      {'yes' if result['extrapolated'] else 'no'}")
     return "\n".join(lines)

@@ -6,7 +6,7 @@ At the kV and filter of the references that is a top-up (generator.topup); at an
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..acquisition.setting import Setting, setting_from_text
 from ..errors import InputError
 from ..files import sha256_of_file
 from .as_published import published_parameters, sample_as_published
+from .binning import refuse_binning
 from .predict import predict_flatfield, slope_share, spectral_model_of
 from .registration import estimate_shift_px, shift_image
 from .spectral_signal import OpenBeam, gain_behind_object
@@ -90,6 +91,7 @@ class ChannelModel:
     dark_DN: NDArray[np.float32] = field(init=False)
     read_variance_DN2: NDArray[np.float32] = field(init=False)
     gain_DN: float = field(init=False)
+    warnings: tuple[str, ...] = field(init=False)
     _transmission: NDArray[np.float64] = field(init=False)
     _gain_ratio: NDArray[np.float64] = field(init=False)
 
@@ -117,6 +119,7 @@ class ChannelModel:
         self.dark_DN = dark
         self.read_variance_DN2 = variance
         self.gain_DN = predicted.gain_DN.value
+        self.warnings = self._warnings(predicted.extrapolated)
         if twin.spectral is None:
             self._transmission, self._gain_ratio = np.array([0.0, 1.0]), np.ones(2)
         else:
@@ -129,6 +132,20 @@ class ChannelModel:
                 thickness_mm=_GAIN_THICKNESSES_MM,
             )
             self._transmission, self._gain_ratio = rate[::-1], ratio[::-1]
+
+    def _warnings(self, extrapolated: bool) -> tuple[str, ...]:
+        found = []
+        if self.level is None and extrapolated:
+            found.append(
+                f"{self.target} lies outside the calibrated kV or filters: its level rests on the spectral model"
+            )
+        bits = self.twin.instrument.bits
+        if bits is not None:
+            brightest = self.open_signal_DN + 4.0 * np.sqrt(self.gain_DN * self.open_signal_DN) + self.dark_DN
+            cut = 100.0 * float(np.mean(brightest > 2.0**bits - 1))
+            if cut > 1.0:
+                found.append(f"{self.target} drives {cut:.2g} % of the pixels in the open field to the end of the ADC")
+        return tuple(found)
 
     def channel(self) -> Channel:
         """The same as a transfer needs it."""
@@ -322,6 +339,134 @@ def reference_settings(row: DatasetRow, fallback: tuple[Setting, Setting] | None
     return fallback
 
 
+class ReferenceImages:
+    """References of a dataset as a line would show them at one target, each time with other noise.
+
+    `len()` is the number of references; positions count them in the order of the dataset, `numbers` says which of its
+    images they are.
+
+    Raises:
+        InputError: targets the twin or the references cannot reach, another detector size, no reference.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        reference: Dataset,
+        *,
+        low: Setting,
+        high: Setting,
+        recipe: str = "raytwin",
+        product_material: str = DEFAULT_PRODUCT,
+        foreign_material: str = DEFAULT_FOREIGN,
+        bad_pixels: str = "repaired",
+        registration_px: tuple[float, float] | str | None = None,
+        split: str | None = None,
+        reference_setting: tuple[Setting, Setting] | None = None,
+    ) -> None:
+        refuse_binning(low, high)
+        if recipe not in RECIPES:
+            raise InputError("recipe", received=recipe, expected="one of " + ", ".join(RECIPES))
+        if bad_pixels not in BAD_PIXELS:
+            raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
+        refuse_binning(low, high)
+        if high.kV <= low.kV:
+            raise InputError(
+                "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
+            )
+        if reference.shape != twin.maps.shape:
+            raise InputError(
+                "reference",
+                received=f"images of {reference.shape}",
+                expected=f"the twin's detector, {twin.maps.shape} (row, column)",
+                remedy="calibrate from flats of the detector that took the references",
+            )
+        self.numbers = [int(number) for number in reference.indices(split=split)]
+        if not self.numbers:
+            raise InputError(
+                "reference", received=f"no image of split {split}", expected="at least one reference image"
+            )
+        self._reference = reference
+        self._recipe = recipe
+        self._registration_px = registration_px
+        self._settings = [reference_settings(reference.rows[number], reference_setting) for number in self.numbers]
+        self._needs_transfer = {
+            pair: not all(same_beam(own, target) for own, target in zip(pair, (low, high), strict=True))
+            for pair in sorted(set(self._settings), key=str)
+        }
+        self.transfers = any(self._needs_transfer.values())
+        if recipe == "as_published" and self.transfers:
+            raise InputError(
+                "target setting",
+                received=f"{low};{high}",
+                expected="the kV and filter of the references: the published recipe knows no other",
+                remedy="use --recipe raytwin",
+            )
+        self._transfer: PairTransfer | None = None
+        if self.transfers:
+            self._transfer = PairTransfer(
+                twin,
+                low=low,
+                high=high,
+                product_material=product_material,
+                foreign_material=foreign_material,
+                bad_pixels=bad_pixels,
+            )
+            self.channels = self._transfer.models
+        else:
+            self.channels = tuple(ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high))
+        self.warnings = tuple(self._plan_warnings(twin, (low, high)))
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def counts(self, position: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+        """Counts with dark (2, row, column) of one reference at the target, DN, and warnings.
+
+        Raises:
+            InputError: the reference is too noisy for the target.
+        """
+        number, settings = self.numbers[position], self._settings[position]
+        images = _registered(self._reference.images(number), self._registration_px)
+        if self._transfer is not None and self._needs_transfer[settings]:
+            pair, told = self._transfer.transfer(
+                images,
+                settings,
+                product=self._reference.product_masks(number),
+                name=f"reference {self._reference.rows[number].image}",
+            )
+            return self._transfer.draw(pair, rng), told
+        counts = np.empty(images.shape, dtype=np.float32)
+        for plane, channel in enumerate(self.channels):
+            transmission = np.exp(-images[plane].astype(np.float64))
+            if self._recipe == "raytwin":
+                counts[plane] = channel.sample_counts(transmission, settings[plane], rng)
+            else:
+                counts[plane] = channel.sample_as_published(transmission, rng)
+        return counts, ()
+
+    def log_images(self, counts: NDArray[np.floating]) -> NDArray[np.float32]:
+        """-log(I / I0) of counts (2, row, column) of the target."""
+        return np.stack([channel.log_image(plane) for channel, plane in zip(self.channels, counts, strict=True)])
+
+    def _plan_warnings(self, twin: Twin, targets: tuple[Setting, Setting]) -> Iterator[str]:
+        for pair, transferred in self._needs_transfer.items():
+            if transferred:
+                continue
+            for own, target in zip(pair, targets, strict=True):
+                plan = plan_top_up(reference=own, target=target)
+                if plan.read < -1e-9:
+                    excess = math.sqrt(-plan.read) * twin.noise.read_noise_DN.value
+                    yield (
+                        f"references at {own} carry {excess:.3g} DN rms more electronic noise than {target} would: their"
+                        " frames are too many and too dim for it"
+                    )
+        if twin.spectral is None:
+            yield "the twin has no spectral part: the gain behind the product is that of the open beam"
+        for channel in self.channels:
+            yield from channel.warnings
+
+
 def generate_dataset(
     twin: Twin,
     reference: Dataset,
@@ -363,66 +508,25 @@ def generate_dataset(
     Raises:
         InputError: targets the twin or the references cannot reach, another detector size, no reference.
     """
-    if recipe not in RECIPES:
-        raise InputError("recipe", received=recipe, expected="one of " + ", ".join(RECIPES))
     if images < 1:
         raise InputError("number of images", received=images, expected="1 or more")
-    if high.kV <= low.kV:
-        raise InputError(
-            "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
-        )
-    if reference.shape != twin.maps.shape:
-        raise InputError(
-            "reference",
-            received=f"images of {reference.shape}",
-            expected=f"the twin's detector, {twin.maps.shape} (row, column)",
-            remedy="calibrate from flats of the detector that took the references",
-        )
-    chosen = reference.indices(split=split)
-    if len(chosen) == 0:
-        raise InputError("reference", received=f"no image of split {split}", expected="at least one reference image")
-    if bad_pixels not in BAD_PIXELS:
-        raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
-    settings = [reference_settings(reference.rows[int(index)], reference_setting) for index in chosen]
-    needs_transfer = {
-        pair: not all(same_beam(own, target) for own, target in zip(pair, (low, high), strict=True))
-        for pair in sorted(set(settings), key=str)
-    }
-    if recipe == "as_published" and any(needs_transfer.values()):
-        raise InputError(
-            "target setting",
-            received=f"{low};{high}",
-            expected="the kV and filter of the references: the published recipe knows no other",
-            remedy="use --recipe raytwin",
-        )
-    transfer = None
-    if any(needs_transfer.values()):
-        transfer = PairTransfer(
-            twin,
-            low=low,
-            high=high,
-            product_material=product_material,
-            foreign_material=foreign_material,
-            bad_pixels=bad_pixels,
-        )
-        channels = list(transfer.models)
-    else:
-        channels = [ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high)]
-    warnings: list[str] = []
-    for pair in [one for one, needed in needs_transfer.items() if not needed]:
-        for own, target in zip(pair, (low, high), strict=True):
-            plan = plan_top_up(reference=own, target=target)
-            if plan.read < -1e-9:
-                excess = math.sqrt(-plan.read) * twin.noise.read_noise_DN.value
-                warnings.append(
-                    f"references at {own} carry {excess:.3g} DN rms more electronic noise than {target} would: their"
-                    " frames are too many and too dim for it"
-                )
-    if twin.spectral is None:
-        warnings.append("the twin has no spectral part: the gain behind the product is that of the open beam")
+    drawn = ReferenceImages(
+        twin,
+        reference,
+        low=low,
+        high=high,
+        recipe=recipe,
+        product_material=product_material,
+        foreign_material=foreign_material,
+        bad_pixels=bad_pixels,
+        registration_px=registration_px,
+        split=split,
+        reference_setting=reference_setting,
+    )
+    warnings = list(drawn.warnings)
     setting_text = f"{low};{high}"
     reference_sha256 = sha256_of_file(reference.path)
-    order = np.random.default_rng([seed, 0]).permutation(len(chosen))
+    order = np.random.default_rng([seed, 0]).permutation(len(drawn))
     with_foreign = clipped = values = 0
     provenance = {
         "twin_sha256": twin_sha256,
@@ -432,51 +536,30 @@ def generate_dataset(
         "seed": seed,
         "recipe": recipe,
         "product_material": product_material,
-        "foreign_material": foreign_material if transfer is not None else None,
+        "foreign_material": foreign_material if drawn.transfers else None,
         "bad_pixels": bad_pixels,
         "registration_px": None if registration_px is None else str(registration_px),
     }
     with write_dataset(out, shape=reference.shape, provenance=provenance) as writer:
         for number in range(images):
-            position = int(order[number % len(chosen)])
-            index = int(chosen[position])
-            images_of_reference = _registered(reference.images(index), registration_px)
-            product = reference.product_masks(index)
-            rng = np.random.default_rng([seed, 1, number])
-            counts = np.empty((2, *reference.shape), dtype=np.float32)
-            logs = np.empty_like(counts)
-            transferred = needs_transfer[settings[position]]
-            if transfer is not None and transferred:
-                transferred_pair, told = transfer.transfer(
-                    images_of_reference,
-                    settings[position],
-                    product=product,
-                    name=f"reference {reference.rows[index].image}",
-                )
-                counts = transfer.draw(transferred_pair, rng)
-                warnings += [line for line in told if line not in warnings]
-            transmission = np.exp(-images_of_reference.astype(np.float64))
-            for plane, channel in enumerate(channels):
-                if transferred:
-                    pass
-                elif recipe == "raytwin":
-                    counts[plane] = channel.sample_counts(transmission[plane], settings[position][plane], rng)
-                else:
-                    counts[plane] = channel.sample_as_published(transmission[plane], rng)
-                logs[plane] = channel.log_image(counts[plane])
+            position = int(order[number % len(drawn)])
+            counts, told = drawn.counts(position, np.random.default_rng([seed, 1, number]))
+            warnings += [line for line in told if line not in warnings]
+            for plane, channel in enumerate(drawn.channels):
                 clipped += int(np.count_nonzero(counts[plane] - channel.dark_DN < 1.0))
-                values += counts[plane].size
+            values += counts.size
+            index = drawn.numbers[position]
             row = reference.rows[index]
             foreign = reference.foreign_object_masks(index)
             with_foreign += bool(foreign.any())
             writer.append(
-                image=logs,
+                image=drawn.log_images(counts),
                 counts=counts if with_counts else None,
                 foreign_object_mask=foreign,
-                product_mask=product,
+                product_mask=reference.product_masks(index),
                 # the first image of a reference keeps its name, so that it pairs with the measured one
                 row=replace(
-                    row, image=row.image if number < len(chosen) else f"{row.image}-{number:05d}", setting=setting_text
+                    row, image=row.image if number < len(drawn) else f"{row.image}-{number:05d}", setting=setting_text
                 ),
             )
             if progress is not None:
@@ -488,7 +571,7 @@ def generate_dataset(
         )
     return GenerationSummary(
         images=images,
-        references=min(images, len(chosen)),
+        references=min(images, len(drawn)),
         with_foreign_object=with_foreign,
         seed=seed,
         recipe=recipe,
@@ -497,7 +580,7 @@ def generate_dataset(
         reference_sha256=reference_sha256,
         clipped_percent=clipped_percent if math.isfinite(clipped_percent) else 0.0,
         warnings=tuple(warnings),
-        transferred=transfer is not None,
+        transferred=drawn.transfers,
     )
 
 

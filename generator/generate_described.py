@@ -13,6 +13,7 @@ from ..acquisition.dataset_io import DatasetRow, write_dataset
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from ..files import sha256_of_file
+from .binning import refuse_binning
 from .describe import Description, Individual, Scene, choose_kind, sample_individual, sample_scene
 from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise
 from .render import SUPERSAMPLING, ExpectedImage, Geometry, geometry_of, render_expected, sample_expected
@@ -51,6 +52,7 @@ class DescribedScenes:
         bad_pixels: str = "repaired",
         supersampling: int = SUPERSAMPLING,
     ) -> None:
+        refuse_binning(low, high)
         if twin.spectral is None:
             raise InputError(
                 "twin",
@@ -232,7 +234,7 @@ def generate_from_description(
             )
             if progress is not None:
                 progress(number + 1)
-    warnings = []
+    warnings = [line for model in scenes.models for line in model.warnings]
     if 100.0 * clipped / values > 0.1:
         warnings.append(
             f"{100.0 * clipped / values:.2g} % of the values lie below 1 DN above dark and are clipped in the log image"

@@ -368,7 +368,9 @@ def test_a_dataset_at_another_kV_carries_masks_rows_and_provenance_and_repeats_b
     first = generate(twin, path, tmp_path / "a.h5")
     again = generate(twin, path, tmp_path / "b.h5")
     assert first.transferred
-    assert first.warnings == ()
+    assert len(first.warnings) == 1
+    assert "kv=120" in first.warnings[0]
+    assert "outside the calibrated kV" in first.warnings[0]
     with read_dataset(tmp_path / "a.h5") as made, read_dataset(tmp_path / "b.h5") as same, read_dataset(path) as source:
         np.testing.assert_array_equal(made.counts(slice(None)), same.counts(slice(None)))
         assert made.attributes["foreign_material"] == "rib_bone"

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from ._loops import seed_stream, uniform
 
@@ -42,7 +42,7 @@ def _pick(table, u):  # type: ignore[no-untyped-def]
     return low + ((u - table[low]) / gap if gap > 0.0 else 0.0)
 
 
-@njit(parallel=True, cache=True)
+@njit(cache=True)
 def follow_photons(  # type: ignore[no-untyped-def]
     histories,
     key,
@@ -61,7 +61,7 @@ def follow_photons(  # type: ignore[no-untyped-def]
     mu,
     scattered,
     coherent,
-    cosines,
+    angles,
     coherent_cumulated,
     coherent_density,
     incoherent_cumulated,
@@ -74,7 +74,8 @@ def follow_photons(  # type: ignore[no-untyped-def]
 
     Lengths in mm; the object stands on the plane z = 0 with heights `height_mm` (cell,) and material shares `share`
     (cell, material); source at z = source_mm, detector at z = -gap_mm. `mu`, `scattered` (share of collisions that
-    scatter) and `coherent` (share of these) are (material, energy). Densities are per sr and per scattered photon.
+    scatter) and `coherent` (share of these) are (material, energy). Densities are per sr and per scattered photon, on
+    `angles` even steps of sin(theta / 2).
     """
     rows, columns = grid
     half_y, half_x = 0.5 * field_mm[0], 0.5 * field_mm[1]
@@ -83,7 +84,7 @@ def follow_photons(  # type: ignore[no-untyped-def]
     n_material = mu.shape[0]
     tally_rows, tally_columns = tally_grid
     area_mm2 = detector_mm[0] * detector_mm[1] / points
-    for stream in prange(_STREAMS):
+    for stream in range(_STREAMS):
         state = np.empty(4, dtype=np.uint64)
         seed_stream(state, key, 9, 0, stream)
         for _ in range(histories // _STREAMS):
@@ -117,8 +118,8 @@ def follow_photons(  # type: ignore[no-untyped-def]
                     away = math.sqrt(px * px + py * py + pz * pz)
                     px, py, pz = px / away, py / away, pz / away
                     cosine = dx * px + dy * py + dz * pz
-                    place = (cosine + 1.0) * 0.5 * (cosines.size - 1)
-                    below = min(int(place), cosines.size - 2)
+                    place = math.sqrt(max(0.5 * (1.0 - cosine), 0.0)) * (angles - 1)
+                    below = min(int(place), angles - 2)
                     part = place - below
                     if is_coherent:
                         table = coherent_density[material, energy]
@@ -155,7 +156,8 @@ def follow_photons(  # type: ignore[no-untyped-def]
                     break
                 # On in a direction of the law's own.
                 table = coherent_cumulated[material, energy] if is_coherent else incoherent_cumulated[material, energy]
-                cosine = -1.0 + 2.0 * _pick(table, uniform(state)) / (cosines.size - 1)
+                half_sine = _pick(table, uniform(state)) / (angles - 1)
+                cosine = 1.0 - 2.0 * half_sine * half_sine
                 if not is_coherent:
                     keV = keV / (1.0 + keV / _ELECTRON_KEV * (1.0 - cosine))
                     energy = min(max(int((keV - lowest_keV) / step_keV + 0.5), 0), n_energy - 1)

@@ -29,7 +29,9 @@ Array = NDArray[np.float64]
 
 LOWEST_KEV = 8.0
 STEP_KEV = 2.0
-COSINES = np.linspace(-1.0, 1.0, 257)
+# Even steps of sin(theta / 2), on which form factors vary smoothly: half a degree near forward.
+HALF_SINES = np.linspace(0.0, 1.0, 257)
+COSINES = 1.0 - 2.0 * HALF_SINES**2
 GRID = 64
 TALLY = 16
 MODES = 6
@@ -45,7 +47,8 @@ class Tables:
     """Scattering of a material on the energy grid.
 
     Fields: mu (energy,) total attenuation per mm; scattered (energy,) share of collisions that scatter; coherent
-    (energy,) share of these; densities (energy, cosine) per sr, integrating to 1; cumulated (energy, cosine).
+    (energy,) share of these; densities (energy, angle) per sr, integrating to 1; cumulated (energy, angle) from forward
+    on; angles as in HALF_SINES.
     """
 
     mu: Array
@@ -69,7 +72,7 @@ def scatter_tables(material: str, n_energies: int) -> Tables:
     klein_nishina = 0.5 * _R_E2_MM2 * kept**2 * (kept + 1.0 / kept - 1.0 + COSINES[None, :] ** 2)
     thomson = 0.5 * _R_E2_MM2 * (1.0 + COSINES[None, :] ** 2)
     # sin(theta / 2) / lambda in 1 / Angstrom
-    transfer = np.sqrt(0.5 * (1.0 - COSINES[None, :])) * energy_keV[:, None] / _HC_KEV_ANGSTROM
+    transfer = HALF_SINES[None, :] * energy_keV[:, None] / _HC_KEV_ANGSTROM
     coherent = np.zeros_like(transfer)
     incoherent = np.zeros_like(transfer)
     photoelectric = np.zeros_like(energy_keV)
@@ -84,7 +87,9 @@ def scatter_tables(material: str, n_energies: int) -> Tables:
     mu = mu_per_mm(material, energy_keV)
 
     def normalised(density: Array) -> tuple[Array, Array, Array]:
-        steps = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(COSINES) * 2.0 * math.pi
+        # d(cos theta) = -4 s ds
+        rate = density * (8.0 * math.pi * HALF_SINES)
+        steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * np.diff(HALF_SINES)
         total = steps.sum(axis=1)
         cumulated = np.concatenate([np.zeros((total.size, 1)), np.cumsum(steps, axis=1)], axis=1) / total[:, None]
         return density / total[:, None], cumulated, total
@@ -176,7 +181,7 @@ def scattered_photons(
         stacked("mu"),
         stacked("scattered"),
         stacked("coherent"),
-        COSINES,
+        HALF_SINES.size,
         stacked("coherent_cumulated"),
         stacked("coherent_density"),
         stacked("incoherent_cumulated"),

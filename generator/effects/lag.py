@@ -2,26 +2,32 @@
 
     y_n = (1 - phi) x_n + sum_i (1 - a_i) R_i,n       R_i,n+1 = a_i R_i,n + phi_i x_n       a_i = exp(-interval / tau_i)
 
-Charge is conserved: a steady exposure reads x. After a long exposure the first beam-off frame reads phi x. Three traps
-of equal share at tau / s, tau and tau s; s = 1 is one exponential, a large s resembles a power law. What is released while
-nothing is exposed is thrown away by a panel that keeps being read, and found in the next frame by one that is not.
+Charge is conserved: a steady exposure reads x in the end. After an exposure of length T the first beam-off frame reads
+x sum_i phi_i (1 - exp(-T / tau_i)), which is the strength. Three traps at tau / s, tau and tau s hold 4, 2 and 1 parts of
+the charge. What is released while nothing is exposed is thrown away by a panel that keeps being read, and found in the
+next frame by one that is not.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LagLaw, LineContext, LineState
 from .effect import Effect, Parameter
 
+_PARTS = (4.0 / 7.0, 2.0 / 7.0, 1.0 / 7.0)
+
 
 def _trap_charge(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    trapped = parameters["strength"] / 100.0
-    if trapped == 0:
+    if parameters["strength"] == 0:
         return state
     middle, spread = parameters["release_s"], parameters["spread"]
+    times = (middle / spread, middle, middle * spread)
+    filled = sum(part * -math.expm1(-parameters["after_s"] / time) for part, time in zip(_PARTS, times, strict=True))
+    trapped = parameters["strength"] / 100.0 / filled
     law = LagLaw(
-        trapped=(trapped / 3.0,) * 3,
-        time_s=(middle / spread, middle, middle * spread),
+        trapped=tuple(part * trapped for part in _PARTS),
+        time_s=times,
         pause_share=parameters["pause_share"],
     )
     return replace(state, lag=law)
@@ -37,7 +43,7 @@ IMAGE_LAG = Effect(
             low=0.02,
             high=5.0,
             default=1.0,
-            source="first beam-off frame over the last exposed one, after long exposure",
+            source="first beam-off frame over the last exposed one",
             log=True,
         ),
         Parameter(
@@ -63,8 +69,18 @@ IMAGE_LAG = Effect(
             unit="",
             low=1.0,
             high=10.0,
+            default=7.0,
+            source="ratio of neighbouring release times; 7.6 and twice the charge a step in Starman et al. (2012)",
+            log=True,
+            fitted=False,
+        ),
+        Parameter(
+            name="after_s",
+            unit="s",
+            low=0.001,
+            high=1e5,
             default=5.0,
-            source="ratio of neighbouring release times; measured decays follow sums of exponentials or power laws",
+            source="length of the exposure after which `strength` is seen",
             log=True,
             fitted=False,
         ),

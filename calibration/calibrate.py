@@ -1,7 +1,7 @@
 """Measured flats and darks -> a calibrated twin."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.setting import text_from_filters
 from ..errors import FitError
 from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
+from ..spectra import Spectrum
 from .next_measurement import rank_measurements
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .spectral_fit import fit_spectrum
@@ -24,6 +25,7 @@ def calibrate_twin(
     progress: Callable[[str], None] | None = None,
     provenance: dict[str, Any] | None = None,
     advise: bool = True,
+    spectra: Sequence[Spectrum] = (),
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
@@ -32,6 +34,7 @@ def calibrate_twin(
         rng: source of randomness of the posterior's draws.
         progress: called with the name of each stage.
         provenance: kept in the twin.
+        spectra: measured ones, in place of the tube model at their voltages.
         advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
@@ -67,6 +70,7 @@ def calibrate_twin(
                 transfer.levels,
                 acquisition.instrument,
                 rng=rng,
+                spectra=spectra,
                 transmissions=[value for item in wedges for value in item.transmissions],
             )
         except FitError as error:

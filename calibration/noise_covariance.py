@@ -50,6 +50,7 @@ def compute_noise_covariance(
     signal_DN: NDArray[np.float64],
     good: NDArray[np.bool_],
     radius: int,
+    about: tuple[NDArray[np.float64], int] | None = None,
 ) -> NoiseCovariance:
     """Autocovariance of the noise of one frame from successive differences, DN^2.
 
@@ -62,6 +63,8 @@ def compute_noise_covariance(
         signal_DN: mean signal above dark (row, column), DN; zeros for darks.
         good: pixels to use (row, column).
         radius: largest lag, px.
+        about: mean frame (row, column) and how many frames it is the mean of, N: deviations from it, d = x_i - mean with
+            C(o) = mean of d(r) d(r + o) / (1 - 1/N), in place of successive differences.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
     from scipy.special import chdtri
@@ -83,7 +86,7 @@ def compute_noise_covariance(
     power = np.zeros((size[0], size[1] // 2 + 1))
     count = 0
     factors: list[float] = []
-    last: NDArray[np.float64] | None = None
+    last: NDArray[np.float64] | None = None if about is None else about[0]
     for piece in pieces:
         for frame in piece:
             current = np.asarray(frame, dtype=np.float64)
@@ -95,11 +98,12 @@ def compute_noise_covariance(
                 power += spectrum.real**2 + spectrum.imag**2
                 factors.append(factor)
                 count += 1
-            last = current
-    if count == 0:
+            last = current if about is None else last
+    if count == 0 or (about is not None and about[1] < 2):
         raise InputError("frames", received="fewer than two frames", expected="at least two frames of one setting")
     window = np.ix_(np.arange(-radius, radius + 1) % size[0], np.arange(-radius, radius + 1) % size[1])
-    products = irfft2(power, s=size)[window] / (2.0 * count)
+    single = 2.0 if about is None else 1.0 - 1.0 / about[1]  # variance of d over that of one frame
+    products = irfft2(power, s=size)[window] / (single * count)
     coverage = rfft2(mask, s=size)
     neighbours = irfft2(coverage.real**2 + coverage.imag**2, s=size)[window]
     covariance = products / np.maximum(neighbours, 1.0)
@@ -108,16 +112,16 @@ def compute_noise_covariance(
     covariance = covariance + covariance.sum() / (1.0 - lags / pixels) / pixels
     covariance = 0.5 * (covariance + covariance[::-1, ::-1])
     signal = float(signal_DN[good].mean()) if has_signal else 0.0
+    degrees = effective_frames(count + 1) if about is None else count * single
     common = 0.0
     if has_signal:
         # the pixels' own noise moves the factor too; what is left must stand out of that as in 1 of 1000 by chance
         own = float(covariance.sum()) / norm
-        excess = float(np.mean(np.square(factors))) / 2.0 - own
-        degrees = effective_frames(count + 1)
+        excess = float(np.mean(np.square(factors))) / single - own
         common = excess if excess > own * (float(chdtri(degrees, 1e-3)) / degrees - 1.0) else 0.0
     return NoiseCovariance(
         covariance_DN2=covariance,
-        samples=effective_frames(count + 1) * pixels,
+        samples=degrees * pixels,
         signal_DN=signal,
         common_mode=common,
     )

@@ -16,13 +16,18 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import InputError
 from ..generator.twin import BAD_PIXEL_CODES, DetectorMaps, Estimate, Level, NoiseModel, estimate_from_sd
-from .frame_sums import FrameSums, effective_frames, sum_frames
+from ._kept_sums import KeptSums, SumsKeeper
+from .frame_sums import effective_frames, sum_frames
 from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covariance, fit_spread
 
+ESTIMATORS = ("pairs", "stack")
 COVARIANCE_FRAMES = 400
+_PIECE_BYTES = 16 * 2**20
 _COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
 _FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16))
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
+_CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
+_CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 Progress = Callable[[str], None]
@@ -92,22 +97,28 @@ class PhotonTransfer:
 
 @dataclass(frozen=True, slots=True)
 class _Darks:
-    """Dark frames: the mean at each exposure, growth, and the pairs' variance."""
+    """Dark frames: the mean at each session and exposure, growth, and the pairs' variance over all sessions."""
 
-    by_exposure: dict[float | None, NDArray[np.float64]]
-    sums: list[tuple[Series, FrameSums]]
+    by_exposure: dict[tuple[int, float | None], NDArray[np.float64]]
+    sums: list[tuple[Series, KeptSums]]
     per_ms: NDArray[np.float64]
     variance: NDArray[np.float64]
     effective: float
 
-    def at(self, exposure_ms: float | None) -> NDArray[np.float64]:
-        if exposure_ms in self.by_exposure:
-            return self.by_exposure[exposure_ms]
-        known = [key for key in self.by_exposure if key is not None]
+    def of(self, item: Series) -> NDArray[np.float64]:
+        """The dark frame of a series: of its own session where that has darks."""
+        return self.at(item.session, item.exposure_ms)
+
+    def at(self, session: int, exposure_ms: float | None) -> NDArray[np.float64]:
+        sessions = sorted({key[0] for key in self.by_exposure}, key=lambda one: (abs(one - session), one))
+        exposures = {key[1]: mean for key, mean in self.by_exposure.items() if key[0] == sessions[0]}
+        if exposure_ms in exposures:
+            return exposures[exposure_ms]
+        known = [key for key in exposures if key is not None]
         if exposure_ms is None or not known:
-            return next(iter(self.by_exposure.values()))
+            return next(iter(exposures.values()))
         nearest = min(known, key=lambda key: abs(key - exposure_ms))
-        return np.asarray(self.by_exposure[nearest] + self.per_ms * (exposure_ms - nearest))
+        return np.asarray(exposures[nearest] + self.per_ms * (exposure_ms - nearest))
 
 
 def usable_series(acquisition: AcquisitionFile, kind: str) -> list[Series]:
@@ -119,32 +130,41 @@ def usable_series(acquisition: AcquisitionFile, kind: str) -> list[Series]:
     ]
 
 
-def _sum_darks(series: Sequence[Series], shape: tuple[int, int]) -> _Darks:
-    sums = [(item, sum_frames(item.iter_frames(), name=f"series {item.name}")) for item in series]
-    grouped: dict[float | None, list[FrameSums]] = {}
+def _sums_of(item: Series, keeper: SumsKeeper) -> KeptSums:
+    return keeper.keep(sum_frames(item.iter_frames(maximum_bytes=_PIECE_BYTES), name=f"series {item.name}"))
+
+
+def _sum_darks(series: Sequence[Series], shape: tuple[int, int], keeper: SumsKeeper) -> _Darks:
+    sums = [(item, _sums_of(item, keeper)) for item in series]
+    grouped: dict[tuple[int, float | None], list[KeptSums]] = {}
     for item, total in sums:
-        grouped.setdefault(item.exposure_ms, []).append(total)
+        grouped.setdefault((item.session, item.exposure_ms), []).append(total)
+    frames = {key: sum(total.frames for total in totals) for key, totals in grouped.items()}
     by_exposure = {
-        exposure: np.asarray(
-            sum(total.mean_DN * total.frames for total in totals) / sum(total.frames for total in totals)
-        )
-        for exposure, totals in grouped.items()
+        key: np.asarray(sum(total.mean_DN * total.frames for total in totals) / frames[key])
+        for key, totals in grouped.items()
     }
-    known = sorted(key for key in by_exposure if key is not None)
+    # growth with exposure: a line in each session, one slope
     per_ms = np.zeros(shape)
-    if len(known) > 1:
-        times = np.array(known)
-        weights = np.array([sum(total.frames for total in grouped[key]) for key in known], dtype=np.float64)
+    denominator = 0.0
+    for session in {key[0] for key in grouped}:
+        keys = [key for key in grouped if key[0] == session and key[1] is not None]
+        if len(keys) < 2:
+            continue
+        times = np.array([key[1] for key in keys], dtype=np.float64)
+        weights = np.array([frames[key] for key in keys], dtype=np.float64)
         centred = times - np.average(times, weights=weights)
-        denominator = float(np.sum(weights * centred**2))
-        for weight, offset, key in zip(weights, centred, known, strict=True):
-            per_ms += weight * offset * by_exposure[key] / denominator
+        denominator += float(np.sum(weights * centred**2))
+        for weight, offset, key in zip(weights, centred, keys, strict=True):
+            per_ms += weight * offset * by_exposure[key]
+    if denominator > 0:
+        per_ms /= denominator
     variance = np.full(shape, np.nan)
     pairs = [(item, total) for item, total in sums if total.pairs > 0]
     effective = sum(effective_frames(total.frames) for _, total in pairs)
     if pairs:
         variance = np.asarray(
-            sum(total.pair_variance_DN2 * item.averaged * effective_frames(total.frames) for item, total in pairs)
+            sum(total.pair_variance_DN2 * (item.averaged * effective_frames(total.frames)) for item, total in pairs)
             / effective
         )
     return _Darks(by_exposure=by_exposure, sums=sums, per_ms=per_ms, variance=variance, effective=effective)
@@ -155,20 +175,24 @@ def _robust_spread(values: NDArray[np.float64]) -> tuple[float, float]:
     return centre, 1.4826 * float(np.median(np.abs(values - centre)))
 
 
-def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDArray[np.uint8]:
+def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, KeptSums]]) -> NDArray[np.uint8]:
     """Reason codes (row, column) from the darks' level and noise and from the flats' response."""
     from scipy.ndimage import median_filter
 
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
-    for exposure, mean in darks.by_exposure.items():
+    closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
+    for key, mean in darks.by_exposure.items():
         local = mean - median_filter(mean, size=5, mode="nearest")
         centre, spread = _robust_spread(local)
         limit = _DARK_NOISE_SIGMAS * max(spread, 0.5)
-        frames = sum(total.frames * item.averaged for item, total in darks.sums if item.exposure_ms == exposure)
+        frames = sum(
+            total.frames * item.averaged for item, total in darks.sums if (item.session, item.exposure_ms) == key
+        )
         # the mean of a noisy pixel strays by its own noise; that alone does not make it hot
         own = 4.0 * np.sqrt(np.nan_to_num(darks.variance) / max(frames, 1))
-        hot = np.abs(local - centre) > np.maximum(limit, own)
-        code[hot & (code == 0)] = BAD_PIXEL_CODES["hot"]
+        departure = np.abs(local - centre) / np.maximum(limit, own)
+        np.maximum(closest, departure, out=closest)
+        code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["hot"]
     if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
         # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
         from scipy.stats import chi2
@@ -177,22 +201,61 @@ def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, FrameSums]]) -> NDA
         limit = centre * float(chi2.isf(_NOISY_CHANCE, darks.effective)) / darks.effective + 1.0
         code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
-    signal = brightest[1].mean_DN - darks.at(brightest[0].exposure_ms)
+    signal = brightest[1].mean_DN - darks.of(brightest[0])
     if not np.median(signal) > 0:
-        return code  # no response to judge; the caller says so
+        return _with_clusters(code, closest)  # no response to judge; the caller says so
     local = median_filter(signal, size=5, mode="nearest")
     ratio = signal / np.where(local > 0, local, np.nan)
     code[(~np.isfinite(ratio) | (ratio < 0.5)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
     centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
-    odd = np.abs(ratio - centre) > max(_DARK_NOISE_SIGMAS * spread, 0.05)
-    code[odd & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
-    return code
+    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, 0.05))
+    np.maximum(closest, departure, out=closest)
+    code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    return _with_clusters(code, closest)
 
 
-def _saturation(total: FrameSums, bits: int | None) -> float | None:
+def _bad_neighbours(bad: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """How many of the eight pixels about each are bad (row, column)."""
+    from scipy.ndimage import convolve
+
+    around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    return np.asarray(convolve(bad.astype(np.int64), around, mode="constant"))
+
+
+def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Bad pixels with those that a cluster of them takes along: beside a bad one and at `_CLUSTER_SHARE` of a limit, or
+    hemmed in by bad ones."""
+    while True:
+        neighbours = _bad_neighbours(code != 0)
+        taken = (code == 0) & (
+            ((neighbours > 0) & (closest > _CLUSTER_SHARE)) | (neighbours >= _CLUSTER_NEIGHBOURS)
+        )
+        if not np.any(taken):
+            return code
+        code = np.where(taken, np.uint8(BAD_PIXEL_CODES["clustered"]), code)
+
+
+def cluster_evidence(bad: NDArray[np.uint8]) -> dict[str, int]:
+    """Groups of two or more bad pixels that touch: how many, pixels in the largest, and kernel pixels.
+
+    A kernel pixel is a bad one with fewer than five good neighbours, which interpolation cannot mend (ASTM E2597).
+    """
+    from scipy.ndimage import label
+
+    numbered, _ = label(bad != 0, structure=np.ones((3, 3)))
+    sizes = np.bincount(numbered.ravel())[1:]
+    kernel = (bad != 0) & (_bad_neighbours(bad != 0) > 3)
+    return {
+        "groups": int(np.count_nonzero(sizes > 1)),
+        "largest": int(sizes.max(initial=0)),
+        "kernel_pixels": int(np.count_nonzero(kernel)),
+    }
+
+
+def _saturation(total: KeptSums, bits: int | None) -> float | None:
     """The full scale (DN) if more than 0.1 % of the values stand at it, else None."""
     full = float(2**bits - 1) if bits else None
-    share = total.maximum_count / (total.frames * total.reference.size)
+    share = total.maximum_count / (total.frames * total.pixels)
     scales = (full,) if full is not None else _FULL_SCALES
     if total.maximum_DN in scales and share > 1e-3:
         return total.maximum_DN
@@ -201,19 +264,30 @@ def _saturation(total: FrameSums, bits: int | None) -> float | None:
 
 
 def _covariance(
-    item: Series, total: FrameSums, signal: NDArray[np.float64], good: NDArray[np.bool_], radius: int
+    item: Series,
+    total: KeptSums,
+    signal: NDArray[np.float64],
+    good: NDArray[np.bool_],
+    radius: int,
+    estimator: str,
 ) -> NoiseCovariance:
     most = int(min(total.frames, COVARIANCE_FRAMES, max(2, _COVARIANCE_SAMPLES // good.size)))
 
     def pieces() -> Any:
         left = most
-        for piece in item.iter_frames():
+        for piece in item.iter_frames(maximum_bytes=_PIECE_BYTES):
             yield piece[:left]
             left -= piece.shape[0]
             if left <= 0:
                 return
 
-    result = compute_noise_covariance(pieces(), signal_DN=signal, good=good, radius=radius)
+    result = compute_noise_covariance(
+        pieces(),
+        signal_DN=signal,
+        good=good,
+        radius=radius,
+        about=(total.mean_DN, total.frames) if estimator == "stack" else None,
+    )
     return NoiseCovariance(
         covariance_DN2=result.covariance_DN2 * item.averaged,
         samples=result.samples,
@@ -223,13 +297,33 @@ def _covariance(
 
 
 def compute_photon_transfer(
-    acquisition: AcquisitionFile, *, radius: int = 5, progress: Progress | None = None
+    acquisition: AcquisitionFile,
+    *,
+    radius: int = 5,
+    estimator: str = "pairs",
+    progress: Progress | None = None,
 ) -> PhotonTransfer:
     """Photon transfer of the darks and flats of an acquisition that may calibrate.
 
+    Args:
+        acquisition: one session, or several as one (`merge_sessions`): each then has its own darks.
+        radius: largest lag of the noise covariances, px.
+        estimator: where variances come from: `pairs` of successive frames, which slow drift leaves alone, or the `stack`
+            about its mean, which lag lowers less. The evidence holds both.
+        progress: called with the name of each stage.
+
     Raises:
-        InputError: no darks, no flats, nothing but saturated or single-frame flats, frames of several shapes.
+        InputError: no darks, no flats, nothing but saturated or single-frame flats, frames of several shapes, binned ones.
     """
+    if estimator not in ESTIMATORS:
+        raise InputError("estimator", received=estimator, expected="one of " + ", ".join(ESTIMATORS))
+    with SumsKeeper() as keeper:
+        return _photon_transfer(acquisition, keeper, radius=radius, estimator=estimator, progress=progress)
+
+
+def _photon_transfer(
+    acquisition: AcquisitionFile, keeper: SumsKeeper, *, radius: int, estimator: str, progress: Progress | None
+) -> PhotonTransfer:
     tell = progress or (lambda stage: None)
     warnings: list[str] = []
     flats = usable_series(acquisition, "flat")
@@ -248,6 +342,14 @@ def compute_photon_transfer(
             expected="at least one series of kind dark with two or more frames",
             remedy="measure darks (beam off, same exposure) and add them",
         )
+    binned = [item.name for item in flats if item.setting is not None and item.setting.binning != 1]
+    if binned:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"binned flats ({', '.join(binned)})",
+            expected="frames of single pixels",
+            remedy="leave `binning` out and give the binned pixel's pixel_mm: the twin's pixels are then the binned ones",
+        )
     shapes = {item.shape for item in [*flats, *dark_series]}
     if len(shapes) > 1:
         raise InputError(
@@ -260,19 +362,19 @@ def compute_photon_transfer(
     tell("darks")
     if offset_done:
         zero = np.zeros(shape)
-        darks = _Darks({None: zero}, [], zero, np.full(shape, np.nan), 0.0)
+        darks = _Darks({(0, None): zero}, [], zero, np.full(shape, np.nan), 0.0)
         if dark_series:
-            measured = _sum_darks(dark_series, shape)
-            darks = _Darks({None: zero}, measured.sums, zero, measured.variance, measured.effective)
+            measured = _sum_darks(dark_series, shape, keeper)
+            darks = _Darks({(0, None): zero}, measured.sums, zero, measured.variance, measured.effective)
     else:
-        darks = _sum_darks(dark_series, shape)
+        darks = _sum_darks(dark_series, shape, keeper)
 
     tell("flats")
     bits = acquisition.instrument.bits
-    sums: list[tuple[Series, FrameSums, str]] = []
+    sums: list[tuple[Series, KeptSums, str]] = []
     saturation: dict[str, float] = {}
     for item in flats:
-        total = sum_frames(item.iter_frames(), name=f"series {item.name}")
+        total = _sums_of(item, keeper)
         full = _saturation(total, bits)
         reason = ""
         if full is not None:
@@ -315,11 +417,11 @@ def compute_photon_transfer(
     def collect(reach: int) -> tuple[list[NoiseCovariance], list[int]]:
         covariances, groups = [], []
         for item, total in good_sums:
-            signal = total.mean_DN - darks.at(item.exposure_ms)
-            covariances.append(_covariance(item, total, signal, good, reach))
+            signal = total.mean_DN - darks.of(item)
+            covariances.append(_covariance(item, total, signal, good, reach, estimator))
             groups.append(index_of[_group_key(item)])
         for item, total in dark_pairs:
-            covariances.append(_covariance(item, total, np.zeros(shape), good, reach))
+            covariances.append(_covariance(item, total, np.zeros(shape), good, reach, estimator))
             groups.append(-1)
         return covariances, groups
 
@@ -371,7 +473,10 @@ def compute_photon_transfer(
     read_map = _read_variance_map(darks, good, fit.read_variance_DN2)
     gain_map = _gain_map(good_sums, usable, darks, good, fit, [groups[i] for i in range(len(good_sums))], read_map)
     levels = _levels(acquisition, keys, good_sums, usable, darks, good, fit, groups, points, saturation)
-    dark_estimate, reference_exposure = _dark_estimate(darks, good, [item.exposure_ms for item, _ in good_sums])
+    session = max((item.session for item in [*flats, *dark_series]), default=0)
+    dark_estimate, reference_exposure = _dark_estimate(
+        darks, good, session, [item.exposure_ms for item, _ in good_sums if item.session == session]
+    )
     evidence = _evidence(points, fit, darks, covariances, groups, good, warnings)
     for point in points:
         if point.used and point.common_mode_percent > 0.3:
@@ -379,7 +484,7 @@ def compute_photon_transfer(
                 f"tube output varies by {point.common_mode_percent:.2g} % rms from frame to frame in {point.series}"
             )
             break
-    reference_dark = darks.at(reference_exposure)
+    reference_dark = darks.at(session, reference_exposure)
     return PhotonTransfer(
         maps=DetectorMaps(
             dark_DN=reference_dark.astype(np.float32),
@@ -481,22 +586,22 @@ def _median_of_means(values: NDArray[np.float64], frames: int, integer: bool) ->
 
 
 def _dark_estimate(
-    darks: _Darks, good: NDArray[np.bool_], exposures: Sequence[float | None]
+    darks: _Darks, good: NDArray[np.bool_], session: int, exposures: Sequence[float | None]
 ) -> tuple[Estimate, float | None]:
-    """Median dark (DN) at the shortest exposure of the flats that was measured dark; spread of repeats included."""
-    known = sorted(key for key in darks.by_exposure if key is not None)
+    """Median dark (DN) of a session at the shortest exposure of its flats that was measured dark; spread of repeats
+    included."""
+    known = sorted(key[1] for key in darks.by_exposure if key[0] == session and key[1] is not None)
     shared = [key for key in known if key in exposures]
     candidates = shared or known
     exposure = candidates[0] if candidates else None
-    mean = darks.at(exposure)
+    mean = darks.at(session, exposure)
     integer = all(total.integer for _, total in darks.sums)
-    level = _median_of_means(mean[good], sum(t.frames for i, t in darks.sums if i.exposure_ms == exposure), integer)
-    repeats = [
-        _median_of_means(total.mean_DN[good], total.frames, total.integer)
-        for item, total in darks.sums
-        if item.exposure_ms == exposure
+    there = [
+        (item, total) for item, total in darks.sums if item.session == session and item.exposure_ms == exposure
     ]
-    frames = sum(total.frames for item, total in darks.sums if item.exposure_ms == exposure)
+    level = _median_of_means(mean[good], sum(total.frames for _, total in there), integer)
+    repeats = [_median_of_means(total.mean_DN[good], total.frames, total.integer) for _, total in there]
+    frames = sum(total.frames for _, total in there)
     pixels = int(good.sum())
     noise = float(np.nanmedian(darks.variance[good])) / max(frames, 1) if darks.effective > 0 else 0.0
     # frame noise carries pixels over the median of the map: sd^2 = E|noise| / (pixels x density at the median)
@@ -526,7 +631,7 @@ def _shrinkage(ratio: NDArray[np.float64], noise: float) -> float:
 
 
 def _gain_map(
-    sums: Sequence[tuple[Series, FrameSums]],
+    sums: Sequence[tuple[Series, KeptSums]],
     usable: Sequence[bool],
     darks: _Darks,
     good: NDArray[np.bool_],
@@ -543,7 +648,7 @@ def _gain_map(
         if not keep or total.pairs < 1:
             continue
         slope = float(fit.slope_DN[renumbered[group]])
-        signal = total.mean_DN - darks.at(item.exposure_ms)
+        signal = total.mean_DN - darks.of(item)
         typical = float(np.median(signal[good]))
         if slope <= 0 or typical <= 0:
             continue
@@ -561,19 +666,19 @@ def _gain_map(
 
 
 def _points(
-    sums: Sequence[tuple[Series, FrameSums, str]],
+    sums: Sequence[tuple[Series, KeptSums, str]],
     darks: _Darks,
     good: NDArray[np.bool_],
     covariances: Sequence[NoiseCovariance],
     groups: Sequence[int],
-    good_sums: Sequence[tuple[Series, FrameSums]],
+    good_sums: Sequence[tuple[Series, KeptSums]],
     usable: Sequence[bool],
     dropped: set[int],
 ) -> tuple[SeriesPoint, ...]:
     order = {item.name: index for index, (item, _) in enumerate(good_sums)}
     points = []
     for item, total, reason in sums:
-        signal = total.mean_DN - darks.at(item.exposure_ms)
+        signal = total.mean_DN - darks.of(item)
         index = order.get(item.name)
         covariance = covariances[index] if index is not None else None
         means = total.frame_mean_DN
@@ -623,7 +728,7 @@ def _load(item: Series) -> float | None:
 def _levels(
     acquisition: AcquisitionFile,
     keys: Sequence[tuple[float | None, tuple[str, ...]]],
-    sums: Sequence[tuple[Series, FrameSums]],
+    sums: Sequence[tuple[Series, KeptSums]],
     usable: Sequence[bool],
     darks: _Darks,
     good: NDArray[np.bool_],
@@ -640,7 +745,7 @@ def _levels(
         shape_sum = np.zeros(good.shape)
         for i in members:
             item, total = sums[i]
-            shape_sum += (total.mean_DN - darks.at(item.exposure_ms)) * total.frames
+            shape_sum += (total.mean_DN - darks.of(item)) * total.frames
         centre = float(np.median(shape_sum[good]))
         flat_shape = shape_sum / centre if centre > 0 else np.ones(good.shape)
         first = sums[members[0]][0]

@@ -15,25 +15,29 @@ from numpy.typing import NDArray
 
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, text_from_filters
-from ..errors import FitError
+from ..errors import FitError, InputError
 from ..generator.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
     OTHER_TABLES,
     OpenBeam,
     SpectralModel,
+    SpectrumCorrection,
     attenuation_scale_name,
 )
 from ..generator.twin import Level, SpectralPosterior
+from ..spectra import BIN_WIDTH_KEV, Spectrum
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
     DEPARTURE_FACTOR,
     DEPARTURES,
+    FREE_OUTPUT,
     GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
     LOG_DEPARTURE_SD,
     LOG_DISCREPANCY_SD,
+    MEASURED_SPECTRUM,
     PRIORS,
     TABLE_SHARE,
     UNDECLARED_SCINTILLATOR,
@@ -45,6 +49,7 @@ _FINAL_DRAWS = 2048
 _ROUNDS = 12
 _KEPT = 512
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
+_BELOW_END = 0.85  # of kV in keV: up to here a measured spectrum corrects the model
 _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
 _STUDENT_DEGREES = 5.0
 _MIXTURE = (0.75, 0.2, 0.05)
@@ -96,12 +101,20 @@ def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None)
     return (1000.0 / distance) ** 2 * pitch**2
 
 
-def priors_for(model: SpectralModel, *, scintillator_declared: bool) -> dict[str, Prior]:
+def priors_for(
+    model: SpectralModel, *, scintillator_declared: bool, geometry_declared: bool = True
+) -> dict[str, Prior]:
     """The priors of a model's parameters, in the order of its names."""
     result = {}
     for name in model.names:
         if name == "log_scintillator_thickness" and not scintillator_declared:
             result[name] = UNDECLARED_SCINTILLATOR
+        elif name in MEASURED_SPECTRUM and model.correction is not None:
+            result[name] = MEASURED_SPECTRUM[name]
+        elif name == "log_output" and (
+            not geometry_declared or (model.correction is not None and model.correction.relative)
+        ):
+            result[name] = FREE_OUTPUT
         elif name == "log_swank" and model.counting:
             result[name] = COUNTING_SWANK
         elif name == ALTERNATIVE_SCINTILLATOR:
@@ -119,7 +132,12 @@ def priors_for(model: SpectralModel, *, scintillator_declared: bool) -> dict[str
 
 
 def model_for(
-    instrument: Instrument, *, materials: Sequence[str], highest_kV: float, model_name: str = "casim"
+    instrument: Instrument,
+    *,
+    materials: Sequence[str],
+    highest_kV: float,
+    model_name: str = "casim",
+    correction: SpectrumCorrection | None = None,
 ) -> SpectralModel:
     """The spectral model of a declared instrument; what it leaves open takes the defaults (W, 12 degrees).
 
@@ -138,6 +156,59 @@ def model_for(
         # the commonest filters carry their uncertainty even where they were not measured
         filter_materials=sorted({*materials, "Al", "Cu"}),
         highest_kV=max(160.0, highest_kV),
+        correction=correction,
+    )
+
+
+def correction_from_spectra(
+    spectra: Sequence[Spectrum], instrument: Instrument, *, model_name: str = "casim"
+) -> SpectrumCorrection:
+    """Measured spectra over the model's behind the declared layers, smoothed over 1 keV (no unit).
+
+    Energies at which the measured spectrum holds less than a thousandth of its highest bin, and those above 0.85 kV, take
+    the nearest value. A spectrum without absolute scale is brought to the model's by its photons.
+
+    Raises:
+        InputError: a spectrum without tube voltage, or two at one.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    if any(item.kV is None for item in spectra) or len({item.kV for item in spectra}) < len(spectra):
+        raise InputError(
+            "--spectrum",
+            received=", ".join("no kV" if item.kV is None else f"{item.kV:g} kV" for item in spectra),
+            expected="each spectrum with a tube voltage of its own",
+            remedy="write FILE:kV",
+        )
+    ordered = sorted(spectra, key=lambda item: item.kV or 0.0)
+    model = model_for(
+        instrument, materials=(), highest_kV=max(item.kV or 0.0 for item in spectra), model_name=model_name
+    )
+    rows = []
+    for item in ordered:
+        kV = item.kV or 0.0
+        expected = model.weights(model.default_parameters()[None, :], OpenBeam(kV=kV, filters=()))[0]
+        bins = min(expected.size, item.fluence.size)
+        measured = np.zeros(expected.size)
+        measured[:bins] = item.fluence[:bins] * BIN_WIDTH_KEV / 100.0
+        smooth = gaussian_filter1d(measured, 2.0, mode="constant")
+        ours = gaussian_filter1d(expected, 2.0, mode="constant")
+        seen = (smooth > 1e-3 * smooth.max()) & (ours > 1e-3 * ours.max())
+        # the end point moves with the voltage, which has a parameter of its own
+        seen &= model.energies_keV[: expected.size] < _BELOW_END * kV
+        if not seen.any():
+            raise InputError(
+                "--spectrum", received=f"a spectrum that shares no energies with {kV:g} kV", expected="the tube's own"
+            )
+        logarithm = np.log(smooth[seen] / ours[seen])
+        if not item.absolute:
+            logarithm -= math.log(float(smooth[seen].sum() / ours[seen].sum()))
+        full = np.interp(model.energies_keV, model.energies_keV[: expected.size][seen], logarithm)
+        rows.append(full)
+    return SpectrumCorrection(
+        kV=tuple(item.kV or 0.0 for item in ordered),
+        log_ratio=np.array(rows),
+        relative=not all(item.absolute for item in ordered),
     )
 
 
@@ -149,6 +220,8 @@ def fit_spectrum(
     transmissions: Sequence[Transmission] = (),
     level_discrepancy: float | None = None,
     gain_discrepancy: float | None = None,
+    spectra: Sequence[Spectrum] = (),
+    correction: SpectrumCorrection | None = None,
     model_name: str = "casim",
 ) -> SpectralFit:
     """Posterior of the spectral parameters from measured levels, gains and transmissions.
@@ -160,6 +233,9 @@ def fit_spectrum(
         transmissions: of known layers (step wedges); scales cancel in them.
         level_discrepancy, gain_discrepancy: relative standard deviation of a level and of a gain beyond the model; None:
             learned, with the prior of `priors`.
+        spectra: measured ones, in place of the tube model at their voltages; between and beyond them the model's own
+            dependence on kV is kept (`SpectrumCorrection`).
+        correction: the same, where it is known already.
         model_name: SpekPy's physics model.
 
     Raises:
@@ -168,6 +244,8 @@ def fit_spectrum(
     known = [level for level in levels if level.kV is not None]
     if not known:
         raise FitError("no flat series states its kV, so nothing can be said of the spectrum")
+    if spectra:
+        correction = correction_from_spectra(spectra, instrument, model_name=model_name)
     layers = [layer for level in known for layer in level.filters]
     layers += [layer for item in transmissions for layer in (*item.filters, *item.layers)]
     model = model_for(
@@ -175,8 +253,13 @@ def fit_spectrum(
         materials=[layer.material for layer in layers],
         highest_kV=max([level.kV or 0.0 for level in known] + [item.kV for item in transmissions]),
         model_name=model_name,
+        correction=correction,
     )
-    priors = priors_for(model, scintillator_declared=instrument.scintillator is not None)
+    priors = priors_for(
+        model,
+        scintillator_declared=instrument.scintillator is not None,
+        geometry_declared=instrument.pixel_mm is not None and all(level.source_detector_mm for level in known),
+    )
     beams: dict[OpenBeam, int] = {}
     data = _data(known, transmissions, instrument, beams)
     posterior = _Posterior(model, priors, tuple(beams), data, {"level": level_discrepancy, "gain": gain_discrepancy})
@@ -196,6 +279,7 @@ def fit_spectrum(
             inherent=model.inherent,
             scintillator=model.scintillator,
             alternative=model.alternative,
+            correction=correction,
             cover=model.cover,
             counting=model.counting,
             level_discrepancy=float(np.sqrt(np.mean(discrepancies["level"] ** 2))),

@@ -310,7 +310,14 @@ def leave_one_out(
         tell(level.name)
         others = tuple(item for item in twin.levels if item is not level)
         kept = [item for item in transmissions if (item.kV, item.filters) != (level.kV, level.filters)]
-        fit = fit_spectrum(others, twin.instrument, rng=rng, transmissions=kept, model_name=twin.spectral.model)
+        fit = fit_spectrum(
+            others,
+            twin.instrument,
+            rng=rng,
+            transmissions=kept,
+            correction=twin.spectral.correction,
+            model_name=twin.spectral.model,
+        )
         mine = [loads[name] for name in level.series if name in loads]
         load_mAs = float(np.mean([load for load, _ in mine])) if mine else 1.0
         exposure_ms = float(np.median([exposure for _, exposure in mine])) if mine else 1000.0

@@ -63,7 +63,7 @@ class Prediction:
 
 @lru_cache(maxsize=8)
 def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
-    anode, angle, model, inherent, scintillator, alternative, cover, counting, names = key
+    anode, angle, model, inherent, scintillator, alternative, cover, counting, names, correction = key
     prefix = attenuation_scale_name("")
     return SpectralModel(
         anode=anode,
@@ -77,6 +77,7 @@ def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
         filter_materials=[name.removeprefix(prefix) for name in names if name.startswith(prefix)],
         highest_kV=highest_kV,
         names=names,
+        correction=correction,
     )
 
 
@@ -104,6 +105,7 @@ def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel
         posterior.cover,
         posterior.counting,
         posterior.names,
+        posterior.correction,
     )
     return _cached_model(key, max(160.0, 20.0 * math.ceil(highest_kV / 20.0)))
 

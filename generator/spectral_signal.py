@@ -76,6 +76,31 @@ class OpenBeam:
     filters: tuple[Filter, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpectrumCorrection:
+    """Measured spectra over the model's at the same tube voltages: kV (spectrum,), rising, and log_ratio (spectrum, energy).
+
+    The ratio holds at fixed photon energy, as what filters and anodes do; between the measured voltages it is
+    interpolated linearly in kV, outside the nearest is kept. relative: the spectra have no absolute scale.
+    """
+
+    kV: tuple[float, ...]
+    log_ratio: NDArray[np.float64]
+    relative: bool
+
+    def at(self, kV: float, bins: int) -> NDArray[np.float64]:
+        """Logarithm of the correction on the first `bins` of the common grid (energy,)."""
+        below, share = (
+            _brackets(np.array(self.kV), np.array([kV])) if len(self.kV) > 1 else (np.array([0]), np.zeros(1))
+        )
+        first = self.log_ratio[below[0]]
+        last = self.log_ratio[min(int(below[0]) + 1, len(self.kV) - 1)]
+        row = first + share[0] * (last - first)
+        if bins > row.size:
+            row = np.concatenate([row, np.full(bins - row.size, row[-1])])
+        return np.asarray(row[:bins])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamSignal:
     """What a beam gives (draw,): rate_DN_per_mAs, gain_DN (variance per signal), absorbed_per_mAs, kerma_uGy_per_mAs,
@@ -91,8 +116,9 @@ class SpectralModel:
     """Tables of one tube and scintillator, from which signals of many parameter sets follow by sums over energy.
 
     `names` are the parameters, in the order of a parameter set; a set of fewer names (an older twin's) can be given, and
-    what it lacks counts as 0. `alternative` is another scintillator, which a parameter of value 1 puts in place of the
-    first where the sheet does not say. The state is a cache: what each kV and material looks like on the common grid.
+    what it lacks counts as 0. `correction` brings the tube model to measured spectra. `alternative` is another
+    scintillator, which a parameter of value 1 puts in place of the first where the sheet does not say. The state is a
+    cache: what each kV and material looks like on the common grid.
     """
 
     def __init__(
@@ -109,6 +135,7 @@ class SpectralModel:
         filter_materials: Sequence[str] = (),
         highest_kV: float = 160.0,
         names: Sequence[str] | None = None,
+        correction: SpectrumCorrection | None = None,
     ) -> None:
         self.anode = anode
         self.anode_angle_deg = anode_angle_deg
@@ -119,6 +146,7 @@ class SpectralModel:
         self.cover = tuple(cover)
         self.counting = counting
         self.filter_materials = tuple(filter_materials)
+        self.correction = correction
         every = [*FIXED_PARAMETERS, *((ALTERNATIVE_SCINTILLATOR,) if self.alternative else ())]
         for material in self.filter_materials:
             every.append(attenuation_scale_name(material))
@@ -264,6 +292,8 @@ class SpectralModel:
         photons = np.exp(np.stack(factors, axis=1) @ np.stack(rows))
         photons *= _interpolate(_KV_ERRORS, nodes[:, :top], kV_error)
         photons *= self._inherent[:top]
+        if self.correction is not None:
+            photons *= np.exp(self.correction.at(beam.kV, top))
         return np.asarray(photons)
 
     def signal(

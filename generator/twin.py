@@ -12,9 +12,10 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from .effects.effect import AppliedEffect
+from .spectral_signal import SpectrumCorrection
 
 # reason codes of bad pixels; a pixel carries the first that applies
-BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5}
+BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,7 +131,7 @@ class SpectralPosterior:
     prior: name -> text; undetermined: directions that the data leave as wide as the prior, in words; anode,
     anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model; alternative:
     the scintillator of draws that have another one (where nobody declared it); level_discrepancy, gain_discrepancy: relative
-    sd of a single level and gain beyond the parameters.
+    sd of a single level and gain beyond the parameters; correction: of the tube model by measured spectra, if there were any.
     """
 
     names: tuple[str, ...]
@@ -150,6 +151,7 @@ class SpectralPosterior:
     calibrated_kV: tuple[float, float]
     calibrated_filters: tuple[str, ...]
     alternative: tuple[Filter, ...] = ()
+    correction: SpectrumCorrection | None = None
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Draws of one parameter (draw,)."""

@@ -13,6 +13,7 @@ from ..acquisition.setting import filters_from_text, text_from_filters
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from .effects import AppliedEffect, in_order
+from .spectral_signal import SpectrumCorrection
 from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
 
 FORMAT = "raytwin-twin"
@@ -108,6 +109,10 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
                 spectral.attrs[name] = getattr(posterior, name)
             for name in ("inherent", "scintillator", "alternative", "cover"):
                 spectral.attrs[name] = text_from_filters(getattr(posterior, name))
+            if posterior.correction is not None:
+                corrected = spectral.create_dataset("log_correction", data=posterior.correction.log_ratio)
+                corrected.attrs["kV"] = np.array(posterior.correction.kV)
+                corrected.attrs["relative"] = posterior.correction.relative
             spectral.attrs["calibrated_kV"] = np.array(posterior.calibrated_kV)
             spectral.attrs["calibrated_filters"] = json.dumps(list(posterior.calibrated_filters))
 
@@ -207,6 +212,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             inherent=filters_from_text(_text(attributes["inherent"])),
             scintillator=filters_from_text(_text(attributes["scintillator"])),
             alternative=filters_from_text(_text(attributes.get("alternative", ""))),
+            correction=_correction(group),
             cover=filters_from_text(_text(attributes["cover"])),
             counting=bool(attributes["counting"]),
             level_discrepancy=float(attributes["level_discrepancy"]),
@@ -253,6 +259,17 @@ def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:
     )
     in_order(effects)  # names the effects and parameters that it does not know
     return effects
+
+
+def _correction(group: Any) -> SpectrumCorrection | None:
+    if "log_correction" not in group:
+        return None
+    stored = group["log_correction"]
+    return SpectrumCorrection(
+        kV=tuple(float(value) for value in stored.attrs["kV"]),
+        log_ratio=np.asarray(stored[()], dtype=np.float64),
+        relative=bool(stored.attrs["relative"]),
+    )
 
 
 def _optional_float(group: Any, name: str) -> float | None:

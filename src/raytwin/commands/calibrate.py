@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
 from ._answer import answer, say
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol calibration --seed 1
   raytwin calibrate session.h5 -o twin.h5
+  raytwin calibrate session.h5 -o twin.h5 --spectrum tube_40kV.csv:40 --spectrum tube_90kV.csv:90
 """
 
 
@@ -21,6 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin calibrate`."""
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats and darks")
     parser.add_argument("-o", "--output", metavar="TWIN", type=Path, required=True, help="twin file to write")
+    parser.add_argument(
+        "--spectrum",
+        metavar="FILE:kV",
+        action="append",
+        default=[],
+        help="a measured spectrum of the tube (two columns: keV, fluence per keV) in place of the tube model; repeatable."
+        " At other voltages the model is scaled as at the nearest ones measured",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the posterior's draws (default 0)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
@@ -34,11 +44,21 @@ def run(arguments: argparse.Namespace) -> int:
     from ..calibration.calibrate import calibrate_twin, calibration_answer
     from ..files import sha256_of_file
     from ..generator.twin_io import write_twin
+    from ..spectra import spectrum_from_file
 
+    spectra = []
+    for text in arguments.spectrum:
+        file, colon, voltage = text.rpartition(":")
+        if not colon or not _is_number(voltage):
+            raise InputError(
+                "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
+            )
+        spectra.append(spectrum_from_file(file, kV=float(voltage)))
     with open_acquisition(arguments.acquisition) as acquisition:
         twin = calibrate_twin(
             acquisition,
             rng=np.random.default_rng(arguments.seed),
+            spectra=spectra,
             progress=_stage if sys.stderr.isatty() else None,
             provenance={
                 "acquisition_sha256": sha256_of_file(arguments.acquisition),
@@ -52,6 +72,13 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))
     return 0
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return float(text) > 0
+    except ValueError:
+        return False
 
 
 def _stage(name: str) -> None:

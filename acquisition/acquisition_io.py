@@ -35,6 +35,7 @@ KINDS = ("dark", "flat", "object", "afterglow")
 SCENE_KINDS = ("wedge", "slab", "edge", "disc", "product")
 CORRECTIONS = ("offset", "gain", "defects", "log")
 ROLES = ("calibration", "evaluation")
+PANEL_LAYERS = ("front", "back")
 PIECE_BYTES = 64 * 2**20
 
 _LARGEST_EXACT_FLOAT32 = 2**24
@@ -49,7 +50,8 @@ class Series:
     current_mA, power_W (None: unknown or beam off); filters; averaged (frames averaged into each one);
     frame_interval_ms; belt_speed_mm_s; panel_rotation_deg (counter-clockwise as the panel sees the source);
     source_object_mm and source_detector_mm (None: the instrument's); photons_per_pixel (None: not measured); scene
-    (empty: none); corrected (subset of `offset`, `gain`, `defects`, `log`; empty = raw); role (`calibration`,
+    (empty: none); layer (`front`, `back` of a dual-layer panel, or None); session (0, or its number where several were
+    merged); corrected (subset of `offset`, `gain`, `defects`, `log`; empty = raw); role (`calibration`,
     `evaluation`, or None for either); setting (None where kV or exposure is unknown); n_frames; shape (row, column);
     time_s (n_frames,) or None.
     """
@@ -78,6 +80,8 @@ class Series:
     time_s: NDArray[np.float64] | None
     _frames: Any
     _where: str
+    layer: str | None = None
+    session: int = 0
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -355,6 +359,11 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     role = text_attribute(node, "role", where=where) or None
     if role is not None and role not in ROLES:
         raise FileFormatError(f"{where}, attribute role", received=repr(role), expected="one of " + ", ".join(ROLES))
+    layer = text_attribute(node, "layer", where=where) or None
+    if layer is not None and layer not in PANEL_LAYERS:
+        raise FileFormatError(
+            f"{where}, attribute layer", received=repr(layer), expected="one of " + ", ".join(PANEL_LAYERS)
+        )
     index = whole_attribute(node, "index", where=where, lowest=0)
     return Series(
         name=name,
@@ -381,6 +390,7 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         time_s=_times(node, n_frames=int(frames.shape[0]), where=where),
         _frames=frames,
         _where=where,
+        layer=layer,
     )
 
 
@@ -609,6 +619,7 @@ class AcquisitionWriter:
         scene: str = "",
         corrected: Iterable[str] = (),
         role: str | None = None,
+        layer: str | None = None,
         time_s: NDArray[Any] | Sequence[float] | None = None,
     ) -> SeriesWriter:
         """Start a series, with its frames at once or with `append` on what is returned.
@@ -622,6 +633,7 @@ class AcquisitionWriter:
             chunk_frames: frames a chunk of the file holds; by default 1, more where frames are tiny.
             index: order in time; by default after the series added before.
             setting: the setting as one value; or the single attributes instead, each None where unknown.
+            layer: `front` or `back`, of a dual-layer panel.
             time_s: (n,) times of the frames in s, where they are known.
 
         Returns:
@@ -661,6 +673,7 @@ class AcquisitionWriter:
             "scene": scene or None,
             "corrected": "+".join(word for word in CORRECTIONS if word in words) or None,
             "role": role,
+            "layer": layer,
         }
         if setting is not None:
             attributes = _attributes_of(setting) | {

@@ -1,7 +1,7 @@
 """The instrument as its owner describes it. Everything is optional: None means unknown."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from ..errors import InputError
 from .setting import Filter
@@ -94,6 +94,26 @@ class Instrument:
     def dual_layer(self) -> bool:
         """A second sensitive layer behind the first takes an image of its own."""
         return bool(self.back_scintillator)
+
+    def of_layer(self, layer: str) -> "Instrument":
+        """The instrument as one layer of a dual-layer panel sees it: what lies before the back layer is its cover.
+
+        Raises:
+            InputError: another word than front or back, or a back layer that was not declared.
+        """
+        if layer == "front":
+            return self
+        if layer != "back" or not self.dual_layer:
+            raise InputError(
+                "layer",
+                received=layer,
+                expected="front" if not self.dual_layer else "front or back",
+                remedy="" if self.dual_layer else "declare the panel's back_scintillator to work with its back layer",
+            )
+        before = (*(self.detector_cover or ()), *(self.scintillator or ()), *(self.interlayer or ()))
+        return replace(
+            self, detector_cover=before, scintillator=self.back_scintillator, interlayer=None, back_scintillator=None
+        )
 
     @property
     def magnification(self) -> float | None:

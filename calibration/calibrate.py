@@ -26,6 +26,7 @@ def calibrate_twin(
     provenance: dict[str, Any] | None = None,
     advise: bool = True,
     spectra: Sequence[Spectrum] = (),
+    estimator: str = "pairs",
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
@@ -35,13 +36,14 @@ def calibrate_twin(
         progress: called with the name of each stage.
         provenance: kept in the twin.
         spectra: measured ones, in place of the tube model at their voltages.
+        estimator: variances from `pairs` of successive frames, or from the `stack` about its mean.
         advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
         InputError: the session cannot calibrate anything; the message says what is missing.
     """
     tell = progress or (lambda stage: None)
-    transfer = compute_photon_transfer(acquisition, progress=tell)
+    transfer = compute_photon_transfer(acquisition, estimator=estimator, progress=tell)
     warnings = list(transfer.warnings)
     evidence = dict(transfer.evidence)
     spectral = None

@@ -227,9 +227,7 @@ def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDA
     hemmed in by bad ones."""
     while True:
         neighbours = _bad_neighbours(code != 0)
-        taken = (code == 0) & (
-            ((neighbours > 0) & (closest > _CLUSTER_SHARE)) | (neighbours >= _CLUSTER_NEIGHBOURS)
-        )
+        taken = (code == 0) & (((neighbours > 0) & (closest > _CLUSTER_SHARE)) | (neighbours >= _CLUSTER_NEIGHBOURS))
         if not np.any(taken):
             return code
         code = np.where(taken, np.uint8(BAD_PIXEL_CODES["clustered"]), code)
@@ -470,14 +468,27 @@ def _photon_transfer(
     read_sd = fit.read_sd_DN2
     read_noise = _root_estimate(read_variance, read_sd)
     points = _points(sums, darks, good, covariances, groups, good_sums, usable, dropped)
-    read_map = _read_variance_map(darks, good, fit.read_variance_DN2)
-    gain_map = _gain_map(good_sums, usable, darks, good, fit, [groups[i] for i in range(len(good_sums))], read_map)
+    read_map, read_relative_sd = _read_variance_map(darks, good, fit.read_variance_DN2)
+    gain_map, gain_sd = _gain_map(
+        good_sums, usable, darks, good, fit, [groups[i] for i in range(len(good_sums))], read_map, estimator
+    )
     levels = _levels(acquisition, keys, good_sums, usable, darks, good, fit, groups, points, saturation)
     session = max((item.session for item in [*flats, *dark_series]), default=0)
     dark_estimate, reference_exposure = _dark_estimate(
         darks, good, session, [item.exposure_ms for item, _ in good_sums if item.session == session]
     )
     evidence = _evidence(points, fit, darks, covariances, groups, good, warnings)
+    evidence["estimator"] = estimator
+    evidence["clusters"] = cluster_evidence(bad)
+    evidence["maps"] = {
+        "gain_relative_sd": gain_sd,
+        "gain_relative_spread": float(np.std(gain_map[good])),
+        "read_variance_relative_sd": read_relative_sd,
+        "dark_sd_DN": _dark_map_sd(darks, good, session, reference_exposure),
+    }
+    sessions = _session_evidence(acquisition, sums, usable, good_sums, darks, good, warnings)
+    if sessions is not None:
+        evidence["sessions"] = sessions
     for point in points:
         if point.used and point.common_mode_percent > 0.3:
             warnings.append(
@@ -596,9 +607,7 @@ def _dark_estimate(
     exposure = candidates[0] if candidates else None
     mean = darks.at(session, exposure)
     integer = all(total.integer for _, total in darks.sums)
-    there = [
-        (item, total) for item, total in darks.sums if item.session == session and item.exposure_ms == exposure
-    ]
+    there = [(item, total) for item, total in darks.sums if item.session == session and item.exposure_ms == exposure]
     level = _median_of_means(mean[good], sum(total.frames for _, total in there), integer)
     repeats = [_median_of_means(total.mean_DN[good], total.frames, total.integer) for _, total in there]
     frames = sum(total.frames for _, total in there)
@@ -612,15 +621,30 @@ def _dark_estimate(
     return estimate_from_sd(level, max(sd, 1e-9)), exposure
 
 
-def _read_variance_map(darks: _Darks, good: NDArray[np.bool_], pooled: float) -> NDArray[np.float64]:
-    """Electronic and rounding variance per pixel (row, column), shrunk towards the pooled value, DN^2."""
+def _dark_map_sd(darks: _Darks, good: NDArray[np.bool_], session: int, exposure_ms: float | None) -> float | None:
+    """Standard deviation of one pixel of the dark frame (DN), from the frames it is the mean of."""
+    frames = sum(
+        total.frames * item.averaged
+        for item, total in darks.sums
+        if (item.session, item.exposure_ms) == (session, exposure_ms)
+    )
+    if frames == 0 or darks.effective < 1:
+        return None
+    return math.sqrt(max(float(np.mean(darks.variance[good])), 0.0) / frames)
+
+
+def _read_variance_map(
+    darks: _Darks, good: NDArray[np.bool_], pooled: float
+) -> tuple[NDArray[np.float64], float | None]:
+    """Electronic and rounding variance per pixel (row, column), shrunk towards the pooled value, DN^2; its relative
+    standard deviation in one pixel."""
     if darks.effective < 1 or not np.all(np.isfinite(darks.variance)):
-        return np.full(darks.per_ms.shape, max(pooled, 0.0))
+        return np.full(darks.per_ms.shape, max(pooled, 0.0)), None
     ratio = darks.variance / max(float(np.mean(darks.variance[good])), 1e-12)
     noise = 2.0 / darks.effective
     keep = _shrinkage(ratio[good], noise)
     result = max(pooled, 0.0) * (1.0 + keep * (ratio - 1.0))
-    return np.asarray(np.where(good, result, pooled * ratio))
+    return np.asarray(np.where(good, result, pooled * ratio)), math.sqrt(keep * noise)
 
 
 def _shrinkage(ratio: NDArray[np.float64], noise: float) -> float:
@@ -638,8 +662,10 @@ def _gain_map(
     fit: SpreadFit,
     groups: Sequence[int],
     read_map: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Gain of each pixel over the detector median (row, column), shrunk towards 1 as far as its own slope is noise."""
+    estimator: str,
+) -> tuple[NDArray[np.float64], float | None]:
+    """Gain of each pixel over the detector median (row, column), shrunk towards 1 as far as its own slope is noise, and
+    the standard deviation of one pixel's value: of noise s^2 and true spread t^2, s t / sqrt(s^2 + t^2)."""
     present = sorted({g for g, keep in zip(groups, usable, strict=False) if keep})
     renumbered = {old: new for new, old in enumerate(present)}
     numerator = np.zeros(good.shape)
@@ -653,16 +679,20 @@ def _gain_map(
         if slope <= 0 or typical <= 0:
             continue
         variance = slope * typical + fit.read_variance_DN2
-        weight = effective_frames(total.frames) * (slope * typical / variance) ** 2 / 2.0
-        ratio = (total.pair_variance_DN2 * item.averaged - read_map) / (slope * np.where(signal > 0, signal, np.nan))
+        stack = estimator == "stack"
+        effective = total.frames - 1.0 if stack else effective_frames(total.frames)
+        weight = effective * (slope * typical / variance) ** 2 / 2.0
+        own = total.stack_variance_DN2 if stack else total.pair_variance_DN2
+        ratio = (own * item.averaged - read_map) / (slope * np.where(signal > 0, signal, np.nan))
         numerator += weight * np.where(np.isfinite(ratio), ratio, 1.0)
         weight_sum += weight
     if weight_sum <= 0:
-        return np.ones(good.shape)
+        return np.ones(good.shape), None
     ratio = numerator / weight_sum
     ratio = ratio / float(np.median(ratio[good]))
     real = _shrinkage(ratio[good], 1.0 / weight_sum)
-    return np.asarray(np.where(good, np.clip(1.0 + real * (ratio - 1.0), 0.1, 10.0), 1.0))
+    gain_map = np.where(good, np.clip(1.0 + real * (ratio - 1.0), 0.1, 10.0), 1.0)
+    return np.asarray(gain_map), math.sqrt(real / weight_sum)
 
 
 def _points(
@@ -873,6 +903,61 @@ def _evidence(
         },
         "photon_transfer": [point.as_dict() for point in points],
     }
+
+
+def _session_evidence(
+    acquisition: AcquisitionFile,
+    sums: Sequence[tuple[Series, KeptSums, str]],
+    usable: Sequence[bool],
+    good_sums: Sequence[tuple[Series, KeptSums]],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+    warnings: list[str],
+) -> list[dict[str, Any]] | None:
+    """Per session: its series, dark levels, levels a mAs, and their change since the first session that has the same;
+    None for one session."""
+    numbers = sorted({item.session for item, *_ in [*sums, *darks.sums]})
+    if len(numbers) < 2:
+        return None
+    dark_first: dict[float | None, float] = {}
+    rate_first: dict[tuple[Any, ...], float] = {}
+    found = []
+    for number in numbers:
+        dark_change: dict[str, float] = {}
+        for key, mean in darks.by_exposure.items():
+            if key[0] == number:
+                level = float(np.median(mean[good]))
+                dark_change[f"{key[1]:g} ms" if key[1] is not None else "unknown"] = level - dark_first.setdefault(
+                    key[1], level
+                )
+        loads: dict[tuple[Any, ...], list[tuple[float, float]]] = {}
+        for (item, total), keep in zip(good_sums, usable, strict=False):
+            load = _load(item)
+            if keep and load is not None and item.session == number:
+                signal = float(np.median((total.mean_DN - darks.of(item))[good]))
+                loads.setdefault((*_group_key(item), item.source_detector_mm), []).append((signal, load))
+        level_change: dict[str, float] = {}
+        for beam, pairs in loads.items():
+            rate = sum(signal for signal, _ in pairs) / sum(load for _, load in pairs)
+            name = f"{beam[0]:g} kV" + "".join(f" {layer}" for layer in beam[1])
+            level_change[name] = 100.0 * (rate / rate_first.setdefault(beam, rate) - 1.0)
+        found.append(
+            {
+                "session": number,
+                "series": sum(item.session == number for item in acquisition.series),
+                "dark_change_DN": dark_change,
+                "level_change_percent": level_change,
+            }
+        )
+        largest = max(level_change.values(), key=abs, default=0.0)
+        if abs(largest) > 0.3:
+            warnings.append(f"session {number + 1}: levels changed by up to {largest:+.2g} % since the first session")
+        largest = max(dark_change.values(), key=abs, default=0.0)
+        if abs(largest) > 1.0:
+            warnings.append(
+                f"session {number + 1}: the dark level moved by {largest:+.3g} DN; each session has its own darks"
+            )
+    return found
 
 
 def _repeats(points: Sequence[SeriesPoint]) -> list[dict[str, Any]]:

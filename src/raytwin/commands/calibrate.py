@@ -6,6 +6,7 @@ Series whose role is `evaluation` are not looked at; `raytwin validate` compares
 
 import argparse
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,20 @@ from ._answer import answer, say
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol calibration --seed 1
   raytwin calibrate session.h5 -o twin.h5
+  raytwin calibrate monday.h5 tuesday.h5 -o twin.h5
   raytwin calibrate session.h5 -o twin.h5 --spectrum tube_40kV.csv:40 --spectrum tube_90kV.csv:90
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin calibrate`."""
-    parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats and darks")
+    parser.add_argument(
+        "acquisition",
+        metavar="ACQ",
+        type=Path,
+        nargs="+",
+        help="acquisition file with flats and darks; several are sessions of one line, each with its own darks",
+    )
     parser.add_argument("-o", "--output", metavar="TWIN", type=Path, required=True, help="twin file to write")
     parser.add_argument(
         "--spectrum",
@@ -30,6 +38,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a measured spectrum of the tube (two columns: keV, fluence per keV) in place of the tube model; repeatable."
         " At other voltages the model is scaled as at the nearest ones measured",
+    )
+    parser.add_argument(
+        "--estimator",
+        choices=("pairs", "stack"),
+        default="pairs",
+        help="variances from pairs of successive frames (default: slow drift leaves them alone) or from the stack about its"
+        " mean (lag lowers it less)",
+    )
+    parser.add_argument(
+        "--layer",
+        choices=("front", "back"),
+        help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the posterior's draws (default 0)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -41,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from .. import __version__
     from ..acquisition import open_acquisition
+    from ..acquisition.sessions import merge_sessions, select_layer
     from ..calibration.calibrate import calibrate_twin, calibration_answer
     from ..files import sha256_of_file
     from ..generator.twin_io import write_twin
@@ -54,14 +75,19 @@ def run(arguments: argparse.Namespace) -> int:
                 "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
             )
         spectra.append(spectrum_from_file(file, kV=float(voltage)))
-    with open_acquisition(arguments.acquisition) as acquisition:
+    with ExitStack() as stack:
+        opened = [stack.enter_context(open_acquisition(path)) for path in arguments.acquisition]
+        acquisition = merge_sessions(opened)
+        if arguments.layer is not None or any(item.layer == "back" for item in acquisition.series):
+            acquisition = select_layer(acquisition, arguments.layer or "front")
         twin = calibrate_twin(
             acquisition,
             rng=np.random.default_rng(arguments.seed),
             spectra=spectra,
+            estimator=arguments.estimator,
             progress=_stage if sys.stderr.isatty() else None,
             provenance={
-                "acquisition_sha256": sha256_of_file(arguments.acquisition),
+                "acquisition_sha256": "+".join(sha256_of_file(path) for path in arguments.acquisition),
                 "raytwin_version": __version__,
                 "seed": arguments.seed,
             },

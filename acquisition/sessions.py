@@ -1,0 +1,103 @@
+"""Several sessions of one detector as one acquisition, and one layer of a dual-layer panel's."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import InputError
+from .acquisition_io import AcquisitionFile, Scene, Series
+from .instrument import Instrument
+
+
+class _Several:
+    """Files that are closed together."""
+
+    def __init__(self, files: Sequence[Any]) -> None:
+        self._files = files
+
+    def close(self) -> None:
+        for file in self._files:
+            file.close()
+
+
+def merge_sessions(acquisitions: Sequence[AcquisitionFile]) -> AcquisitionFile:
+    """Sessions of one line, in the order given, as one acquisition; closing it closes them all.
+
+    Series keep their order in time within a session and know its number. Where a name of a series or scene comes again, the
+    later one is called `2.NAME`, after its session.
+
+    Raises:
+        InputError: no session, or instruments that contradict each other; what one leaves open the others may tell.
+    """
+    if not acquisitions:
+        raise InputError("sessions", received="none", expected="at least one acquisition")
+    if len(acquisitions) == 1:
+        return acquisitions[0]
+    series: list[Series] = []
+    scenes: dict[str, Scene] = {}
+    taken: set[str] = set()
+    instrument = acquisitions[0].instrument
+    for number, acquisition in enumerate(acquisitions):
+        instrument = _joined(instrument, acquisition.instrument, acquisition.path)
+        renamed = {name: _free(name, number, scenes) for name in acquisition.scenes}
+        scenes |= {renamed[name]: replace(scene, name=renamed[name]) for name, scene in acquisition.scenes.items()}
+        first = len(series)
+        for place, item in enumerate(acquisition.series):
+            name = _free(item.name, number, taken)
+            taken.add(name)
+            scene = renamed.get(item.scene, item.scene)
+            series.append(replace(item, name=name, index=first + place, scene=scene, session=number))
+    return AcquisitionFile(
+        path=" + ".join(acquisition.path for acquisition in acquisitions),
+        instrument=instrument,
+        series=tuple(series),
+        scenes=scenes,
+        attributes=MappingProxyType({}),
+        missing=tuple(dict.fromkeys(line for acquisition in acquisitions for line in acquisition.missing)),
+        _file=_Several([acquisition._file for acquisition in acquisitions]),
+    )
+
+
+def select_layer(acquisition: AcquisitionFile, layer: str) -> AcquisitionFile:
+    """The series of one layer of a dual-layer panel, with the instrument as that layer sees it.
+
+    Series that do not name their layer are the front's.
+
+    Raises:
+        InputError: no such layer was declared, or it has no series.
+    """
+    instrument = acquisition.instrument.of_layer(layer)
+    chosen = tuple(item for item in acquisition.series if (item.layer or "front") == layer)
+    if not chosen:
+        raise InputError(
+            "layer",
+            received=layer,
+            expected="a layer that series of the acquisition name",
+            remedy="give the series of the back image the attribute layer = back",
+        )
+    return replace(acquisition, instrument=instrument, series=chosen)
+
+
+def _free(name: str, number: int, taken: set[str] | dict[str, Scene]) -> str:
+    return f"{number + 1}.{name}" if name in taken else name
+
+
+def _joined(first: Instrument, second: Instrument, path: str) -> Instrument:
+    """What either tells of the instrument."""
+    told: dict[str, Any] = {}
+    for field in fields(Instrument):
+        one, other = getattr(first, field.name), getattr(second, field.name)
+        if one is not None and other is not None and one != other:
+            raise InputError(
+                f"{path}, instrument {field.name}",
+                received=_shown(other),
+                expected=f"{_shown(one)} as in the sessions before it",
+                remedy="calibrate sessions of different lines one by one",
+            )
+        told[field.name] = one if one is not None else other
+    return Instrument(**told)
+
+
+def _shown(value: Any) -> str:
+    return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)

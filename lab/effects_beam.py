@@ -285,7 +285,7 @@ def _object_scatter(request: EffectRequest, site: Site) -> Planted:
 
     def natural() -> list[float]:
         """Scatter over primary behind 20 mm of water, middle of the field, at each kV."""
-        water = np.full((system.rows, system.columns), WATER_MM, dtype=np.float32)
+        water = np.full((system.rows * SUBPIXELS, system.columns * SUBPIXELS), WATER_MM, dtype=np.float32)
         ratios = []
         for number, kV in enumerate(site.geometry.kVs):
             incidence = compute_incidence(system, kV=kV, filters=COPPER, materials=("water",))

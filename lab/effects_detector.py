@@ -181,9 +181,10 @@ def lag_of_signals(signals: Array, interval_s: Array, capture: Array) -> Array:
     return read
 
 
-def _session_signals(site: Site) -> tuple[Array, Array, int]:
+def _session_signals(site: Site, *, since: str | None) -> tuple[Array, Array, int]:
     """Relative signal and interval (s) of every frame up to the first beam-off one, and that frame's number.
 
+    Traps that came after the calibration have caught nothing before.
     A session without such a series stands for 50 frames at the longest exposure, then one without beam.
     """
     geometry, readout_ms = site.geometry, site.system.readout_ms
@@ -196,7 +197,7 @@ def _session_signals(site: Site) -> tuple[Array, Array, int]:
     for take in takes[: last + 1]:
         setting = take.setting
         level = 0.0
-        if take.kind == "flat":
+        if take.kind == "flat" and not (since == "calibration" and take.role == "calibration"):
             nominal_W = geometry.power_W[setting.kV, bool(setting.filters)]
             level = (setting.power_W or 0.0) / nominal_W * setting.exposure_ms / 100.0
         count = 1 if take is takes[last] else take.frames * setting.averaged
@@ -210,7 +211,7 @@ def _image_lag(request: EffectRequest, site: Site) -> Planted:
     power = float(site.rng.uniform(0.2, 0.8))
     times = np.asarray(TRAP_TIMES_S)
     share = times**-power / (times**-power).sum()
-    signals, intervals, off = _session_signals(site)
+    signals, intervals, off = _session_signals(site, since=request.since)
 
     def first_frame(capture: float) -> float:
         read = lag_of_signals(signals, intervals, capture * share)

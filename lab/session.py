@@ -48,6 +48,7 @@ EVALUATION_EXPOSURES_MS = (25.0, 100.0)
 SLAB_MM = 20.0
 AVERAGED = 50
 MAXIMUM_POWER_W = 1000.0
+OUTPUT_SPREAD_PERCENT = 0.03  # of the tube, from series to series at one setting
 _SMALL_FRAME_PIXELS = 256 * 256
 
 
@@ -100,7 +101,8 @@ class SessionTake:
     """One series of a session.
 
     Fields: name; kind; setting (of a dark or afterglow: exposure and `averaged` count); frames; role; scene (a name in
-    the plan, empty: open field); source_object_mm (None: the instrument's); panel_rotation_deg; pause_s before it.
+    the plan, empty: open field); source_object_mm (None: the instrument's); panel_rotation_deg; pause_s before it;
+    output (of the tube in this series over what was set: tubes do not repeat themselves exactly).
     """
 
     name: str
@@ -112,6 +114,7 @@ class SessionTake:
     source_object_mm: float | None = None
     panel_rotation_deg: float = 0.0
     pause_s: float = 1.0
+    output: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,7 +200,10 @@ class _Planner:
         while free in self._names:
             free, number = f"{name}_{number}", number + 1
         self._names.add(free)
-        self.takes.append(SessionTake(name=free, kind=kind, setting=setting, frames=max(frames, 1), **more))
+        output = 1.0 + OUTPUT_SPREAD_PERCENT / 100.0 * float(np.clip(self.rng.standard_normal(), -2.5, 2.5))
+        self.takes.append(
+            SessionTake(name=free, kind=kind, setting=setting, frames=max(frames, 1), output=output, **more)
+        )
 
     def setting(
         self, kV: float, exposure_ms: float, *, filtered: bool, load: float = 1.0, averaged: int = 1
@@ -612,11 +618,14 @@ def _measure(
             source_object_mm=take.source_object_mm,
             panel_rotation_deg=take.panel_rotation_deg,
         )
+        arrivals = replace(arrivals, load_mAs=arrivals.load_mAs * take.output)
         exposures = line.expose(arrivals, setting, frames=take.frames)
     for frame, began_s in exposures:
         sink.append(frame, time_s=began_s)
         advance()
     expected: dict[str, Any] = {"kind": take.kind}
+    if take.kind in ("flat", "object"):
+        expected["output"] = take.output
     if take.kind == "flat":
         # Of the line as it was calibrated; effects are told apart from it.
         expected |= flat_truth(line.base, line.base_maps, setting)

@@ -135,7 +135,7 @@ def test_a_cluster_takes_along_what_touches_it_and_is_half_bad(tmp_path):
     assert bad[alone] == BAD_PIXEL_CODES["good"]
     assert bad[hemmed] != BAD_PIXEL_CODES["good"]
     assert bad_pixel_counts(found)["clustered"] >= 1
-    assert found.evidence["clusters"] == {"groups": 2, "largest": 9, "kernel_pixels": 1}
+    assert found.evidence["clusters"] == {"groups": 2, "largest": 9, "kernel_pixels": 5}
 
 
 def test_clusters_are_counted_as_groups_that_touch():

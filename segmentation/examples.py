@@ -42,6 +42,22 @@ class Examples:
                 self._kept[number] = found
         return found
 
+    def at_epoch(self, epoch: int) -> "Examples":
+        """What an epoch sees: the same examples in all of them."""
+        return self
+
+
+class FreshExamples(Examples):
+    """Examples that are made anew for every epoch; without an epoch they are those of epoch 0, which are kept."""
+
+    def __init__(self, load: Callable[[int, int], Example], count: int, *, cache_bytes: int = CACHE_BYTES) -> None:
+        super().__init__(lambda number: load(number, 0), count, cache_bytes=cache_bytes)
+        self._load_at = load
+
+    def at_epoch(self, epoch: int) -> Examples:
+        """Examples of one epoch; none is kept, for none comes again."""
+        return Examples(lambda number: self._load_at(number, epoch), len(self), cache_bytes=0)
+
 
 def examples_from_arrays(
     images: NDArray[Any],
@@ -83,20 +99,30 @@ def examples_from_arrays(
 
 
 def examples_from_dataset(
-    dataset: "Dataset", numbers: Sequence[int] | NDArray[np.intp], *, recipe: Recipe, cache_bytes: int = CACHE_BYTES
+    dataset: "Dataset",
+    numbers: Sequence[int] | NDArray[np.intp],
+    *,
+    recipe: Recipe,
+    cache_bytes: int = CACHE_BYTES,
+    fresh: Callable[[int, int], NDArray[Any]] | None = None,
 ) -> Examples:
     """Examples of the pairs of a dataset file, by their numbers; the file must stay open.
+
+    `fresh`, called with an image's number and the epoch, gives its log images (2, row, column) in place of the file's.
 
     Raises (when an example is read):
         FileFormatError: an image that cannot be read or is not finite.
     """
     wanted = [int(number) for number in numbers]
 
-    def load(position: int) -> Example:
+    def load(position: int, epoch: int = 0) -> Example:
         number = wanted[position]
         product = dataset.product_masks(number) if PRODUCT in recipe.classes else None
-        return _example(dataset.images(number), dataset.foreign_object_masks(number), product, recipe)
+        image = dataset.images(number) if fresh is None else fresh(number, epoch)
+        return _example(image, dataset.foreign_object_masks(number), product, recipe)
 
+    if fresh is not None:
+        return FreshExamples(load, len(wanted), cache_bytes=cache_bytes)
     return Examples(load, len(wanted), cache_bytes=cache_bytes)
 
 

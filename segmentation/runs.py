@@ -1,6 +1,6 @@
 """Networks on a dataset file: train a folder of them, and try every one of them on every image."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +88,8 @@ def train_networks(
     seed: int = 0,
     device: str = "cpu",
     start_from: "str | os.PathLike[str] | None" = None,
+    fresh: Callable[[int, int], NDArray[Any]] | None = None,
+    fresh_noise: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> list[NetworkResult]:
@@ -101,6 +103,9 @@ def train_networks(
         seed: of the randomness.
         device: torch device (see `choose_device`).
         start_from: weights.pt or RUNS folder whose network(s) to start from instead of random weights.
+        fresh: called with an image's number and the epoch, gives its log images (2, row, column) with noise of that epoch;
+            validation images are those of epoch 0 throughout. None takes the file's images.
+        fresh_noise: what decides `fresh`, kept with the folder so that it is not gone on with by other images.
         progress: called after every epoch.
         warn: called with what the user should know (a made-up split, an unreadable state).
 
@@ -123,10 +128,10 @@ def train_networks(
     starts = {number: _starting_weights(path, recipe) for number, path in started_from.items()}
     hashes = {number: sha256_of_file(path) for number, path in started_from.items()}
     configuration = make_configuration(
-        recipe, seed=seed, dataset_sha256=sha256_of_file(dataset.path), started_from=hashes
+        recipe, seed=seed, dataset_sha256=sha256_of_file(dataset.path), started_from=hashes, fresh_noise=fresh_noise
     )
-    train_examples = examples_from_dataset(dataset, train, recipe=recipe)
-    validation_examples = examples_from_dataset(dataset, validation, recipe=recipe)
+    train_examples = examples_from_dataset(dataset, train, recipe=recipe, fresh=fresh)
+    validation_examples = examples_from_dataset(dataset, validation, recipe=recipe, fresh=fresh)
     if all(train_examples[number][1][-1].any() for number in range(len(train_examples))):
         say("no training image is without a foreign object: expect false alarms on clean products")
     runs = create_or_resume_runs(runs_path, configuration)

@@ -67,7 +67,12 @@ class NetworkResult:
 
 
 def make_configuration(
-    recipe: Recipe, *, seed: int, dataset_sha256: str, started_from: Mapping[int, str] | None = None
+    recipe: Recipe,
+    *,
+    seed: int,
+    dataset_sha256: str,
+    started_from: Mapping[int, str] | None = None,
+    fresh_noise: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What decides the weights of the networks of a folder.
 
@@ -76,6 +81,7 @@ def make_configuration(
         seed: of the randomness.
         dataset_sha256: what on.
         started_from: hash of the weights that networks start from; key -1 stands for one shared by all.
+        fresh_noise: where the noise of the images comes from, where it is drawn anew for every epoch.
     """
     return {
         "format": FORMAT,
@@ -84,6 +90,7 @@ def make_configuration(
         "seed": seed,
         "dataset_sha256": dataset_sha256,
         "started_from": {str(number): digest for number, digest in (started_from or {}).items()},
+        **({} if fresh_noise is None else {"fresh_noise": dict(fresh_noise)}),
     }
 
 
@@ -138,7 +145,7 @@ def create_or_resume_runs(path: str | os.PathLike[str], configuration: Mapping[s
             raise InputError(
                 str(path),
                 received="a folder of networks that differ in " + "; ".join(different),
-                expected="the same dataset, recipe, seed and starting weights for all networks of a folder",
+                expected="the same dataset, recipe, seed, noise and starting weights for all networks of a folder",
                 remedy="give another folder with -o, or the same options as before",
             )
         return runs
@@ -305,7 +312,7 @@ def starting_weights_files(path: str | os.PathLike[str], networks: Iterable[int]
 
 def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     different = []
-    for key in ("dataset_sha256", "seed", "started_from"):
+    for key in ("dataset_sha256", "seed", "started_from", "fresh_noise"):
         if held.get(key) != wanted.get(key):
             different.append(f"{key} ({_short(held.get(key))} there, {_short(wanted.get(key))} now)")
     old, new = held["recipe"], wanted["recipe"]
@@ -318,6 +325,8 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
 
 
 def _short(value: object) -> str:
+    if value is None:
+        return "nothing"
     if isinstance(value, Mapping):
         return " ".join(_short(item) for item in value.values()) or "nothing"
     text = str(value)

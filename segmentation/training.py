@@ -147,7 +147,7 @@ def iterate_training(
             loss = _train_epoch(
                 network,
                 optimizer,
-                train,
+                train.at_epoch(epoch),
                 recipe=recipe,
                 generator=np.random.default_rng([seed, network_number, epoch]),
                 device=device,

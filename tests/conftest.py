@@ -98,3 +98,98 @@ def series_line():
         evidence={},
         warnings=(),
     )
+
+
+@pytest.fixture(scope="session")
+def make_model_twin():
+    """A twin set by hand whose measured levels, 40 and 90 kV behind 50 um Cu, are those of its own spectral model.
+
+    Called with the detector's shape and what its instrument has otherwise than the paper's. The spread is 0.5 px, the
+    white part 0.01, the electronic noise 12 DN, the dark 1200 DN.
+    """
+    import math
+    from dataclasses import replace
+
+    import numpy as np
+
+    from raytwin.acquisition import Setting
+    from raytwin.acquisition.instrument import Instrument
+    from raytwin.acquisition.setting import filters_from_text
+    from raytwin.generator.predict import predict_flatfield
+    from raytwin.generator.psf import blur_variance_share
+    from raytwin.generator.spectral_signal import SpectralModel
+    from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, SpectralPosterior, Twin, estimate_from_sd
+
+    copper, scintillator = filters_from_text("Cu:0.05"), filters_from_text("CsI:0.5")
+    sigma_px, white, read_DN = 0.5, 0.01, 12.0
+    model = SpectralModel(filter_materials=("Al", "Cu"))
+    best = model.default_parameters()
+    values = {"inherent_filtration_mm_Al": 0.8, "log_DN_per_keV": math.log(0.2), "log_swank": math.log(0.9)}
+    for name, value in values.items():
+        best[model.names.index(name)] = value
+    spectral = SpectralPosterior(
+        names=model.names,
+        samples=np.repeat(best[None], 8, axis=0),
+        best=best,
+        prior={},
+        undetermined=(),
+        anode="W",
+        anode_angle_deg=12.0,
+        model="casim",
+        inherent=(),
+        scintillator=scintillator,
+        cover=(),
+        counting=False,
+        level_discrepancy=0.003,
+        gain_discrepancy=0.01,
+        calibrated_kV=(40.0, 90.0),
+        calibrated_filters=("Cu:0.05",),
+    )
+    share = (blur_variance_share("aperture", sigma_px) + white) / (1 + white)
+
+    def make(shape, **instrument):
+        line = {"pixel_mm": 0.15, "source_object_mm": 990.0, "source_detector_mm": 1059.0, **instrument}
+        bare = Twin(
+            instrument=Instrument(anode="W", scintillator=scintillator, bits=16, counting=False, **line),
+            maps=DetectorMaps(
+                dark_DN=np.full(shape, 1200.0, dtype=np.float32),
+                dark_exposure_ms=20.0,
+                dark_DN_per_ms=np.zeros(shape, dtype=np.float32),
+                gain_relative=np.ones(shape, dtype=np.float32),
+                read_variance_DN2=np.full(shape, read_DN**2 + 1 / 12, dtype=np.float32),
+                bad_pixels=np.zeros(shape, dtype=np.uint8),
+            ),
+            noise=NoiseModel(
+                psf_model="aperture",
+                psf_sigma_px=estimate_from_sd(sigma_px, 0.003),
+                white_fraction=white,
+                read_noise_DN=estimate_from_sd(read_DN, 0.05),
+                quantised=True,
+            ),
+            dark_DN=estimate_from_sd(1200.0, 0.1),
+            levels=(),
+            spectral=spectral,
+            evidence={},
+            warnings=(),
+        )
+        levels = []
+        for kV in (40.0, 90.0):
+            setting = Setting(kV=kV, current_mA=1.0, exposure_ms=1000.0, filters=copper)
+            predicted = predict_flatfield(bare, setting)
+            levels.append(
+                Level(
+                    kV=kV,
+                    filters=copper,
+                    gain_DN=predicted.gain_DN,
+                    photon_transfer_slope_DN=estimate_from_sd(share * predicted.gain_DN.value, 0.01),
+                    rate_DN_per_mAs=predicted.mean_DN,
+                    source_detector_mm=line["source_detector_mm"],
+                    saturation_DN=None,
+                    flat_shape=np.ones(shape, dtype=np.float32),
+                    series=(f"flat_{kV:g}",),
+                    role="calibration",
+                )
+            )
+        return replace(bare, levels=tuple(levels))
+
+    return make

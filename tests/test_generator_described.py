@@ -12,18 +12,17 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
 from raytwin.acquisition import Setting, read_dataset
-from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.cli import main
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.describe import read_description, read_thickness_map, sample_individual, sample_scene
 from raytwin.generator.generate_described import DescribedScenes, generate_from_description
 from raytwin.generator.kinds import KINDS
-from raytwin.generator.predict import predict_flatfield, spectral_model_of
+from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
 from raytwin.generator.render import Geometry, geometry_of, render_expected
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, SpectralPosterior, Twin, estimate_from_sd
+from raytwin.generator.spectral_signal import OpenBeam
+from raytwin.generator.twin import estimate_from_sd
 from raytwin.generator.twin_io import write_twin
 
 SHAPE = (64, 80)
@@ -63,73 +62,8 @@ where = "on"
 
 
 @pytest.fixture(scope="module")
-def twin():
-    model = SpectralModel(filter_materials=("Cu",))
-    best = model.default_parameters()
-    best[model.names.index("log_DN_per_keV")] = math.log(0.2)
-    best[model.names.index("log_swank")] = math.log(0.9)
-    spectral = SpectralPosterior(
-        names=model.names,
-        samples=np.repeat(best[None], 8, axis=0),
-        best=best,
-        prior={},
-        undetermined=(),
-        anode="W",
-        anode_angle_deg=12.0,
-        model="casim",
-        inherent=(),
-        scintillator=filters_from_text("CsI:0.5"),
-        cover=(),
-        counting=False,
-        level_discrepancy=0.003,
-        gain_discrepancy=0.01,
-        calibrated_kV=(40.0, 90.0),
-        calibrated_filters=("Cu:0.05",),
-    )
-    bare = Twin(
-        instrument=Instrument(
-            anode="W", pixel_mm=0.45, source_object_mm=2970.0, source_detector_mm=3177.0, bits=16, counting=False
-        ),
-        maps=DetectorMaps(
-            dark_DN=np.full(SHAPE, 1200.0, dtype=np.float32),
-            dark_exposure_ms=20.0,
-            dark_DN_per_ms=np.zeros(SHAPE, dtype=np.float32),
-            gain_relative=np.ones(SHAPE, dtype=np.float32),
-            read_variance_DN2=np.full(SHAPE, READ**2 + 1 / 12, dtype=np.float32),
-            bad_pixels=np.zeros(SHAPE, dtype=np.uint8),
-        ),
-        noise=NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(SIGMA, 0.003),
-            white_fraction=WHITE,
-            read_noise_DN=estimate_from_sd(READ, 0.05),
-            quantised=True,
-        ),
-        dark_DN=estimate_from_sd(1200.0, 0.1),
-        levels=(),
-        spectral=spectral,
-        evidence={},
-        warnings=(),
-    )
-    levels = []
-    share = (blur_variance_share("aperture", SIGMA) + WHITE) / (1 + WHITE)
-    for kV in (40.0, 90.0):
-        predicted = predict_flatfield(bare, Setting(kV=kV, current_mA=1.0, exposure_ms=1000.0, filters=COPPER))
-        levels.append(
-            Level(
-                kV=kV,
-                filters=COPPER,
-                gain_DN=predicted.gain_DN,
-                photon_transfer_slope_DN=estimate_from_sd(share * predicted.gain_DN.value, 0.01),
-                rate_DN_per_mAs=predicted.mean_DN,
-                source_detector_mm=3177.0,
-                saturation_DN=None,
-                flat_shape=np.ones(SHAPE, dtype=np.float32),
-                series=("flat",),
-                role="calibration",
-            )
-        )
-    return replace(bare, levels=tuple(levels))
+def twin(make_model_twin):
+    return make_model_twin(SHAPE, pixel_mm=0.45, source_object_mm=2970.0, source_detector_mm=3177.0)
 
 
 def described(folder, text):

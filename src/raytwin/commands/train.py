@@ -3,6 +3,9 @@
 Networks are numbered from 0 and differ in their random numbers. A run that was stopped goes on with the same command:
 at most one epoch is lost. A folder holds networks of one dataset, recipe, seed and start; asking for more networks than
 it has adds to them. The validation images decide which epoch's weights are kept (lowest loss).
+
+With --fresh-noise DATASET holds reference images, and every epoch sees them with noise of its own at a setting: a network never
+sees the same noise twice.
 """
 
 import argparse
@@ -13,11 +16,18 @@ from ..errors import InputError
 from ._answer import answer, say
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..segmentation import EpochResult, NetworkResult, Recipe
 
 EXAMPLE = """example:
   raytwin train images.h5 -o networks --networks 5 --seed 1
   raytwin train images_20ms.h5 -o networks_20ms --start-from networks
+  raytwin train references.h5 -o fresh_20ms --fresh-noise twin.h5 \
+    --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
 """
 
 
@@ -48,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="none",
         help="start the encoder from ImageNet (downloaded once) instead of random weights",
     )
+    parser.add_argument("--fresh-noise", metavar="TWIN", help="twin that draws other noise for every epoch")
+    parser.add_argument("--low", metavar="SETTING", help="with --fresh-noise: target setting at the low kV")
+    parser.add_argument("--high", metavar="SETTING", help="the same at the high kV")
     parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
     parser.add_argument("--threads", type=int, help="processor threads (all)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -61,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..segmentation import choose_device, train_networks
 
     recipe = _recipe(arguments)
+    fresh, fresh_noise = _fresh(arguments)
     set_threads(arguments.threads)
     device = choose_device(arguments.device)
     with read_dataset(arguments.dataset) as dataset, tqdm(disable=None, unit="epoch") as bar:
@@ -83,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             device=device,
             start_from=arguments.start_from,
+            fresh=fresh,
+            fresh_noise=fresh_noise,
             progress=progress,
             warn=say,
         )
@@ -93,6 +109,38 @@ def run(arguments: argparse.Namespace) -> int:
         text=f"{arguments.output}: {len(results)} networks\n" + "\n".join(map(_line, results)),
     )
     return 0
+
+
+def _fresh(
+    arguments: argparse.Namespace,
+) -> "tuple[Callable[[int, int], NDArray[np.float32]] | None, dict[str, Any] | None]":
+    """What makes the images of an epoch, and what decides them."""
+    given = (arguments.fresh_noise, arguments.low, arguments.high)
+    if given == (None, None, None):
+        return None, None
+    if None in given:
+        raise InputError(
+            "--fresh-noise",
+            received="only a part of --fresh-noise, --low and --high",
+            expected="all three: a twin and the two settings to train for",
+        )
+    from ..acquisition import setting_from_text
+    from ..files import sha256_of_file
+    from ..generator.fresh import FreshReferences
+    from ..generator.twin_io import read_twin
+
+    low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
+    source = FreshReferences(
+        read_twin(arguments.fresh_noise), arguments.dataset, low=low, high=high, seed=arguments.seed
+    )
+    for line in source.warnings:
+        say(f"warning: {line}")
+
+    def images(number: int, epoch: int) -> "NDArray[np.float32]":
+        return source.example(number, epoch=epoch).log_images
+
+    decided_by = {"twin_sha256": sha256_of_file(arguments.fresh_noise), "low": str(low), "high": str(high)}
+    return images, decided_by
 
 
 def set_threads(threads: int | None) -> None:

@@ -1,0 +1,199 @@
+"""Images made when asked for: their noise is decided by seed, epoch and position, in whatever process they are made."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import Setting, read_dataset
+from raytwin.acquisition.dataset_io import DatasetRow, write_dataset
+from raytwin.acquisition.setting import filters_from_text
+from raytwin.campaign.fresh_noise import EpochSampler, FreshNoiseDataset
+from raytwin.cli import main
+from raytwin.errors import InputError
+from raytwin.generator.describe import read_description
+from raytwin.generator.fresh import FreshReferences, FreshScenes
+from raytwin.generator.generate import generate_dataset
+from raytwin.generator.twin_io import write_twin
+from raytwin.segmentation import RECIPES
+from raytwin.segmentation.examples import examples_from_dataset
+
+SHAPE = (32, 48)
+COPPER = filters_from_text("Cu:0.05")
+REFERENCE = (
+    Setting(kV=40.0, power_W=40.0, exposure_ms=100.0, filters=COPPER, averaged=10),
+    Setting(kV=90.0, power_W=45.0, exposure_ms=100.0, filters=COPPER, averaged=10),
+)
+LOW, HIGH = (replace(one, exposure_ms=20.0, averaged=1) for one in REFERENCE)
+
+
+@pytest.fixture(scope="module")
+def twin(make_model_twin):
+    return make_model_twin(SHAPE)
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    path = tmp_path_factory.mktemp("fresh") / "references.h5"
+    rng = np.random.default_rng(0)
+    with write_dataset(path, shape=SHAPE) as writer:
+        for number in range(6):
+            foreign = np.zeros(SHAPE, dtype=bool)
+            if number % 3:
+                foreign[10:16, 12:22] = True
+            image = np.stack([0.5 + 0.2 * foreign, 0.3 + 0.08 * foreign]) + 0.005 * rng.standard_normal((2, *SHAPE))
+            writer.append(
+                image=image.astype(np.float32),
+                foreign_object_mask=foreign,
+                product_mask=np.ones(SHAPE),
+                row=DatasetRow(
+                    image=f"r{number}",
+                    product=f"p{number}",
+                    foreign_object="bone" if number % 3 else "",
+                    split="val" if number > 3 else "train",
+                    setting=f"{REFERENCE[0]};{REFERENCE[1]}",
+                ),
+            )
+    return path
+
+
+def source(twin, references, **options):
+    return FreshReferences(twin, references, **{"low": LOW, "high": HIGH, "seed": 3, **options})
+
+
+def test_the_same_epoch_is_the_same_image_and_another_epoch_another_noise(twin, references):
+    first, again = source(twin, references), source(twin, references)
+    one = first.example(2, epoch=4)
+    np.testing.assert_array_equal(one.log_images, again.example(2, epoch=4).log_images)
+    seen = [first.example(2, epoch=epoch).log_images for epoch in range(4)]
+    for number, image in enumerate(seen):
+        for other in seen[number + 1 :]:
+            noise = np.corrcoef(image[0].ravel() - 0.5, other[0].ravel() - 0.5)[0, 1]
+            assert not np.array_equal(image, other)
+            assert abs(noise) < 0.9
+    assert not np.array_equal(one.log_images, source(twin, references, seed=4).example(2, epoch=4).log_images)
+
+
+def test_fresh_noise_is_that_of_a_generated_dataset(tmp_path, twin, references):
+    with read_dataset(references) as dataset:
+        generate_dataset(twin, dataset, tmp_path / "g.h5", low=LOW, high=HIGH, images=48, seed=1)
+    with read_dataset(tmp_path / "g.h5") as made:
+        written = made.images(slice(None))[:, :, :8].std(axis=(0, 2, 3))
+    fresh = source(twin, references)
+    drawn = np.stack([fresh.example(number % 6, epoch=number // 6).log_images for number in range(48)])
+    np.testing.assert_allclose(drawn[:, :, :8].std(axis=(0, 2, 3)), written, rtol=5 * np.sqrt(3 / (2 * 48 * 8 * 48)))
+
+
+def test_a_pickled_source_makes_the_same_images(twin, references):
+    fresh = source(twin, references)
+    image = fresh.example(1, epoch=2).log_images
+    again = pickle.loads(pickle.dumps(fresh))
+    np.testing.assert_array_equal(again.example(1, epoch=2).log_images, image)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_any_number_of_workers_makes_the_same_images(twin, references, workers):
+    torch = pytest.importorskip("torch")
+    dataset = FreshNoiseDataset(source(twin, references))
+    sampler = EpochSampler(dataset, seed=5)
+    loader = torch.utils.data.DataLoader(
+        dataset, batch_size=3, sampler=sampler, num_workers=workers, persistent_workers=workers > 0
+    )
+    epochs = [[images.numpy() for images, _ in loader] for _ in range(2)]
+    for epoch, batches in enumerate(epochs):
+        order = np.random.default_rng([5, epoch]).permutation(6)
+        expected = np.stack([dataset[epoch, int(position)][0] for position in order])
+        np.testing.assert_array_equal(np.concatenate(batches), expected)
+    assert sampler.epoch == 2
+
+
+def test_items_by_position_follow_the_epoch_that_was_set(twin, references):
+    dataset = FreshNoiseDataset(source(twin, references))
+    assert len(dataset) == 6
+    dataset.set_epoch(3)
+    image, masks = dataset[4]
+    np.testing.assert_array_equal(image, dataset[3, 4][0])
+    np.testing.assert_array_equal(dataset[-2][0], image)
+    assert masks.shape == (2, *SHAPE)
+    assert masks[1].sum() == 60
+    with pytest.raises(IndexError):
+        dataset[6]
+    with pytest.raises(InputError, match="0 or more"):
+        dataset.set_epoch(-1)
+
+
+def test_a_transform_has_randomness_of_its_own_that_repeats(twin, references):
+    def shifted(image, masks, rng):
+        step = int(rng.integers(5))
+        return np.roll(image, step, axis=2), np.roll(masks, step, axis=2)
+
+    dataset = FreshNoiseDataset(source(twin, references), transform=shifted, seed=2)
+    first = dataset[1, 1]
+    np.testing.assert_array_equal(first[0], dataset[1, 1][0])
+    columns = {int(np.flatnonzero(dataset[epoch, 1][1][1].any(axis=0))[0]) for epoch in range(12)}
+    assert len(columns) > 2
+
+
+def test_a_sampler_shows_every_image_once_an_epoch_and_can_go_on(twin, references):
+    dataset = FreshNoiseDataset(source(twin, references))
+    sampler = EpochSampler(dataset, seed=1)
+    passes = [list(sampler) for _ in range(3)]
+    for epoch, items in enumerate(passes):
+        assert sorted(items) == [(epoch, position) for position in range(6)]
+    assert [position for _, position in passes[0]] != [position for _, position in passes[1]]
+    assert list(EpochSampler(dataset, seed=1, first_epoch=2)) == passes[2]
+    assert list(EpochSampler(dataset, shuffle=False)) == [(0, position) for position in range(6)]
+
+
+def test_scenes_of_a_description_are_new_in_every_epoch_unless_asked_otherwise(tmp_path, twin):
+    path = tmp_path / "d.toml"
+    path.write_text(
+        '[[product]]\nshape = "ellipsoid"\nmaterial = "water"\nlength_mm = [3, 4]\nwidth_mm = [2, 3]\nheight_mm = [3, 5]\n'
+    )
+    description = read_description(path)
+    options = {"images": 2, "low": LOW, "high": HIGH, "seed": 1}
+    moving = FreshScenes(twin, description, **options)
+    still = FreshScenes(twin, description, new_scenes=False, **options)
+    assert len(moving) == 2
+    assert not np.array_equal(moving.example(0, epoch=0).product_mask, moving.example(0, epoch=1).product_mask)
+    first, second = (still.example(0, epoch=epoch) for epoch in (0, 1))
+    np.testing.assert_array_equal(first.product_mask, second.product_mask)
+    assert not np.array_equal(first.log_images, second.log_images)
+    np.testing.assert_array_equal(first.log_images, moving.example(0, epoch=0).log_images)
+
+
+def test_examples_of_an_epoch_come_from_the_source_and_validation_stays_the_same(twin, references):
+    fresh = source(twin, references)
+    calls = []
+
+    def images(number, epoch):
+        calls.append((number, epoch))
+        return fresh.example(number, epoch=epoch).log_images
+
+    with read_dataset(references) as dataset:
+        examples = examples_from_dataset(dataset, [1, 2], recipe=RECIPES["raytwin"], fresh=images)
+        first, second = examples.at_epoch(1)[0][0], examples.at_epoch(2)[0][0]
+        assert not np.array_equal(first, second)
+        np.testing.assert_array_equal(examples[0][0], examples[0][0])
+        assert calls == [(1, 1), (1, 2), (1, 0)]
+        plain = examples_from_dataset(dataset, [1, 2], recipe=RECIPES["raytwin"])
+        assert plain.at_epoch(5) is plain
+
+
+def test_train_draws_noise_anew_and_goes_on_only_with_the_same_source(tmp_path, twin, references, capsys):
+    pytest.importorskip("segmentation_models_pytorch")
+    write_twin(tmp_path / "twin.h5", twin)
+    words = ["train", str(references), "-o", str(tmp_path / "runs"), "--epochs", "1", "--batch", "2", "--threads", "1"]
+    words += ["--json", "--device", "cpu"]
+    fresh = ["--fresh-noise", str(tmp_path / "twin.h5"), "--low", str(LOW), "--high", str(HIGH)]
+    assert main([*words, *fresh]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["networks"][0]["epochs"] == 1
+    held = json.loads((tmp_path / "runs" / "run.json").read_text())
+    assert held["fresh_noise"]["low"] == str(LOW)
+    assert main(words) == 2
+    assert "fresh_noise" in capsys.readouterr().err
+    assert main([*words, "--fresh-noise", str(tmp_path / "twin.h5")]) == 2
+    assert "all three" in capsys.readouterr().err

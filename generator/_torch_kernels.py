@@ -1,0 +1,252 @@
+"""The noise of detector frames in torch: the words of the compiled loops, on whatever device torch has.
+
+Same random words, same expansions, other rounding: frames agree with the compiled ones but for the last bits of the
+normal numbers (one pixel in some ten thousand takes the next whole quantum).
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ._noise_constants import (
+    EXPANSION_FROM,
+    MIX_64,
+    MULTIPLIERS,
+    STAGE_ELECTRONICS,
+    STAGE_FIRST_DEPOSIT,
+    STAGE_QUANTA,
+    STAGE_SECOND_DEPOSIT,
+    STEP_64,
+    STRIDE,
+)
+
+if TYPE_CHECKING:
+    from .kernels import _Frames
+
+_PIXELS_AT_ONCE = 2**24  # frames of a stack are taken together up to this many: some 60 bytes a pixel
+
+
+def torch_device(device: str | None) -> Any:
+    """The torch device of a name; None: cuda where there is one, else the processor.
+
+    Raises:
+        InputError: torch does not have it here.
+    """
+    import torch
+
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        found = torch.device(device)
+        torch.empty(1, device=found)
+    except (RuntimeError, AssertionError) as problem:
+        raise InputError(
+            "device",
+            received=device,
+            expected="a device that torch has here, for example cpu or cuda",
+            remedy=str(problem).splitlines()[0],
+        ) from problem
+    return found
+
+
+def _signed(value: int, bits: int) -> int:
+    value &= 2**bits - 1
+    return value - 2**bits if value >= 2 ** (bits - 1) else value
+
+
+def _shifted(word: Any, by: int, bits: int = 32) -> Any:
+    """Logical shift to the right of signed words."""
+    return (word >> by) & (2 ** (bits - by) - 1)
+
+
+def _mixed(word: Any) -> Any:
+    word = (word ^ _shifted(word, 30, 64)) * _signed(MIX_64[0], 64)
+    word = (word ^ _shifted(word, 27, 64)) * _signed(MIX_64[1], 64)
+    return word ^ _shifted(word, 31, 64)
+
+
+def row_keys(key: int, frames: Any, stage: int, rows: int) -> Any:
+    """Four 32-bit keys (4, frame, row, 1) of every row of `frames` (frame,) int64."""
+    import torch
+
+    step = _signed(STEP_64, 64)
+    start = torch.tensor(_signed(key + STEP_64, 64), dtype=torch.int64, device=frames.device)
+    of_frame = _mixed(_mixed(start) + frames)[:, None]
+    row = torch.arange(rows, dtype=torch.int64, device=frames.device)[None, :]
+    stream = _mixed(of_frame + (row * 8 + stage))
+    other = _mixed(stream + step)
+    keys = torch.stack([stream, _shifted(stream, 32, 64), other, _shifted(other, 32, 64)])
+    return keys.to(torch.int32)[..., None]  # the low 32 bits
+
+
+def random_words(keys: Any, columns: int) -> Any:
+    """Random words (frame, row, columns) int32 from the keys of the rows."""
+    import torch
+
+    first, second, third = (_signed(value, 32) for value in MULTIPLIERS)
+    x = torch.arange(columns, dtype=torch.int32, device=keys.device) * _signed(STRIDE, 32) + keys[0]
+    x = x ^ _shifted(x, 17)
+    x = (x * first) ^ keys[1]
+    x = x ^ _shifted(x, 11)
+    x = x * second + keys[2]
+    x = x ^ _shifted(x, 15)
+    x = (x * third) ^ keys[3]
+    return x ^ _shifted(x, 14)
+
+
+def _unsigned(words: Any, dtype: Any) -> Any:
+    """Words as numbers from 0 to 2^32, rounded once."""
+    return _shifted(words, 16).to(dtype) * 65536.0 + (words & 0xFFFF).to(dtype)
+
+
+def normals(words: Any) -> Any:
+    """Independent normal numbers (..., 2 half) of words (..., 2 half) (Box and Muller)."""
+    import torch
+
+    half = words.shape[-1] // 2
+    radius = torch.sqrt(-2.0 * torch.log((_unsigned(words[..., :half], torch.float32) + 0.5) * 2.0**-32))
+    turn = words[..., half:].to(torch.float32) * (2.0 * math.pi * 2.0**-32)
+    return torch.cat([radius * torch.cos(turn), radius * torch.sin(turn)], dim=-1)
+
+
+def many_quanta(quanta: Any, step: Any, w: Any) -> Any:
+    """step x (Poisson count - mean) from normal numbers w, for means of EXPANSION_FROM or more (see _numba_kernels)."""
+    import torch
+
+    mean = torch.clamp(quanta, min=EXPANSION_FROM)
+    root = torch.sqrt(mean)
+    part = 1.0 / root
+    square = w * w
+    away = root * w + (1.0 / 3.0 + square * (1.0 / 6.0))
+    away = away - part * w * (1.0 / 36.0 + square * (1.0 / 72.0))
+    away = away + part * part * (-8.0 / 405.0 + square * (7.0 / 810.0 + square * (1.0 / 270.0)))
+    rest = mean - torch.floor(mean)
+    return step * (torch.floor(rest + away) - rest)
+
+
+def _inverted(words: Any, mean: Any) -> Any:
+    """Poisson counts of `mean` (number,) by inversion, one word each."""
+    import torch
+
+    uniform = (_unsigned(words, torch.float64) + 0.5) * 2.0**-32
+    probability = torch.exp(-mean)
+    cumulative = probability.clone()
+    count = torch.zeros_like(mean)
+    top = float(mean.max()) if mean.numel() else 0.0
+    if top > 0:
+        for k in range(1, int(top + 7.0 * math.sqrt(top) + 14.0)):
+            count += uniform > cumulative
+            probability *= mean / k
+            cumulative += probability
+    return count
+
+
+def few_quanta(level: Any, slope: Any, step: Any, excess: Any, quanta: Any, words: Any) -> Any:
+    """Noise (number,) of pixels of few quanta, float32: see _numba_kernels; `words` gives those of a stage."""
+    import torch
+
+    level, slope, step, excess, quanta = (one.to(torch.float64) for one in (level, slope, step, excess, quanta))
+    compound = excess > 0
+    second = 1.0 + torch.where(compound, excess, 1.0)
+    third = step / slope * second * second
+    total = (third - second) / (second - 1.0)
+    middle = 0.5 * total
+    apart = torch.sqrt(torch.clamp(middle * middle - (total - second), min=0.0))
+    small, large = torch.clamp(middle - apart, min=0.0), middle + apart
+    share = (1.0 - small) / (large - small)
+    photons = second * level / slope
+    one = slope / second
+    means = (torch.where(compound, photons * share, quanta), torch.where(compound, photons * (1.0 - share), 0.0))
+    worths = (torch.where(compound, one * large, step), one * small)
+    noise = torch.zeros_like(level)
+    stages = (STAGE_FIRST_DEPOSIT, STAGE_SECOND_DEPOSIT) if bool(compound.any()) else (STAGE_FIRST_DEPOSIT,)
+    for mean, worth, stage in zip(means, worths, stages, strict=False):
+        noise += (_inverted(words(stage), mean) - mean) * worth
+    return noise.to(torch.float32)
+
+
+def _spread(image: Any, kernel: Any, axis: int, length: int) -> Any:
+    """Convolution along `axis`, in single precision whatever the device's convolutions are set to."""
+    taps = [float(value) for value in kernel]
+    result = image.narrow(axis, 0, length) * taps[0]
+    for j, tap in enumerate(taps[1:], start=1):
+        if tap:
+            result.add_(image.narrow(axis, j, length), alpha=tap)
+    return result
+
+
+def sample(request: "_Frames", *, device: str | None) -> Any:
+    """Frames (frame, row, column) float32 on the device."""
+    import torch
+
+    where = torch_device(device)
+    rows, columns = request.signal.shape[-2:]
+    result = torch.empty((request.frames, rows, columns), dtype=torch.float32, device=where)
+    if result.numel() == 0:
+        return result
+    together = max(1, _PIXELS_AT_ONCE // (rows * columns))
+    names = ("signal", "relative", "slope", "step", "excess", "read_variance", "dark")
+    whole = {name: torch.from_numpy(getattr(request, name)).to(where) for name in names}
+    with torch.no_grad():
+        for start in range(0, request.frames, together):
+            stop = min(start + together, request.frames)
+            maps = {name: values[start:stop] if len(values) > 1 else values for name, values in whole.items()}
+            numbers = torch.arange(start, stop, dtype=torch.int64, device=where) + request.first_frame
+            result[start:stop] = _sample_piece(request, maps, numbers)
+    return result
+
+
+def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
+    import torch
+
+    rows, columns = request.signal.shape[-2:]
+    reach = request.reach
+    high, wide = rows + 2 * reach, columns + 2 * reach
+    device = frames.device
+    row_at = torch.clamp(torch.arange(-reach, rows + reach, device=device), 0, rows - 1)
+    column_at = torch.clamp(torch.arange(-reach, columns + reach, device=device), 0, columns - 1)
+
+    def widened(values: Any) -> Any:
+        if values.shape[1:] == (1, 1) or reach == 0:
+            return values
+        return values.index_select(1, row_at).index_select(2, column_at)
+
+    relative, slope, step = (widened(maps[name]) for name in ("relative", "slope", "step"))
+    mean = widened(maps["signal"]) / relative
+    level = torch.clamp(mean, min=0.0)
+    quanta = level * slope / (step * step)
+    keys = row_keys(request.key, frames, STAGE_QUANTA, high)
+    noise = many_quanta(quanta, step, normals(random_words(keys, wide + wide % 2))[..., :wide])
+    few = quanta < EXPANSION_FROM
+    if bool(few.any()):
+        shape = noise.shape
+        places = few.expand(shape).nonzero(as_tuple=True)
+
+        def chosen(values: Any) -> Any:
+            return values.expand(shape)[places]
+
+        def words(stage: int) -> Any:
+            return random_words(row_keys(request.key, frames, stage, high), wide)[places]
+
+        excess = widened(maps["excess"])
+        noise[places] = few_quanta(*(chosen(one) for one in (level, slope, step, excess, quanta)), words)
+    if len(request.kernel) > 1 or reach:
+        kernel = request.kernel[: 2 * reach + 1]
+        noise = _spread(_spread(noise, kernel, 2, columns), kernel, 1, rows)
+    if len(request.signal_kernel):
+        kernel = request.signal_kernel[: 2 * reach + 1]
+        signal = _spread(_spread(mean, kernel, 2, columns), kernel, 1, rows) * maps["relative"]
+    else:
+        signal = maps["signal"]
+    frame = request.signal_share * signal + noise * maps["relative"]
+    if request.electronics:
+        keys = row_keys(request.key, frames, STAGE_ELECTRONICS, rows)
+        drawn = normals(random_words(keys, columns + columns % 2))[..., :columns]
+        white = request.white_fraction * maps["slope"] * maps["relative"] * torch.clamp(signal, min=0.0)
+        frame = frame + torch.sqrt(white + maps["read_variance"]) * drawn
+    frame = frame + maps["dark"]
+    if request.steps_a_DN > 0:
+        frame = torch.round(frame * request.steps_a_DN) * float(np.float32(1.0) / np.float32(request.steps_a_DN))
+    return torch.clamp(frame, request.lowest, request.highest)

@@ -241,3 +241,23 @@ def test_counts_are_kept_for_all_images_or_for_none(path):
 def test_a_row_knows_what_it_may_hold(values, message):
     with pytest.raises(InputError, match=message):
         DatasetRow(**values)
+
+
+def test_every_image_is_a_compressed_chunk_of_its_own(tmp_path):
+    path = tmp_path / "d.h5"
+    rng = np.random.default_rng(0)
+    with write_dataset(path, shape=(64, 80)) as writer:
+        for number in range(3):
+            counts = rng.poisson(1500, (2, 64, 80)).astype(np.float32)
+            writer.append(
+                image=-np.log(counts / 3000),
+                counts=counts,
+                foreign_object_mask=None,
+                product_mask=np.ones((64, 80)),
+                row=DatasetRow(image=str(number)),
+            )
+    with h5py.File(path) as file:
+        for name, chunk in (("images", (1, 2, 64, 80)), ("counts", (1, 2, 64, 80)), ("product_masks", (1, 64, 80))):
+            assert file[name].chunks == chunk
+            assert file[name].compression == "lzf"
+        assert file["counts"].id.get_storage_size() < 0.5 * file["counts"].size * 4

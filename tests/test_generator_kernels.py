@@ -1,0 +1,439 @@
+"""Noisy frames: moments, covariances and distribution as theory has them at any level; bytes that depend on nothing else.
+
+Bounds are four standard errors, from the sample's own influence values or from Bartlett's formula for correlated noise; a
+family of checks shares one error rate.
+"""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from raytwin.errors import InputError
+from raytwin.generator.kernels import draw_key, gamma_step_DN, sample_frames, sample_quanta
+from raytwin.generator.psf import noise_autocovariance, noise_kernel_1d, optical_kernel_1d
+
+LEVELS = (0.1, 1.0, 5.0, 19.9, 20.1, 100.0, 1e3, 1e5)
+STANDARD_ERRORS = 4.0
+MILLION = (1, 1000, 1000)
+TEN_MILLION = (10, 1000, 1000)
+BACKENDS = ("cpu", "torch")
+
+
+def constant(level, shape):
+    return np.full(shape, level, dtype=np.float32)
+
+
+def in_standard_errors(noise, *, variance, skewness):
+    """Mean, variance and skewness of independent zero-mean noise, each off its theory in standard errors."""
+    z = noise.astype(np.float64).ravel() / math.sqrt(variance)
+    size = z.size
+    square, cube = z**2, z**3
+    g = float(cube.mean())
+    influence = cube - 3 * z - g - 1.5 * g * (square - 1)  # of the skewness, mean and variance estimated beside it
+    centred = z - z.mean()
+    found = float((centred**3).mean() / (centred**2).mean() ** 1.5)
+    return (
+        float(z.mean() * math.sqrt(size)),
+        float((square.mean() - 1.0) / (square.std() / math.sqrt(size))),
+        float((found - skewness) / (influence.std() / math.sqrt(size))),
+    )
+
+
+def check_moments(level, spread, shape, backend, key):
+    noise = np.asarray(
+        sample_quanta(
+            constant(level, shape),
+            gain_DN=1.0 + spread,
+            deposit_spread=spread,
+            key=key,
+            backend=backend,
+            device="cpu" if backend == "torch" else None,
+        )
+    )
+    # deposits of mean 1: photons level, E q^2 = 1 + spread, E q^3 = (1 + spread) (1 + 2 spread) (gamma)
+    second, third = 1.0 + spread, (1.0 + spread) * (1.0 + 2.0 * spread)
+    off = in_standard_errors(noise, variance=level * second, skewness=level * third / (level * second) ** 1.5)
+    assert np.max(np.abs(off)) < STANDARD_ERRORS, f"mean, variance, skewness off by {off} standard errors"
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("level", LEVELS)
+def test_quanta_have_the_mean_variance_and_skewness_of_a_compound_poisson_number(level, backend):
+    shape = MILLION if backend == "cpu" else (1, 400, 500)
+    check_moments(level, 0.0, shape, backend, key=11)
+    check_moments(level, 0.3, shape, backend, key=12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("spread", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("level", [0.1, 0.5, 1.0, 3.0, 10.0, 19.9, 20.1, 50.0, 100.0, 240.0, 1e3, 2e3, 1e4, 1e5])
+def test_ten_million_quanta_have_the_moments_of_a_compound_poisson_number(level, spread, backend):
+    check_moments(level, spread, TEN_MILLION, backend, key=21)
+
+
+def check_poisson(level, shape, key, backend="cpu"):
+    noise = sample_quanta(constant(level, shape), gain_DN=1.0, key=key, backend=backend)
+    count = np.rint(np.asarray(noise, dtype=np.float64) + np.float64(np.float32(level))).astype(np.int64).ravel()
+    size = count.size
+    assert count.min() >= 0
+    edges = np.arange(stats.poisson.ppf(20.0 / size, level), stats.poisson.isf(20.0 / size, level) + 1)
+    expected = np.diff(np.concatenate([[0.0], stats.poisson.cdf(edges, level), [1.0]])) * size
+    seen = np.bincount(np.searchsorted(edges, count, side="left"), minlength=len(expected))
+    kept = expected > 5
+    chi_square = float(np.sum((seen[kept] - expected[kept]) ** 2 / expected[kept]))
+    return stats.chi2.sf(chi_square, kept.sum() - 1)
+
+
+@pytest.mark.parametrize("level", [0.1, 1.0, 3.0, 10.0, 19.9, 20.1, 35.0, 100.0, 240.0, 2e3, 1e5])
+def test_equal_quanta_follow_the_poisson_law(level):
+    # 11 levels share an error rate of 1e-3
+    assert check_poisson(level, MILLION, key=31) > 1e-3 / 11
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("level", [0.1, 1.0, 3.0, 10.0, 19.9, 20.1, 25.0, 35.0, 100.0, 240.0, 2e3, 1e5])
+def test_ten_million_equal_quanta_follow_the_poisson_law(level, backend):
+    assert check_poisson(level, TEN_MILLION, key=41, backend=backend) > 1e-3 / 24
+
+
+@pytest.mark.parametrize("level", [0.05, 0.7, 4.0])
+def test_with_few_photons_the_share_of_empty_pixels_is_that_of_the_photons(level):
+    # deposits of two sizes above 0: nothing is deposited only where no photon came
+    spread, gain = 0.2, 3.0
+    signal = level * gain / (1.0 + spread)
+    noise = sample_quanta(constant(signal, MILLION), gain_DN=gain, deposit_spread=spread, key=5)
+    empty = np.mean(np.abs(noise.astype(np.float64) + signal) < 1e-4)
+    expected = math.exp(-level)
+    assert abs(empty - expected) < STANDARD_ERRORS * math.sqrt(expected * (1 - expected) / noise.size)
+
+
+def bartlett(acf, lag, size, excess_kurtosis):
+    """Standard error of the covariance at `lag` of a linear process with known mean, acf lag 0 in the centre."""
+    reach = acf.shape[0] // 2
+
+    def at(i, j):
+        return acf[i + reach, j + reach] if abs(i) <= reach and abs(j) <= reach else 0.0
+
+    lags = range(-reach, reach + 1)
+    total = sum(at(i, j) ** 2 + at(i + lag[0], j + lag[1]) * at(i - lag[0], j - lag[1]) for i in lags for j in lags)
+    return math.sqrt((total + excess_kurtosis * at(*lag) ** 2) / size)
+
+
+def check_covariances(level, shape, backend, key):
+    model, sigma = "aperture", 0.6
+    noise = np.asarray(
+        sample_quanta(
+            constant(level, shape), gain_DN=1.0, kernel_1d=noise_kernel_1d(model, sigma), key=key, backend=backend
+        ),
+        dtype=np.float64,
+    )
+    acf = noise_autocovariance(model, sigma, 7)
+    off = {}
+    for lag in [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0), (1, -1), (3, 0), (0, 3), (8, 0), (0, 8)]:
+        rows, columns = lag
+        ahead = noise[:, rows:, columns:] if columns >= 0 else noise[:, rows:, :columns]
+        behind = (
+            noise[:, : shape[1] - rows, : shape[2] - columns]
+            if columns >= 0
+            else noise[:, : shape[1] - rows, -columns:]
+        )
+        found = float(np.mean(ahead * behind)) / level
+        theory = acf[7 + rows, 7 + columns] if max(map(abs, lag)) <= 7 else 0.0
+        off[lag] = (found - theory) / bartlett(acf, lag, ahead.size, 1.0 / level)
+    assert max(map(abs, off.values())) < STANDARD_ERRORS, off
+
+
+@pytest.mark.parametrize(("level", "backend"), [(0.3, "cpu"), (150.0, "cpu"), (1500.0, "torch")])
+def test_neighbours_have_the_covariance_of_the_spread(level, backend):
+    check_covariances(level, MILLION if backend == "cpu" else (1, 400, 500), backend, key=51)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("level", [0.1, 1.0, 19.0, 150.0, 1.5e3, 1e5])
+def test_ten_million_neighbours_have_the_covariance_of_the_spread(level, backend):
+    check_covariances(level, TEN_MILLION, backend, key=61)
+
+
+def test_there_are_no_seams_where_threads_or_vectors_meet_and_none_at_the_borders():
+    frames, rows, columns = 400, 40, 70
+    sigma = 0.8
+    noise = sample_quanta(
+        constant(200.0, (rows, columns)),
+        gain_DN=1.0,
+        kernel_1d=noise_kernel_1d("aperture", sigma),
+        frames=frames,
+        key=71,
+    ).astype(np.float64)
+    acf = noise_autocovariance("aperture", sigma, 7) * 200.0
+    variance, beside, below = acf[7, 7], acf[7, 8], acf[8, 7]
+    of_rows = [(noise[:, r] ** 2).mean() / variance - 1 for r in range(rows)]
+    of_columns = [(noise[:, :, c] ** 2).mean() / variance - 1 for c in range(columns)]
+    pairs_down = [(noise[:, r] * noise[:, r + 1]).mean() / below - 1 for r in range(rows - 1)]
+    pairs_along = [(noise[:, :, c] * noise[:, :, c + 1]).mean() / beside - 1 for c in range(columns - 1)]
+    correlation = (acf / variance) ** 2
+    # of a row's mean square: 2 sum of squared correlations along it; of a product the same and more by 1 / rho^2
+    for values, size, along, over in (
+        (of_rows, frames * columns, correlation[7].sum(), 1.0),
+        (of_columns, frames * rows, correlation[:, 7].sum(), 1.0),
+        (pairs_down, frames * columns, correlation[7].sum(), variance / below),
+        (pairs_along, frames * rows, correlation[:, 7].sum(), variance / beside),
+    ):
+        assert np.max(np.abs(values)) < 4.5 * over * math.sqrt(2.0 * along / size)
+
+
+def test_a_frame_has_the_same_bytes_however_the_stack_is_cut():
+    rng = np.random.default_rng(0)
+    signal = rng.uniform(0.0, 300.0, size=(5, 33, 47)).astype(np.float32)
+    for backend in BACKENDS:
+        settings = {
+            "gain_DN": 1.5,
+            "key": 2**63 + 9,
+            "deposit_spread": 0.2,
+            "kernel_1d": noise_kernel_1d("aperture", 0.6),
+            "signal_kernel_1d": optical_kernel_1d("aperture", 0.6),
+            "read_noise_DN": 2.0,
+            "white_fraction": 0.02,
+            "dark_DN": 100.0,
+            "backend": backend,
+        }
+        whole = np.asarray(sample_frames(signal, **settings))
+        again = [np.asarray(sample_frames(signal[i : i + 2], first_frame=i, **settings)) for i in (0, 2, 4)]
+        assert whole.tobytes() == np.concatenate(again).tobytes()
+        single = np.asarray(sample_frames(signal[3], first_frame=3, **settings))
+        assert whole[3].tobytes() == single.tobytes()
+        assert not np.array_equal(whole[3], np.asarray(sample_frames(signal[3], first_frame=4, **settings)))
+
+
+def test_a_frame_has_the_same_bytes_whatever_the_number_of_threads():
+    code = (
+        "import hashlib, numpy as np\n"
+        "from raytwin.generator.kernels import sample_frames\n"
+        "signal = np.linspace(0, 400, 60 * 75, dtype=np.float32).reshape(60, 75)\n"
+        "frame = sample_frames(signal, gain_DN=1.2, key=7, kernel_1d=[.2, .6, .2], read_noise_DN=1, deposit_spread=.1)\n"
+        "print(hashlib.sha256(frame.tobytes()).hexdigest())\n"
+    )
+    hashes = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            check=True,
+            capture_output=True,
+            text=True,
+            env={"NUMBA_NUM_THREADS": threads, "PATH": ""},
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(hashes) == 1
+
+
+def test_torch_draws_the_frames_of_the_compiled_loops_but_for_last_bits():
+    rng = np.random.default_rng(1)
+    signal = np.concatenate([rng.uniform(0, 30, (1, 60, 81)), rng.uniform(90, 2000, (1, 60, 81))])
+    settings = {
+        "gain_DN": 1.3,
+        "key": 77,
+        "deposit_spread": 0.2,
+        "gain_relative": rng.uniform(0.9, 1.1, (60, 81)),
+        "kernel_1d": noise_kernel_1d("aperture", 0.6),
+        "signal_kernel_1d": optical_kernel_1d("aperture", 0.6),
+        "read_noise_DN": 1.5,
+        "dark_DN": 50.0,
+        "white_fraction": 0.02,
+        "quantised": False,
+    }
+    compiled = sample_frames(signal, **settings)
+    in_torch = sample_frames(signal, backend="torch", device="cpu", **settings).numpy()
+    # where a last bit moves a count by one quantum, the spread takes it to some of its neighbours
+    assert np.mean(np.abs(compiled - in_torch) > 2e-3) < 5e-3
+
+
+def test_random_words_are_even_in_every_bit_and_independent_of_their_neighbours():
+    # quanta of a mean of 1e6 are lattice normals: judge the words through the plain normals of the electronics
+    normal = sample_frames(np.zeros((6, 512, 512)), gain_DN=1.0, read_noise_DN=1.0, quantised=False, key=3).astype(
+        np.float64
+    )
+    size = normal.size
+    uniform = stats.norm.cdf(normal).ravel()
+    seen = np.bincount((uniform * 4096).astype(int), minlength=4096)
+    assert stats.chi2.sf(float(np.sum((seen - size / 4096) ** 2) / (size / 4096)), 4095) > 1e-4
+    others = {
+        "next column": (normal[:, :, 1:], normal[:, :, :-1]),
+        "half a row": (normal[:, :, 256:], normal[:, :, :256]),
+        "next row": (normal[:, 1:], normal[:, :-1]),
+        "next frame": (normal[1:], normal[:-1]),
+    }
+    other_key = sample_frames(np.zeros((6, 512, 512)), gain_DN=1.0, read_noise_DN=1.0, quantised=False, key=4)
+    others["next key"] = (normal, other_key.astype(np.float64))
+    for name, (one, two) in others.items():
+        for power in (1, 2, 3):
+            a, b = one**power, two**power
+            correlation = np.corrcoef(a.ravel(), b.ravel())[0, 1]
+            assert abs(correlation) < 4.5 / math.sqrt(a.size), (name, power)
+
+
+def test_electronics_white_quanta_and_gain_enter_as_stated():
+    size = (500, 800)
+    signal, gain, white, relative, read = 400.0, 1.4, 0.05, 1.3, 3.0
+    frame = sample_frames(
+        constant(signal, size),
+        gain_DN=gain,
+        white_fraction=white,
+        gain_relative=relative,
+        read_noise_DN=read,
+        dark_DN=100.0,
+        quantised=False,
+        key=8,
+    ).astype(np.float64)
+    variance = gain * signal * relative + read**2
+    number = frame.size
+    assert abs(frame.mean() - signal - 100.0) < STANDARD_ERRORS * math.sqrt(variance / number)
+    assert abs(frame.var() / variance - 1.0) < STANDARD_ERRORS * math.sqrt(2.01 / number)
+
+
+@pytest.mark.parametrize("averaged", [1, 4, 10])
+def test_averaged_frames_have_the_noise_of_a_mean_of_rounded_frames(averaged):
+    size, signal, gain, read = (500, 800), 90.3, 1.2, 0.9
+    settings = {"gain_DN": gain, "read_noise_DN": read, "dark_DN": 20.0}
+    frame = sample_frames(constant(signal, size), averaged=averaged, key=9, **settings).astype(np.float64)
+    steps = frame * averaged
+    assert np.allclose(steps, np.rint(steps), atol=1e-3)
+    variance = (gain * signal + read**2 + 1.0 / 12.0) / averaged
+    number = frame.size
+    assert abs(frame.mean() - signal - 20.0) < STANDARD_ERRORS * math.sqrt(variance / number)
+    assert abs(frame.var() / variance - 1.0) < STANDARD_ERRORS * math.sqrt(2.1 / number)
+
+
+def test_the_signal_is_spread_by_its_kernel_and_the_noise_by_its_own():
+    signal = np.zeros((41, 53), dtype=np.float32)
+    signal[20, 26] = 1e8
+    kernel = optical_kernel_1d("aperture", 0.7)
+    frames = sample_frames(
+        signal, gain_DN=1.0, signal_kernel_1d=kernel, kernel_1d=noise_kernel_1d("aperture", 0.7), quantised=False, key=1
+    )
+    reach = len(kernel) // 2
+    expected = 1e8 * np.outer(kernel, kernel)
+    window = frames[20 - reach : 21 + reach, 26 - reach : 27 + reach]
+    # the noise of 1e8 quanta is 1e4 before the spread
+    assert np.max(np.abs(window - expected)) < 5e4
+    assert np.max(np.abs(frames[:10])) < 5e4
+
+
+def test_readout_saturates_cuts_at_zero_and_leaves_stuck_pixels_alone():
+    stuck = np.full((20, 30), np.nan)
+    stuck[3, 4], stuck[5, 6] = 0.0, 4095.0
+    for backend in BACKENDS:
+        low = np.asarray(
+            sample_frames(constant(0.0, (20, 30)), gain_DN=1.0, read_noise_DN=50.0, key=1, backend=backend)
+        )
+        high = np.asarray(
+            sample_frames(
+                constant(5000.0, (20, 30)), gain_DN=1.0, bits=12, stuck_DN=stuck, key=1, frames=2, backend=backend
+            )
+        )
+        assert low.min() == 0.0
+        assert np.array_equal(low, np.rint(low))
+        assert high.shape == (2, 20, 30)
+        assert high[:, 3, 4].tolist() == [0.0, 0.0]
+        assert np.sum(high != 4095.0) == 2
+
+
+def test_no_photons_no_electronics_nothing_but_the_dark():
+    for signal in (0.0, -50.0):
+        frame = sample_frames(constant(signal, (7, 9)), gain_DN=2.0, dark_DN=100.0, key=0, quantised=False)
+        assert np.array_equal(frame, constant(100.0 + signal, (7, 9)))
+
+
+def test_keys_come_from_the_callers_generator():
+    assert draw_key(np.random.default_rng(3)) == draw_key(np.random.default_rng(3))
+    assert draw_key(np.random.default_rng(3)) != draw_key(np.random.default_rng(4))
+    assert gamma_step_DN(2.0, 0.25) == pytest.approx(2.0 * 1.5 / 1.25)
+
+
+@given(
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.sampled_from([0.0, 1e-6, 0.3, 7.0, 19.99, 20.0, 1e3, 1e9, 1e20]),
+    st.sampled_from([np.float16, np.float32, np.float64, np.uint16, np.int64]),
+    st.sampled_from([1e-3, 1.0, 50.0]),
+    st.sampled_from([0.0, 0.1, 1.5]),
+    st.sampled_from([None, 0.0, 0.3, 2.5]),
+    st.sampled_from([None, 8, 16]),
+    st.integers(0, 2**64 - 1),
+    st.sampled_from(BACKENDS),
+)
+def test_any_shape_type_and_level_gives_finite_frames(
+    rows, columns, level, dtype, gain, spread, sigma, bits, key, backend
+):
+    signal = np.full((rows, columns), min(level, float(np.finfo(np.float16).max) if dtype == np.float16 else 6e4))
+    signal = (
+        signal.astype(dtype)
+        if np.dtype(dtype).kind != "f" or dtype == np.float16
+        else np.full_like(signal, level, dtype)
+    )
+    frame = np.asarray(
+        sample_frames(
+            signal,
+            gain_DN=gain,
+            deposit_spread=spread,
+            kernel_1d=None if sigma is None else noise_kernel_1d("aperture", sigma),
+            read_noise_DN=1.0,
+            white_fraction=0.01,
+            bits=bits,
+            key=key,
+            backend=backend,
+        )
+    )
+    assert frame.shape == (rows, columns)
+    assert frame.dtype == np.float32
+    assert np.all(np.isfinite(frame))
+    assert np.all(frame >= 0)
+    assert bits is None or np.all(frame <= 2**bits - 1)
+
+
+GOOD = {"signal_DN": np.ones((4, 5)), "gain_DN": 1.0, "key": 1}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"signal_DN": np.full((4, 5), np.nan)}, r"signal_DN: got nan in 20 of 20 places; expected finite DN"),
+        ({"signal_DN": np.full((4, 5), np.inf)}, r"signal_DN: got inf in 20 of 20"),
+        ({"signal_DN": np.ones(5)}, r"signal_DN: got shape \(5,\); expected \(row, column\) or"),
+        ({"signal_DN": np.array([["a"]])}, r"signal_DN: got .*; expected numbers"),
+        ({"gain_DN": 0.0}, r"gain_DN: got 0 in 1 of 1 places; expected finite, 1e-12 DN or more"),
+        (
+            {"gain_DN": np.ones((3, 5))},
+            r"gain_DN: got shape \(3, 5\); expected one number, or a map that fits .*\(1, 4, 5\)",
+        ),
+        ({"gain_relative": -1.0}, r"gain_relative: got -1"),
+        ({"read_noise_DN": np.nan}, r"read_noise_DN: got nan"),
+        ({"dark_DN": np.inf}, r"dark_DN: got inf"),
+        ({"white_fraction": -0.1}, r"white_fraction: got -0.1; expected 0 to 1e\+06 of the quantum variance"),
+        ({"deposit_spread": -0.1}, r"deposit_spread: got -0.1"),
+        ({"deposit_spread": 0.2, "step_DN": 0.5}, r"step_DN: got 0.5 of the quantum .*; expected as much or more"),
+        ({"deposit_spread": 0.2, "step_DN": 9.0}, r"deposit_spread and step_DN: got up to 0.2, and 9"),
+        ({"kernel_1d": [0.5, 0.5]}, r"kernel_1d: got shape \(2,\); expected \(2 R \+ 1,\) finite numbers"),
+        ({"kernel_1d": [0.5, np.nan, 0.5]}, r"kernel_1d: got shape"),
+        ({"bits": 40}, r"bits: got 40; expected 1 to 24 bits"),
+        ({"averaged": 0}, r"averaged: got 0; expected a whole number from 1"),
+        ({"averaged": 1.5}, r"averaged: got 1.5; expected a whole number"),
+        ({"key": -1}, r"key: got -1; expected a whole number from 0"),
+        ({"first_frame": -1}, r"first_frame: got -1"),
+        ({"frames": -1}, r"frames: got -1"),
+        ({"signal_DN": np.ones((3, 4, 5)), "frames": 2}, r"frames: got 2; expected 3, as many as there are signals"),
+        ({"stuck_DN": np.ones((4, 4))}, r"stuck_DN: got shape \(4, 4\)"),
+        ({"backend": "gpu"}, r"backend: got gpu; expected one of cpu, torch"),
+        ({"backend": "torch", "device": "nowhere"}, r"device: got nowhere; expected a device that torch has here"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_lab_words(wrong, message):
+    with pytest.raises(InputError, match=message):
+        sample_frames(**{**GOOD, **wrong})

@@ -13,6 +13,10 @@ import numpy as np
 from ..errors import FileFormatError, InputError
 
 
+# a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
+_CHUNK_CACHE_BYTES = 2**20
+
+
 def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
     """Open an HDF5 file for reading; `what` says in the message which kind of file was expected."""
     location = Path(path)
@@ -20,7 +24,7 @@ def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
         given = "a folder" if location.is_dir() else "no such file"
         raise FileFormatError(str(path), received=given, expected=what, remedy="check the path")
     try:
-        return h5py.File(location, "r")
+        return h5py.File(location, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
     except OSError as error:
         if h5py.is_hdf5(location):
             raise FileFormatError(

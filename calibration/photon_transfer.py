@@ -22,7 +22,7 @@ from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covarian
 
 ESTIMATORS = ("pairs", "stack")
 COVARIANCE_FRAMES = 400
-_PIECE_BYTES = 16 * 2**20
+_PIECE_BYTES = 8 * 2**20
 _COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
 _FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16))
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .line_state import FloatArray
+from ._fine_picture import (
+    Borders,
+    find_borders,
+    fine_cells,
+    transform_of_cells,
+)
+from .line_state import FinePicture, FloatArray
 from .predict import slope_share, spectral_model_of
 from .projection import project_polychromatic
 from .spectral_signal import REFERENCE_KV, OpenBeam, SpectralModel
@@ -29,61 +35,8 @@ _BORDER_KEV = 40.0  # attenuation at this energy says where the border of an obj
 _BORDER_DEPTH = 0.02  # optical depth across a pixel's neighbourhood from which its border counts
 _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
-_BUDGET_BYTES = 400_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Borders:
-    """Pixels that the border of an object cuts: the signal is shared between the neighbours on either side.
-
-    Fields: pixel, thick, thin (n,): flat indices of the pixel and of its most and least attenuating neighbour; covered
-    (n,): share of the pixel behind the thick one; sharpness (n,): 1 a step, 0 a slope.
-    """
-
-    pixel: NDArray[np.intp]
-    thick: NDArray[np.intp]
-    thin: NDArray[np.intp]
-    covered: FloatArray
-    sharpness: FloatArray
-
-
-def find_borders(depth: FloatArray) -> Borders:
-    """Pixels of `depth` (row, column) (optical depth, pixel means) that lie on a step between two plateaus.
-
-    The mean of exp(-depth) over a pixel that an edge cuts is not exp(-mean depth). A step spans the same range in 3 x 3
-    as in 5 x 5 pixels, a slope half of it; between the two, sharpness falls from 1 to 0.
-    """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    rows, columns = depth.shape
-    # borders of the frame go on as they come, so that a slope does not end there in a plateau
-    wide = np.pad(depth, 2, mode="reflect", reflect_type="odd")
-    range_3, range_5 = (
-        (maximum_filter(wide, size, mode="nearest") - minimum_filter(wide, size, mode="nearest"))[2:-2, 2:-2]
-        for size in (3, 5)
-    )
-    sharpness = np.clip(2.0 * range_3 / np.maximum(range_5, 1e-12) - 1.0, 0.0, 1.0)
-    row, column = np.nonzero((range_3 > _BORDER_DEPTH) & (sharpness > 1e-6))
-    around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    near_row = np.clip(row[:, None] + around[:, 0], 0, rows - 1)
-    near_column = np.clip(column[:, None] + around[:, 1], 0, columns - 1)
-    near = depth[near_row, near_column]
-    index = near_row * columns + near_column
-    every = np.arange(row.size)
-    if row.size == 0:
-        empty = np.zeros(0, dtype=np.intp)
-        return Borders(empty, empty, empty, np.zeros(0), np.zeros(0))
-    most, least = near.argmax(axis=1), near.argmin(axis=1)
-    high, low = near[every, most], near[every, least]
-    covered = (depth[row, column] - low) / (high - low)
-    inside = (covered > 1e-6) & (covered < 1 - 1e-6)
-    return Borders(
-        pixel=(row * columns + column)[inside],
-        thick=index[every, most][inside],
-        thin=index[every, least][inside],
-        covered=covered[inside],
-        sharpness=sharpness[row, column][inside],
-    )
+_BUDGET_BYTES = 600_000_000
+_SINGLE_PRECISION_CELLS = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +60,7 @@ class BeamProjection:
     open_signal_DN: float
     signal_DN: FloatArray
     variance_DN2: FloatArray
+    picture: FinePicture | None
     _cache: "ModelCache"
     _key: tuple[object, ...]
     _scene: _Scene | None
@@ -116,7 +70,7 @@ class BeamProjection:
         """Maps (k, row, column) of sum_E weights exp(-mu t), or (k, 1, 1) in the open field; kept under `name`."""
         if self.model is None:
             raise InputError("scene", received="a twin without spectral part", expected="one with a spectral part")
-        return self._cache.project(self._key, name, weights, self.model, self._scene, self._scale)
+        return self._cache.project(self._key, name, weights, self.model, self._scene, self._scale)[0]
 
 
 @dataclass(slots=True)
@@ -125,7 +79,7 @@ class ModelCache:
 
     budget_bytes: int = _BUDGET_BYTES
     _scenes: "OrderedDict[int, _Scene]" = field(default_factory=OrderedDict)
-    _maps: "OrderedDict[tuple[object, ...], FloatArray]" = field(default_factory=OrderedDict)
+    _maps: "OrderedDict[tuple[object, ...], tuple[FloatArray, FloatArray | None]]" = field(default_factory=OrderedDict)
     _held: int = 0
     _numbers: int = 0
     _levels: dict[tuple[object, ...], tuple[object, float, float]] = field(default_factory=dict)
@@ -162,14 +116,19 @@ class ModelCache:
         scene = None
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
-        maps = self.project(key, "signal", weights, model, scene, attenuation_scale)
+        maps, transform = self.project(key, "signal", weights, model, scene, attenuation_scale)
+        signal = signal_scale * maps[0]
+        picture = None
+        if transform is not None and twin.noise.psf_model == "aperture":
+            picture = FinePicture(transform=transform, scale=signal_scale, signal_DN=signal)
         return BeamProjection(
             model=model,
             weights=weights,
             energies_keV=model.energies_keV[: weights.shape[1]],
             open_signal_DN=signal_scale * float(weights[0].sum()),
-            signal_DN=signal_scale * maps[0],
+            signal_DN=signal,
             variance_DN2=signal_scale * gain_scale * maps[1],
+            picture=picture,
             _cache=self,
             _key=key,
             _scene=scene,
@@ -197,7 +156,17 @@ class ModelCache:
         gain = level.photon_transfer_slope_DN.value / slope_share(twin)
         one = np.ones((1, 1))
         return BeamProjection(
-            None, None, None, open_signal, open_signal * one, gain * open_signal * one, self, (), None, {}
+            model=None,
+            weights=None,
+            energies_keV=None,
+            open_signal_DN=open_signal,
+            signal_DN=open_signal * one,
+            variance_DN2=gain * open_signal * one,
+            picture=None,
+            _cache=self,
+            _key=(),
+            _scene=None,
+            _scale={},
         )
 
     @staticmethod
@@ -307,7 +276,15 @@ class ModelCache:
             if distinct.shape[1] < 0.7 * points.shape[1]:
                 points, inverse = distinct.astype(np.float64), where.reshape(-1)
         self._numbers += 1
-        scene = _Scene(thickness_mm, self._numbers, materials, points, inverse, find_borders(depth), shape)
+        scene = _Scene(
+            thickness_mm,
+            self._numbers,
+            materials,
+            points,
+            inverse,
+            find_borders(depth, least_depth=_BORDER_DEPTH),
+            shape,
+        )
         self._scenes[number] = scene
         while len(self._scenes) > 64:
             self._scenes.popitem(last=False)
@@ -321,10 +298,15 @@ class ModelCache:
         model: SpectralModel,
         scene: _Scene | None,
         attenuation_scale: Mapping[str, float],
-    ) -> FloatArray:
-        """Maps (k, row, column) or (k, 1, 1) of the weights (k, energy) behind a scene, kept under key and name."""
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Weights (k, energy) behind a scene, kept under key and name.
+
+        Returns:
+            Maps (k, row, column), or (k, 1, 1) in the open field; and the cosine transform over cells of the first one
+            where the scene has steps and the name is `signal`, else None.
+        """
         if scene is None:
-            return np.asarray(weights.sum(axis=1)[:, None, None])
+            return np.asarray(weights.sum(axis=1)[:, None, None]), None
         whole = (*key, scene.number, name)
         found = self._maps.get(whole)
         if found is not None:
@@ -335,16 +317,32 @@ class ModelCache:
         flat = project_polychromatic(scene.thickness_mm, mu, weights).astype(np.float64)
         if scene.inverse is not None:
             flat = flat[:, scene.inverse]
-        borders = scene.borders
-        if borders.pixel.size:
-            shared = borders.covered * flat[:, borders.thick] + (1.0 - borders.covered) * flat[:, borders.thin]
-            flat[:, borders.pixel] += borders.sharpness * (shared - flat[:, borders.pixel])
-        maps = flat.reshape(len(weights), *scene.shape)
-        self._maps[whole] = maps
-        self._held += maps.nbytes
+        result = _with_borders(flat, scene, transformed=name == "signal")
+        self._maps[whole] = result
+        self._held += _bytes(result)
         while self._held > self.budget_bytes and len(self._maps) > 1:
-            self._held -= self._maps.popitem(last=False)[1].nbytes
-        return maps
+            self._held -= _bytes(self._maps.popitem(last=False)[1])
+        return result
+
+
+def _bytes(kept: tuple[FloatArray, FloatArray | None]) -> int:
+    return kept[0].nbytes + (0 if kept[1] is None else kept[1].nbytes)
+
+
+def _with_borders(flat: FloatArray, scene: _Scene, *, transformed: bool) -> tuple[FloatArray, FloatArray | None]:
+    """Maps (k, row, column) of what was projected pixel by pixel (k, pixel), with the pixels that borders cut shared."""
+    borders = scene.borders
+    thick, thin = flat[:, borders.thick], flat[:, borders.thin]
+    if borders.pixel.size:
+        shared = borders.covered * thick + (1.0 - borders.covered) * thin
+        flat[:, borders.pixel] += borders.sharpness * (shared - flat[:, borders.pixel])
+    maps = flat.reshape(len(flat), *scene.shape)
+    if not (transformed and borders.any_steps):
+        return maps, None
+    transform = transform_of_cells(fine_cells(maps[0], thick[0], thin[0], borders))
+    if transform.size > _SINGLE_PRECISION_CELLS:
+        transform = transform.astype(np.float32)
+    return maps, transform
 
 
 def _no_level(request: "SeriesRequest") -> InputError:

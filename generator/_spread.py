@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ._fine_picture import fine_frequencies, sampled_picture
 from .line_state import FloatArray, LineState
 from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
 
@@ -161,19 +162,12 @@ def _base_filters(shape: tuple[int, int], psf_model: str, psf_sigma_px: float) -
     return picture, _base_pattern(psf_model, psf_sigma_px).squared_transfer(f_row, f_column)
 
 
-def _object_transfer(state: LineState, shape: tuple[int, int]) -> FloatArray | None:
+def _object_transfer(state: LineState, f_row: FloatArray, f_column: FloatArray) -> FloatArray | None:
     result: FloatArray | None = None
     for factor in state.object_transfers:
-        part = factor(_frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
+        part = factor(f_row, f_column)
         result = part if result is None else result * part
     return result
-
-
-def _filtered(maps: FloatArray, filters: FloatArray) -> FloatArray:
-    """Maps (k, row, column) through transfer functions (k, row, column) or (row, column); borders mirror."""
-    from scipy.fft import dctn, idctn
-
-    return np.asarray(idctn(dctn(maps, type=2, axes=(-2, -1)) * filters, type=2, axes=(-2, -1)))
 
 
 def spread_maps(
@@ -189,26 +183,50 @@ def spread_maps(
     if signal_DN.shape == (1, 1):
         return signal_DN, pattern.share * variance_DN2
     shape = (signal_DN.shape[0], signal_DN.shape[1])
+    f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
     if state.tails or state.optical_transfers or state.power_transfers:
-        f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
         picture = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
         power = pattern.squared_transfer(f_row, f_column)
     else:
         picture, power = _base_filters(shape, psf_model, psf_sigma_px)
     filters = np.stack([picture, power])
-    blur = _object_transfer(state, shape)
+    blur = _object_transfer(state, f_row, f_column)
     if blur is not None:
         filters = filters * blur
-    spread = _filtered(np.stack([signal_DN, variance_DN2]), filters)
-    return spread[0], np.maximum(spread[1], 0.0)
+    from scipy.fft import dctn
+
+    signals: list[tuple[FloatArray, FloatArray | None]] = []
+    along_columns: list[FloatArray | None] = []
+    if state.picture is not None:
+        fine = fine_frequencies(shape[0])[:, None], fine_frequencies(shape[1])[None, :]
+        sharp = state.picture.transform * state.picture.scale
+        blur = _object_transfer(state, *fine)
+        if state.tails or state.optical_transfers:
+            whole = optical_transfer(state, psf_model, psf_sigma_px, *fine)
+            signals.append((sharp, whole if blur is None else whole * blur))
+            along_columns.append(None)
+        else:
+            rows, columns = (base_transfer_1d(psf_model, psf_sigma_px, frequency) for frequency in fine)
+            signals.append((sharp, rows if blur is None else rows * blur))
+            along_columns.append(columns)
+    if state.picture is None or signal_DN is not state.picture.signal_DN:
+        rest = signal_DN if state.picture is None else signal_DN - state.picture.signal_DN
+        signals.append((dctn(rest, type=2), filters[0]))
+        along_columns.append(None)
+    picture = sampled_picture(signals, shape, state.shift_px, along_columns)
+    power = sampled_picture([(dctn(variance_DN2, type=2), filters[1])], shape, state.shift_px)
+    return picture, np.maximum(power, 0.0)
 
 
 def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     """Signal and variance before the spread of light, with the blur of the object in them, 0 or more."""
     signal, variance = state.signal_DN, state.variance_DN2
-    if signal.shape == (1, 1) or not state.object_transfers:
+    if signal.shape == (1, 1) or not (state.object_transfers or state.shift_px != (0.0, 0.0)):
         return signal, variance
-    blur = _object_transfer(state, (signal.shape[0], signal.shape[1]))
-    spread = _filtered(np.stack([signal, variance]), np.ones(signal.shape) if blur is None else blur)
+    from scipy.fft import dctn
+
+    shape = (signal.shape[0], signal.shape[1])
+    blur = _object_transfer(state, _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
+    spread = [sampled_picture([(dctn(one, type=2), blur)], shape, state.shift_px) for one in (signal, variance)]
     floor = 1e-12 * max(float(signal.max()), 1e-300)
     return np.maximum(spread[0], floor), np.maximum(spread[1], 0.0)

@@ -65,6 +65,18 @@ class FixedPattern:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FinePicture:
+    """A picture with sharp borders: cosine transform over cells finer than pixels, see `_fine_picture`.
+
+    Fields: transform (3 row, 3 column); scale: DN a unit of it; signal_DN (row, column): its pixel means.
+    """
+
+    transform: FloatArray
+    scale: float
+    signal_DN: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LineState:
     """One series on its way through the line; maps are (row, column), or (1, 1) where all pixels are alike.
 
@@ -74,6 +86,9 @@ class LineState:
         attenuation_scale: material of the scene -> factor on its attenuation.
         signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
             even illumination, before any spread.
+        picture: the signal as it was projected, finer than pixels, where it has sharp borders; what effects have made of
+            `signal_DN` since is their difference.
+        shift_px: of the object against its thickness maps, along rows and columns.
         object_transfers: blur of what stands in the beam.
         optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
         tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
@@ -94,6 +109,8 @@ class LineState:
     attenuation_scale: Mapping[str, float] = field(default_factory=dict)
     signal_DN: FloatArray
     variance_DN2: FloatArray
+    picture: FinePicture | None = None
+    shift_px: tuple[float, float] = (0.0, 0.0)
     object_transfers: tuple[Transfer, ...] = ()
     optical_transfers: tuple[Transfer, ...] = ()
     tails: tuple[tuple[float, Transfer], ...] = ()

@@ -51,7 +51,8 @@ class SeriesRequest:
     after_calibration (later than the series that calibrated the twin); previous: exposures before this one that lag may
     remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
     open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
-    material of the scene that is the product.
+    material of the scene that is the product; displacement_px: how far along rows and columns the scene is known to lie
+    from where its thickness maps have it.
     """
 
     kind: str
@@ -72,6 +73,7 @@ class SeriesRequest:
     averaged: int = 1
     open_signal_DN: float | None = None
     product_material: str | None = None
+    displacement_px: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -80,6 +82,8 @@ class SeriesRequest:
             raise InputError("frames of a series", received=min(self.frames, self.averaged), expected="1 or more")
         if not (math.isfinite(self.exposure_ms) and self.exposure_ms >= 0 and math.isfinite(self.start_s)):
             raise InputError("exposure_ms", received=self.exposure_ms, expected="a finite exposure of 0 ms or more")
+        if not all(math.isfinite(value) for value in self.displacement_px):
+            raise InputError("displacement_px", received=self.displacement_px, expected="two finite numbers, px")
         if self.belt_axis not in ("row", "column"):
             raise InputError("belt_axis", received=self.belt_axis, expected="row or column")
 
@@ -259,7 +263,13 @@ def final_state(
             kV_factor=state.kV_factor,
             use_measured_level=use_measured_level,
         )
-        state = replace(state, signal_DN=projection.signal_DN, variance_DN2=projection.variance_DN2)
+        state = replace(
+            state,
+            signal_DN=projection.signal_DN,
+            variance_DN2=projection.variance_DN2,
+            picture=projection.picture,
+            shift_px=request.displacement_px if request.thickness_mm else (0.0, 0.0),
+        )
     return _apply(state, twin, request, active, projection)
 
 

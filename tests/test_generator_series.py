@@ -8,7 +8,7 @@ import pytest
 
 from raytwin.acquisition.setting import filters_from_text, setting_from_text
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator._scene import find_borders
+from raytwin.generator._fine_picture import find_borders
 from raytwin.generator._spread import noise_pattern
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.line_state import LineState
@@ -198,9 +198,9 @@ def test_a_pixel_cut_by_an_opaque_edge_shows_the_share_that_is_open(series_line)
 
 def test_a_smooth_object_has_no_borders_and_a_step_is_found_where_it_is():
     column = np.indices((30, 30))[1]
-    assert find_borders(0.05 * column).pixel.size == 0
+    assert not find_borders(0.05 * column, least_depth=0.02).any_steps
     depth = np.clip(column - 14.25, 0.0, 1.0) * 3.0
-    found = find_borders(depth)
+    found = find_borders(depth, least_depth=0.02)
     assert np.array_equal(np.unique(found.pixel % 30), [15])
     np.testing.assert_allclose(found.covered, 0.75)
     np.testing.assert_allclose(found.sharpness, 1.0)

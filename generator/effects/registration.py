@@ -30,13 +30,19 @@ def displacement_px(
 def _displace(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if parameters["strength"] == 0 or not context.has_scene or state.signal_DN.shape != context.shape:
         return state
+    direction, mix = math.radians(parameters["direction_deg"]), math.radians(parameters["magnification_deg"])
+    shift = parameters["strength"] * math.cos(mix)
+    before = state.shift_px
+    state = replace(state, shift_px=(before[0] + shift * math.cos(direction), before[1] + shift * math.sin(direction)))
+    if mix == 0:
+        return state
     from scipy.ndimage import map_coordinates
 
     down, right = displacement_px(
         context.shape,
-        strength_px=parameters["strength"],
-        direction_deg=parameters["direction_deg"],
-        magnification_deg=parameters["magnification_deg"],
+        strength_px=parameters["strength"] * math.sin(mix),
+        direction_deg=0.0,
+        magnification_deg=90.0,
     )
     row, column = np.indices(context.shape, dtype=np.float64)
     places = np.stack([row - down, column - right])

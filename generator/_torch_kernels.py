@@ -5,9 +5,12 @@ normal numbers (one pixel in some ten thousand takes the next whole quantum).
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ._noise_constants import (
@@ -25,6 +28,7 @@ from ._noise_constants import (
 if TYPE_CHECKING:
     from .kernels import _Frames
 
+_SUMMANDS_AT_ONCE = 2**26  # pixels times energies of a projection: 0.25 GB
 _PIXELS_AT_ONCE = 2**24  # frames of a stack are taken together up to this many: some 60 bytes a pixel
 
 
@@ -231,7 +235,7 @@ def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
             return random_words(row_keys(request.key, frames, stage, high), wide)[places]
 
         excess = widened(maps["excess"])
-        noise[places] = few_quanta(*(chosen(one) for one in (level, slope, step, excess, quanta)), words)
+        noise[places] = few_quanta(chosen(level), chosen(slope), chosen(step), chosen(excess), chosen(quanta), words)
     if len(request.kernel) > 1 or reach:
         kernel = request.kernel[: 2 * reach + 1]
         noise = _spread(_spread(noise, kernel, 2, columns), kernel, 1, rows)
@@ -250,3 +254,39 @@ def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
     if request.steps_a_DN > 0:
         frame = torch.round(frame * request.steps_a_DN) * float(np.float32(1.0) / np.float32(request.steps_a_DN))
     return torch.clamp(frame, request.lowest, request.highest)
+
+
+@contextmanager
+def _single_precision() -> Iterator[None]:
+    """Matrix products in full single precision, whatever the caller allows for networks."""
+    import torch
+
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def project(
+    thickness: NDArray[np.float32], depth: NDArray[np.float64], share: NDArray[np.float64], *, device: str | None
+) -> Any:
+    """sum_j share[k, j] 2^(-sum_m depth[m, j] thickness[m, p]) (k, pixel) float32 on the device."""
+    import torch
+
+    where = torch_device(device)
+    paths = torch.from_numpy(thickness).to(where)
+    depths = torch.from_numpy(depth.astype(np.float32)).to(where)
+    shares = torch.from_numpy(share.astype(np.float32).T.copy()).to(where)
+    pixels, energies = thickness.shape[1], depth.shape[1]
+    result = torch.zeros((share.shape[0], pixels), dtype=torch.float32, device=where)
+    together = max(1, _SUMMANDS_AT_ONCE // max(energies, 1))
+    with torch.no_grad(), _single_precision():
+        for start in range(0, pixels, together):
+            part = paths[:, start : start + together]
+            exponent = torch.zeros((part.shape[1], energies), dtype=torch.float32, device=where)
+            for path, one in zip(part, depths, strict=True):
+                exponent.addr_(path, one, alpha=-1.0)
+            result[:, start : start + together] = (exponent.clamp_(-1e30, 126.0).exp2_() @ shares).T
+    return result

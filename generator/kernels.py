@@ -60,7 +60,7 @@ class _Frames:
     def of(self, name: str, frame: int) -> _FloatMap:
         """One frame's map of `name` (row or 1, column or 1)."""
         values: _FloatMap = getattr(self, name)
-        return values[frame if len(values) > 1 else 0]
+        return np.asarray(values[frame if len(values) > 1 else 0])
 
 
 def _map(name: str, values: ArrayLike, shape: tuple[int, int, int], *, low: float, unit: str) -> _FloatMap:

@@ -5,7 +5,7 @@ share each energy's coefficients.
 """
 
 import math
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,9 +72,39 @@ def checked_thickness(thickness_mm: ArrayLike, *, allow_negative: bool) -> NDArr
     return np.ascontiguousarray(given, dtype=np.float32)
 
 
+@overload
 def project_polychromatic(
-    thickness_mm: ArrayLike, mu_per_mm: ArrayLike, weights: ArrayLike, *, allow_negative: bool = False
-) -> NDArray[np.float32]:
+    thickness_mm: ArrayLike,
+    mu_per_mm: ArrayLike,
+    weights: ArrayLike,
+    *,
+    allow_negative: bool = False,
+    backend: Literal["cpu"] = "cpu",
+    device: str | None = None,
+) -> NDArray[np.float32]: ...
+
+
+@overload
+def project_polychromatic(
+    thickness_mm: ArrayLike,
+    mu_per_mm: ArrayLike,
+    weights: ArrayLike,
+    *,
+    allow_negative: bool = False,
+    backend: str,
+    device: str | None = None,
+) -> Any: ...
+
+
+def project_polychromatic(
+    thickness_mm: ArrayLike,
+    mu_per_mm: ArrayLike,
+    weights: ArrayLike,
+    *,
+    allow_negative: bool = False,
+    backend: str = "cpu",
+    device: str | None = None,
+) -> Any:
     """Weighted sums over energies behind an object (k, row, column), in the unit of the weights.
 
     result_k = sum_E weights_k(E) exp(-sum_m mu_m(E) t_m)
@@ -88,9 +118,11 @@ def project_polychromatic(
         weights: (k, energy) or (energy,): what a photon spectrum is worth, for example N m1 for the signal, N m2 for
             the variance and N D for the photons absorbed; 0 or more.
         allow_negative: take negative thicknesses as they stand (a solution of noisy measurements has them).
+        backend: `cpu` (compiled) or `torch`.
+        device: torch's name of the device; None for `cuda` where there is one, else `cpu`.
 
     Returns:
-        float32 (k, ...); k = 1 for weights (energy,).
+        float32 (k, ...), an array or with `torch` a tensor on the device; k = 1 for weights (energy,).
 
     Raises:
         InputError: NaN, infinite or negative thickness, coefficients or weights, or shapes that do not fit.
@@ -102,6 +134,14 @@ def project_polychromatic(
     mu, weight = _spectrum_arrays(mu_per_mm, weights, materials)
     scale = weight.sum(axis=1)
     pixels = int(np.prod(shape))
+    if backend not in ("cpu", "torch"):
+        raise InputError("backend", received=backend, expected="one of cpu, torch")
+    if backend == "torch":
+        from ._torch_kernels import project
+
+        share = weight / np.where(scale > 0, scale, 1.0)[:, None]
+        shares = project(thickness.reshape(materials, pixels), mu * math.log2(math.e), share, device=device)
+        return (shares * shares.new_tensor(scale)[:, None]).reshape(len(weight), *shape)
     result = np.empty((len(weight), pixels), dtype=np.float32)
     if materials == 0:
         result[:] = scale[:, None]

@@ -41,6 +41,24 @@ def test_projection_is_the_sum_over_energies(materials, moments):
     assert np.max(np.abs(result / exact(thickness, mu, weights) - 1.0)) < TOLERANCE
 
 
+@pytest.mark.parametrize("materials", [1, 2, 3])
+def test_torch_projects_the_same(materials):
+    rng = np.random.default_rng(materials)
+    thickness = rng.uniform(0.0, [[[60.0]], [[6.0]], [[9.0]]][:materials], size=(materials, 37, 53))
+    thickness[:, 0] = 0.0
+    thickness[0, 1] = 1e30
+    mu, weights = coefficients(materials), spectrum()
+    result = project_polychromatic(thickness, mu, weights, backend="torch", device="cpu").numpy()
+    expected = exact(thickness, mu, weights)
+    assert result.shape == (2, 37, 53)
+    assert np.all(np.abs(result - expected) <= TOLERANCE * expected)
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(InputError, match="backend: got gpu; expected one of cpu, torch"):
+        project_polychromatic(np.zeros((1, 2, 2)), coefficients(1), spectrum(), backend="gpu")
+
+
 @pytest.mark.parametrize("energies", [1, 2, 3, 5, 240])
 def test_any_number_of_energies_is_summed(energies):
     energies_keV = np.linspace(15.0, 120.0, energies)

@@ -39,6 +39,9 @@
 A thickness map of your own is a product or a foreign object with shape = "map", file = "fillet.npz" (or several, files = [...]):
 .npz with one array a material, .h5 with thickness_mm/<material>, or a TIFF of one material; mm, at `pixel_mm` in the
 object's plane.
+
+A mesh of your own has shape = "mesh", file = "part.stl" (or files) and, where its unit is not the millimetre, scale_mm = mm a unit
+(a number or a range).
 """
 
 import math
@@ -56,6 +59,7 @@ from ..errors import FileFormatError, InputError
 from ..files import sha256_of_file
 from ..materials import material_from_name
 from .kinds import KINDS
+from .mesh import Mesh, read_mesh
 from .shapes import (
     Fillet,
     Heights,
@@ -84,6 +88,7 @@ _COMMON_WORDS = (
     "file",
     "files",
     "pixel_mm",
+    "scale_mm",
 )
 _IMAGE_WORDS = {
     "with_foreign_object": (0.5, 0.5),
@@ -104,7 +109,7 @@ _POSES = 60
 class ObjectKind:
     """One [[product]] or [[foreign_object]] of a description.
 
-    Fields: name; shape (key of KINDS, or `map`); material; weight; ranges: parameter -> (low, high); turn_deg; where;
+    Fields: name; shape (key of KINDS, `map` or `mesh`); material; weight; ranges: parameter -> (low, high); turn_deg; where;
     orientation; whole: refused where it reaches the border of the field; files and pixel_mm of a map.
     """
 
@@ -245,14 +250,17 @@ def _kind(table: Mapping[str, Any], title: str, file: Path) -> ObjectKind:
     where = f"{file.name}, {title}"
     is_product = title.startswith("product")
     shape = table.get("shape")
-    known = {**KINDS, "map": None}
+    known = {**KINDS, "map": None, "mesh": None}
     if not isinstance(shape, str) or shape not in known:
         _check_words({str(shape): None}, known, where=f"{where}, shape")
     is_map = shape == "map"
-    parameters = {} if is_map else KINDS[str(shape)].parameters
-    words = [*_COMMON_WORDS, *parameters]
-    if not is_map:
-        words = [word for word in words if word not in ("file", "files", "pixel_mm")]
+    is_mesh = shape == "mesh"
+    parameters = {} if is_map or is_mesh else KINDS[str(shape)].parameters
+    # words of files are only for shapes that come from one
+    foreign_words = {"map": ("scale_mm",), "mesh": ("pixel_mm",)}.get(
+        str(shape), ("file", "files", "pixel_mm", "scale_mm")
+    )
+    words = [word for word in (*_COMMON_WORDS, *parameters) if word not in foreign_words]
     _check_words(table, words, where=f"{where} ({shape})")
     ranges: dict[str, Range] = {}
     for word, default in parameters.items():
@@ -277,7 +285,9 @@ def _kind(table: Mapping[str, Any], title: str, file: Path) -> ObjectKind:
     for word, choices in (("where", WHERE), ("orientation", ORIENTATIONS)):
         if texts[word] not in choices:
             raise InputError(f"{where}, {word}", received=repr(texts[word]), expected="one of " + ", ".join(choices))
-    files = _files(table, file, where) if is_map else ()
+    files = _files(table, file, where, needs_pixel=is_map) if is_map or is_mesh else ()
+    if is_mesh:
+        ranges["scale_mm"] = _range(table.get("scale_mm", 1.0), f"{where}, scale_mm", lowest=1e-9)
     if texts["material"]:
         material_from_name(texts["material"])
     elif not (is_map and all(path.suffix.lower() in (".npz", ".h5", ".hdf5") for path in files)):
@@ -303,11 +313,11 @@ def _kind(table: Mapping[str, Any], title: str, file: Path) -> ObjectKind:
     )
 
 
-def _files(table: Mapping[str, Any], file: Path, where: str) -> tuple[Path, ...]:
+def _files(table: Mapping[str, Any], file: Path, where: str, *, needs_pixel: bool) -> tuple[Path, ...]:
     given = table.get("files", [table["file"]] if "file" in table else [])
     if not isinstance(given, list) or not given or not all(isinstance(one, str) for one in given):
-        raise InputError(where, received="no file", expected='file = "map.npz", or files = ["a.npz", "b.npz"]')
-    if "pixel_mm" not in table:
+        raise InputError(where, received="no file", expected='file = "...", or files = ["...", "..."]')
+    if needs_pixel and "pixel_mm" not in table:
         raise InputError(where, received="no pixel_mm", expected="pixel_mm = pitch of the map in the object's plane")
     return tuple(file.parent / one for one in given)
 
@@ -359,7 +369,7 @@ class Individual:
     kind: ObjectKind
     name: str
     size_mm: float
-    body: Shape | None
+    body: Shape | Mesh | None
     layers: Mapping[str, Heights | Fillet]
 
 
@@ -378,6 +388,8 @@ class Placed:
         one = self.individual
         if one.body is not None:
             place = np.array([*self.place_mm, 0.0])
+            if isinstance(one.body, Mesh):
+                return {one.kind.material: one.body.lengths_mm(rays, rotation=self.rotation, place_mm=place)}
             return {one.kind.material: path_lengths_mm(one.body, rays, rotation=self.rotation, place_mm=place)}
         return {
             material: layer_lengths_mm(layer, rays, angle=self.angle, mirrored=self.mirrored, place_mm=self.place_mm)
@@ -426,6 +438,10 @@ def sample_individual(kind: ObjectKind, *, name: str, rng: np.random.Generator) 
         size_mm = float(np.ptp(covered, axis=0).max() + 1) * kind.pixel_mm if len(covered) else 0.0
         return Individual(kind=kind, name=f"{name}:{path.stem}", size_mm=size_mm, body=None, layers=layers)
     values = {word: float(rng.uniform(*ends)) for word, ends in kind.ranges.items()}
+    if kind.shape == "mesh":
+        path = kind.files[int(rng.integers(len(kind.files)))]
+        mesh = read_mesh(path, scale=values["scale_mm"])
+        return Individual(kind=kind, name=f"{name}:{path.stem}", size_mm=mesh.longest_mm, body=mesh, layers={})
     made = KINDS[kind.shape].make(values, rng)
     size_mm = max(values[word] for word in ("length_mm", "width_mm", "height_mm", "diameter_mm") if word in values)
     if isinstance(made, Fillet):

@@ -20,8 +20,8 @@ def _left_of(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> 
     """Whether a point lies left of a -> b; a point on the edge belongs to one of the two triangles that share it."""
     side = _side(ax, ay, bx, by, x, y)
     if side != 0.0:
-        return side > 0.0
-    return by < ay or (by == ay and bx > ax)
+        return bool(side > 0.0)
+    return bool(by < ay or (by == ay and bx > ax))
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

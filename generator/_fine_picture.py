@@ -190,6 +190,14 @@ def fine_frequencies(length: int) -> FloatArray:
     return np.asarray(np.arange(FINE * length) / (2.0 * length))
 
 
+def kept_cosines(length: int, psf_sigma_px: float) -> int:
+    """Number of cosines of `length` pixels' cells along an axis that a Gaussian spread leaves above 1e-5."""
+    if psf_sigma_px <= 0:
+        return FINE * length
+    highest = np.sqrt(np.log(1e5) / 2.0) / (np.pi * psf_sigma_px)
+    return int(min(FINE * length, max(np.ceil(2.0 * length * highest), length + 1)))
+
+
 def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float) -> tuple[FloatArray, ...]:
     """Amplitudes of the cosines, and of the sines where `shift_px` is not 0, of a picture sampled at the pixels.
 
@@ -197,7 +205,8 @@ def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float
     pixel can tell apart (frequencies beyond half a cycle a pixel) is added up.
 
     Args:
-        transform: cosine transform whose `axis` has `length` amplitudes (pixels) or three times as many (cells).
+        transform: cosine transform whose `axis` has `length` amplitudes (pixels), or more, up to three times as many
+            (the first of those over cells).
         length: pixels along the axis.
         shift_px: displacement.
 
@@ -205,24 +214,32 @@ def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float
         Amplitudes for `scipy.fft.idct`, and for `idst` after a shift, `length` along the axis.
     """
     found = np.moveaxis(transform, axis, 0)
-    fine = found.shape[0] > length
     if shift_px == 0.0:
-        return (np.moveaxis(_fold_cosines(found, length) if fine else found, 0, axis),)
+        return (np.moveaxis(_fold(found, length, -1.0), 0, axis),)
     phase = np.pi * shift_px * np.arange(found.shape[0]) / length
     along = (slice(None), *([None] * (found.ndim - 1)))
-    even, odd = found * np.cos(phase)[along], found * np.sin(phase)[along]
-    cosines = _fold_cosines(even, length) if fine else even
-    sines = np.zeros_like(cosines)
-    sines[:-1] = odd[1:length]
-    if fine:
-        sines[:-1] += odd[2 * length - 1 : length : -1] - odd[2 * length + 1 :]
-        sines[-1] = 2.0 * odd[length]
-        sines /= FINE
-    return np.moveaxis(cosines, 0, axis), np.moveaxis(sines, 0, axis)
+    odd = _fold(found * np.sin(phase)[along], length, 1.0)
+    sines = np.zeros_like(odd)
+    sines[:-1] = odd[1:]
+    if found.shape[0] > length:
+        sines[-1] = 2.0 / FINE * found[length] * np.sin(phase[length])
+    return (
+        np.moveaxis(_fold(found * np.cos(phase)[along], length, -1.0), 0, axis),
+        np.moveaxis(sines, 0, axis),
+    )
 
 
-def _fold_cosines(found: FloatArray, length: int) -> FloatArray:
-    return np.asarray((found[:length] - found[2 * length : length : -1] - found[2 * length :]) / FINE)
+def _fold(found: FloatArray, length: int, sign: float) -> FloatArray:
+    """Amplitudes 0..length-1 with those above added: 2 length - k with `sign`, 2 length + k taken off."""
+    count = found.shape[0]
+    if count == length:
+        return found
+    result = found[:length] / FINE
+    middle = found[length + 1 : 2 * length + 1] * (sign / FINE)  # k = length + 1 ... stands at 2 length - k
+    result[length - middle.shape[0] :] += middle[::-1]
+    if count > 2 * length:
+        result[: count - 2 * length] -= found[2 * length :] / FINE
+    return result
 
 
 def sampled_picture(

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ._fine_picture import fine_frequencies, sampled_picture
+from ._fine_picture import fine_frequencies, kept_cosines, sampled_picture
 from .line_state import FloatArray, LineState
 from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
 
@@ -198,15 +198,18 @@ def spread_maps(
     signals: list[tuple[FloatArray, FloatArray | None]] = []
     along_columns: list[FloatArray | None] = []
     if state.picture is not None:
-        fine = fine_frequencies(shape[0])[:, None], fine_frequencies(shape[1])[None, :]
-        sharp = state.picture.transform * state.picture.scale
+        # a tail holds a share of light that reaches further up than the calibrated spread
+        kept = [kept_cosines(length, 0.0 if state.tails else psf_sigma_px) for length in shape]
+        fine = fine_frequencies(shape[0])[: kept[0], None], fine_frequencies(shape[1])[None, : kept[1]]
+        sharp = state.picture.transform[: kept[0], : kept[1]]
         blur = _object_transfer(state, *fine)
         if state.tails or state.optical_transfers:
-            whole = optical_transfer(state, psf_model, psf_sigma_px, *fine)
+            whole = optical_transfer(state, psf_model, psf_sigma_px, *fine) * state.picture.scale
             signals.append((sharp, whole if blur is None else whole * blur))
             along_columns.append(None)
         else:
             rows, columns = (base_transfer_1d(psf_model, psf_sigma_px, frequency) for frequency in fine)
+            rows = rows * state.picture.scale
             signals.append((sharp, rows if blur is None else rows * blur))
             along_columns.append(columns)
     if state.picture is None or signal_DN is not state.picture.signal_DN:

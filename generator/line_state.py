@@ -40,7 +40,7 @@ STAGES = (
 )
 
 FloatArray = NDArray[np.float64]
-# (cycles per pixel along rows (n, 1), along columns (1, m)) -> factor (n, m); even in both
+# (cycles per pixel along rows (n, 1), along columns (1, m)) -> factor that broadcasts to (n, m); even in both
 Transfer = Callable[[FloatArray, FloatArray], FloatArray]
 
 

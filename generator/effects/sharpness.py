@@ -29,7 +29,8 @@ def _blur_by_focal_spot(state: LineState, parameters: Mapping[str, float], conte
     along_row, along_column = sigma_px * math.sqrt(parameters["aspect"]), sigma_px / math.sqrt(parameters["aspect"])
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        return np.asarray(np.exp(-2 * np.pi**2 * ((along_row * f_row) ** 2 + (along_column * f_column) ** 2)))
+        rows, columns = (np.exp(-2 * (np.pi * s * f) ** 2) for s, f in ((along_row, f_row), (along_column, f_column)))
+        return np.asarray(rows * columns)
 
     return replace(state, object_transfers=(*state.object_transfers, transfer))
 
@@ -76,8 +77,7 @@ def _blur_by_motion(state: LineState, parameters: Mapping[str, float], context: 
     along_rows = request.belt_axis != "column"
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        moving, other = (f_row, f_column) if along_rows else (f_column, f_row)
-        return np.asarray(np.sinc(length_px * moving) + 0.0 * other)
+        return np.asarray(np.sinc(length_px * (f_row if along_rows else f_column)))
 
     return replace(state, object_transfers=(*state.object_transfers, transfer))
 

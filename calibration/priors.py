@@ -48,7 +48,7 @@ PRIORS: dict[str, Prior] = {
         reason="light only, 0.8-1: escape of K photons, which takes CsI and Gd2O2S screens down to 0.7, is in the response",
     ),
     "spectrum_model": Prior(
-        centre=0.5, sd=0.7, reason="SpekPy's casim is 0, its kqp 1: the truth between them or somewhat beyond"
+        centre=0.5, sd=0.5, reason="SpekPy's casim is 0, its kqp 1: mean and sd of the two, taken as equally likely"
     ),
     "yield_exponent": Prior(
         centre=0.0, sd=0.01, reason="output against voltage beyond the models' own difference: 1 % from 40 to 110 kV"
@@ -62,7 +62,7 @@ PRIORS: dict[str, Prior] = {
         centre=0.0, sd=0.1, reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %"
     ),
     "scintillator_table": Prior(
-        centre=0.67, sd=0.6, reason="0 is xraylib, 1 the mean of Chantler's and PENELOPE's: the three tables' own mean"
+        centre=0.67, sd=0.47, reason="0 is xraylib, 1 the mean of Chantler's and PENELOPE's: three equally likely tables"
     ),
 }
 # where measured spectra stand in for the model, windows and housing are in them
@@ -87,17 +87,17 @@ COUNTING_SWANK = Prior(
 )
 ATTENUATION_SCALE = Prior(centre=0.0, sd=0.01, reason="density and thickness of a filter")
 TABLE_SHARE = Prior(
-    centre=0.33, sd=0.6, reason="0 is xraylib, 1 the other table: the mean of xraylib, Chantler and PENELOPE"
+    centre=0.33, sd=0.47, reason="0 is xraylib, 1 the other table: xraylib, Chantler and PENELOPE are equally likely"
 )
 
 # The sizes of these small departures differ from line to line, together: one factor for all their standard deviations,
-# learned from the data. Its median is a third, its upper 95 % bound 1.7: most lines show little of all this, some much.
+# learned from the data. Its median is 0.3, its upper 95 % bound 1.4: most lines show little of all this, some much.
 DEPARTURES = ("kV_tilt", "yield_exponent", "hardness_exponent", "escape_scale", "log_mu_")
-DEPARTURE_FACTOR = 0.35
+DEPARTURE_FACTOR = 0.3
 LOG_DEPARTURE_SD = 0.8
 
 # Departure of single levels and gains from any such model: reproducibility of tube and filters, and physics that is not
 # in it. Learned from the levels with these as the prior: logarithm of the relative standard deviation.
-LEVEL_DISCREPANCY = 0.0007
+LEVEL_DISCREPANCY = 0.0006
 GAIN_DISCREPANCY = 0.002
 LOG_DISCREPANCY_SD = 0.8  # a factor of 2.2 either way

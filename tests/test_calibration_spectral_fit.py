@@ -1,0 +1,331 @@
+"""The spectral posterior: derivatives, intervals that hold for lines drawn from the priors, tables, wedges, spectra."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom, truncnorm
+
+from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.setting import Filter, filters_from_text
+from raytwin.calibration.priors import DEPARTURE_FACTOR, DEPARTURES, GAIN_DISCREPANCY, LEVEL_DISCREPANCY
+from raytwin.calibration.spectral_fit import (
+    OTHER_SCINTILLATOR,
+    SHAPE_PARAMETERS,
+    Transmission,
+    correction_from_spectra,
+    fit_spectrum,
+    geometry_factor,
+    model_for,
+    priors_for,
+)
+from raytwin.errors import FitError, InputError
+from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.twin import Estimate, Level, estimate_from_sd
+from raytwin.materials import transmission
+from raytwin.spectra import Spectrum, detector_response, energy_grid_keV, tube_spectrum
+
+INSTRUMENT = Instrument(
+    pixel_mm=0.15,
+    source_detector_mm=1059.0,
+    source_object_mm=990.0,
+    scintillator=filters_from_text("CsI:0.5"),
+    maximum_power_w=90.0,
+)
+BEAMS = tuple(
+    OpenBeam(kV=kV, filters=filters_from_text(text)) for kV, text in ((40, "Cu:0.05"), (40, ""), (90, "Cu:0.05"))
+)
+FACTOR = geometry_factor(source_detector_mm=1059.0, pixel_mm=0.15)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_for(INSTRUMENT, materials=(), highest_kV=120.0)
+
+
+def from_prior(model, rng):
+    """One parameter set drawn from the priors, departures at their typical size."""
+    values = []
+    for name, prior in priors_for(model, scintillator_declared=True).items():
+        sd = prior.sd * (DEPARTURE_FACTOR if name.startswith(DEPARTURES) else 1.0)
+        low, high = (prior.low - prior.centre) / sd, (prior.high - prior.centre) / sd
+        values.append(prior.centre + sd * truncnorm.rvs(low, high, random_state=rng))
+    full = np.array(values)
+    full[model.names.index("log_DN_per_keV")] = math.log(0.1)
+    return full
+
+
+def typical(model, **values):
+    full = np.array([prior.centre for prior in priors_for(model, scintillator_declared=True).values()])
+    full[model.names.index("log_DN_per_keV")] = math.log(0.1)
+    for name, value in values.items():
+        full[model.names.index(name)] = value
+    return full
+
+
+def level(kV, filters, rate, gain, *, rate_sd=0.001, gain_sd=0.01):
+    """A measured level, rate per mAs at 1 m and 1 mm2, with relative standard deviations."""
+    return Level(
+        kV=kV,
+        filters=filters,
+        gain_DN=estimate_from_sd(gain, 1.5 * gain_sd * gain),
+        photon_transfer_slope_DN=estimate_from_sd(0.4 * gain, gain_sd * 0.4 * gain),
+        rate_DN_per_mAs=estimate_from_sd(rate * FACTOR, rate_sd * rate * FACTOR),
+        source_detector_mm=1059.0,
+        saturation_DN=None,
+        flat_shape=np.ones((1, 1), dtype=np.float32),
+        series=(f"{kV:g}",),
+        role="calibration",
+    )
+
+
+def levels_of(model, parameters, beams, rng=None):
+    """Levels of a parameter set, with sampling noise and discrepancy when a generator is given."""
+    found = []
+    for beam in beams:
+        signal = model.signal(parameters[None, :], beam)
+        rate, gain = float(signal.rate_DN_per_mAs[0]), float(signal.gain_DN[0])
+        if rng is not None:
+            rate *= math.exp(math.hypot(0.001, LEVEL_DISCREPANCY) * rng.standard_normal())
+            gain *= math.exp(math.hypot(0.01, GAIN_DISCREPANCY) * rng.standard_normal())
+        found.append(level(beam.kV, beam.filters, rate, gain))
+    return found
+
+
+def test_derivatives_are_those_of_the_signal(model):
+    rng = np.random.default_rng(1)
+    names = [name for name in model.names if name not in SHAPE_PARAMETERS]
+    # as the fit takes them: the filtration, scintillator and voltage of a draw, the rest at the prior's centre
+    samples = np.array([typical(model) for _ in range(5)])
+    drawn = [model.names.index(name) for name in model.names if name in SHAPE_PARAMETERS]
+    samples[:, drawn] = np.array([from_prior(model, rng) for _ in range(5)])[:, drawn]
+    for beam in (OpenBeam(kV=90.0, filters=filters_from_text("Cu:0.1+Al:1")), OpenBeam(kV=45.0, filters=())):
+        logs, rates, gains = model.log_derivatives(samples, beam, names)
+        signal = model.signal(samples, beam)
+        assert logs[0] == pytest.approx(np.log(signal.rate_DN_per_mAs), abs=1e-12)
+        assert logs[1] == pytest.approx(np.log(signal.gain_DN), abs=1e-12)
+        for column, name in enumerate(names):
+            step = np.zeros(len(model.names))
+            # the voltage error is piecewise linear between its nodes, and the derivative takes both sides
+            step[model.names.index(name)] = 2e-3
+            up, down = model.signal(samples + step, beam), model.signal(samples - step, beam)
+            rate = np.log(up.rate_DN_per_mAs / down.rate_DN_per_mAs) / 4e-3
+            gain = np.log(up.gain_DN / down.gain_DN) / 4e-3
+            tolerance = {"rel": 1e-4, "abs": 1e-6}
+            if name == "kV_tilt":
+                tolerance = {"rel": 0.02, "abs": 1e-5}
+            if name.startswith("log_mu"):
+                tolerance = {"rel": 0.01}  # the tables' share of a scale is left out
+            assert rates[:, column] == pytest.approx(rate, **tolerance), name
+            assert gains[:, column] == pytest.approx(gain, **tolerance), name
+
+
+@pytest.mark.parametrize("table", ["chantler", "penelope"])
+def test_a_whole_share_of_another_table_is_that_table(model, table):
+    filters = filters_from_text("Cu:0.1+Al:1")
+    moved = np.zeros((1, len(model.names)))
+    for material in ("Al", "Cu"):
+        moved[0, model.names.index(f"{table}_{material}")] = 1.0
+    bare = model.weights(np.zeros((1, len(model.names))), OpenBeam(kV=90.0, filters=()))[0]
+    behind = model.weights(moved, OpenBeam(kV=90.0, filters=filters))[0]
+    energies = model.energies_keV[: len(bare)]
+    # near copper's K edge at 8.98 keV the tables' edges differ
+    seen = (bare > 1e-6 * bare.max()) & (energies > 12)
+    expected = transmission(filters, energies[seen], table=table)
+    assert behind[seen] / bare[seen] == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_whole_share_of_the_other_spectrum_model_is_that_model(model):
+    moved = np.zeros((1, len(model.names)))
+    moved[0, model.names.index("spectrum_model")] = 1.0
+    other = SpectralModel(model="kqp", filter_materials=("Al", "Cu"))
+    for kV in (40.0, 90.0):
+        beam = OpenBeam(kV=kV, filters=filters_from_text("Al:2"))
+        ours = model.signal(moved, beam)
+        theirs = other.signal(np.zeros((1, len(other.names))), beam)
+        assert ours.rate_DN_per_mAs[0] == pytest.approx(theirs.rate_DN_per_mAs[0], rel=1e-3)
+        assert ours.gain_DN[0] == pytest.approx(theirs.gain_DN[0], rel=1e-3)
+
+
+def test_intervals_hold_for_lines_drawn_from_the_priors(model):
+    rng = np.random.default_rng(5)
+    new = [
+        OpenBeam(kV=60.0, filters=filters_from_text("Al:2")),
+        OpenBeam(kV=110.0, filters=filters_from_text("Cu:0.1")),
+    ]
+    inside, lines = 0, 8
+    for _ in range(lines):
+        truth = from_prior(model, rng)
+        posterior = fit_spectrum(levels_of(model, truth, BEAMS, rng), INSTRUMENT, rng=rng).posterior
+        for beam in new:
+            draws = np.log(model.signal(posterior.samples, beam).rate_DN_per_mAs)
+            exact = float(np.log(model.signal(truth[None, :], beam).rate_DN_per_mAs[0]))
+            middle, low, high = np.quantile(draws, [0.5, 0.025, 0.975])
+            inside += (
+                middle - math.hypot(middle - low, 1.96 * 0.001) <= exact <= middle + math.hypot(high - middle, 0.002)
+            )
+    # two beams of a line go together: bounds as if only the lines counted, at 1e-3
+    assert inside / 2 >= binom.ppf(1e-3, lines, 0.95)
+
+
+def test_more_levels_narrow_the_prediction(model):
+    truth = typical(model, inherent_filtration_mm_Al=0.8, kV_error=0.004)
+    new = OpenBeam(kV=60.0, filters=filters_from_text("Al:2"))
+    widths = []
+    for count in (1, 2, 3):
+        fit = fit_spectrum(levels_of(model, truth, BEAMS[:count]), INSTRUMENT, rng=np.random.default_rng(0))
+        widths.append(float(np.std(np.log(model.signal(fit.posterior.samples, new).rate_DN_per_mAs))))
+    assert widths[0] > 1.5 * widths[1]
+    assert widths[1] > widths[2]
+
+
+def test_a_wedge_at_one_kV_tells_what_levels_at_one_kV_do_not(model):
+    truth = typical(model, inherent_filtration_mm_Al=0.6)
+    beam = OpenBeam(kV=60.0, filters=())
+    steps = []
+    for thickness in (1.0, 2.0, 5.0):
+        layer = Filter(material="Al", thickness_mm=thickness)
+        behind = model.signal(truth[None, :], OpenBeam(kV=60.0, filters=(layer,))).rate_DN_per_mAs[0]
+        value = float(behind / model.signal(truth[None, :], beam).rate_DN_per_mAs[0])
+        steps.append(Transmission(kV=60.0, filters=(), layers=(layer,), value=value, relative_sd=0.002))
+    levels = levels_of(model, truth, [beam])
+    without = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(0)).posterior
+    with_wedge = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(0), transmissions=steps).posterior
+    before, after = (item.column("inherent_filtration_mm_Al") for item in (without, with_wedge))
+    assert np.std(after) < 0.5 * np.std(before)
+    assert abs(np.mean(after) - 0.6) < 3 * np.std(after)
+
+
+def test_levels_that_contradict_the_model_raise_the_learned_discrepancy(model):
+    beams = [OpenBeam(kV=kV, filters=filters_from_text(text)) for kV in (40.0, 60.0, 90.0) for text in ("", "Cu:0.05")]
+    truth = typical(model)
+    smooth = levels_of(model, truth, beams)
+    rough = [
+        level(item.kV, item.filters, item.rate_DN_per_mAs.value / FACTOR * (1 + 0.02 * sign), item.gain_DN.value)
+        for item, sign in zip(smooth, (1, -1, -1, 1, 1, -1), strict=True)
+    ]
+    found = [fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(2)) for levels in (smooth, rough)]
+    assert found[0].discrepancy["level"][0] < 0.0015
+    assert found[1].discrepancy["level"][0] > 0.004
+    assert found[1].posterior.level_discrepancy > 4 * found[0].posterior.level_discrepancy
+
+
+def test_without_a_declared_scintillator_both_kinds_are_weighed():
+    instrument = Instrument(pixel_mm=0.15, source_detector_mm=1059.0)
+    real = SpectralModel(scintillator=OTHER_SCINTILLATOR, filter_materials=("Al", "Cu"))
+    beams = [
+        OpenBeam(kV=kV, filters=filters_from_text(text)) for kV in (30.0, 45.0, 60.0, 90.0) for text in ("", "Al:2")
+    ]
+    truth = typical(real, inherent_filtration_mm_Al=0.8)
+    few = fit_spectrum(levels_of(real, truth, beams[:1]), instrument, rng=np.random.default_rng(3)).posterior
+    many = fit_spectrum(levels_of(real, truth, beams), instrument, rng=np.random.default_rng(3)).posterior
+    assert few.alternative == OTHER_SCINTILLATOR
+    shares = [np.mean(item.column("scintillator_alternative")) for item in (few, many)]
+    assert 0.1 < shares[0] < 0.9
+    assert shares[1] > 0.95  # caesium iodide's K edges at 33 and 36 keV are not there
+    new = OpenBeam(kV=75.0, filters=filters_from_text("Cu:0.1"))
+    wide = SpectralModel(alternative=OTHER_SCINTILLATOR, filter_materials=("Al", "Cu"))
+    draws = np.log(wide.signal(many.samples, new).rate_DN_per_mAs)
+    exact = math.log(real.signal(truth[None, :], new).rate_DN_per_mAs[0])
+    assert abs(np.mean(draws) - exact) < 3 * np.std(draws) + 0.002
+
+
+def test_the_swank_factor_stays_below_one_and_the_levels_where_they_were(model):
+    truth = typical(model, log_swank=-0.001)
+    posterior = fit_spectrum(levels_of(model, truth, BEAMS), INSTRUMENT, rng=np.random.default_rng(4)).posterior
+    assert np.max(posterior.column("log_swank")) <= 0.0
+    for beam, item in zip(BEAMS, levels_of(model, truth, BEAMS), strict=True):
+        signal = model.signal(posterior.samples, beam)
+        assert np.std(np.log(signal.rate_DN_per_mAs)) < 0.003
+        assert np.median(signal.rate_DN_per_mAs) * FACTOR == pytest.approx(item.rate_DN_per_mAs.value, rel=0.003)
+
+
+def test_the_most_probable_set_fits_the_levels(model):
+    truth = typical(model, inherent_filtration_mm_Al=1.4, kV_error=-0.006)
+    fit = fit_spectrum(levels_of(model, truth, BEAMS), INSTRUMENT, rng=np.random.default_rng(6))
+    assert fit.chi_square < 0.5
+    assert fit.effective_draws > 500
+    assert fit.data == 2 * len(BEAMS)
+
+
+def test_a_set_of_fewer_names_counts_what_it_lacks_as_nothing(model):
+    names = model.names[:8]
+    older = SpectralModel(scintillator=INSTRUMENT.scintillator, names=names, highest_kV=120.0)
+    parameters = typical(model, inherent_filtration_mm_Al=0.9)[:8]
+    full = np.zeros(len(model.names))
+    full[:8] = parameters
+    for beam in BEAMS:
+        ours, theirs = older.signal(parameters[None, :], beam), model.signal(full[None, :], beam)
+        assert ours.rate_DN_per_mAs == pytest.approx(theirs.rate_DN_per_mAs, rel=1e-9)
+        assert ours.gain_DN == pytest.approx(theirs.gain_DN, rel=1e-9)
+
+
+def measured_spectrum(kV, *, absolute=True):
+    """A tube that the model does not know: another physics model, rough anode, 1.3 mm Al in its housing."""
+    bare = tube_spectrum(kV=kV, model="kqp", filters=filters_from_text("Al:1.3+W:0.001"))
+    return Spectrum(
+        energies_keV=bare.energies_keV, fluence=1.2 * bare.fluence, kV=kV, model="file tube.csv", absolute=absolute
+    )
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_measured_spectrum_stands_in_for_the_model_at_its_voltage(absolute):
+    spectra = [measured_spectrum(kV, absolute=absolute) for kV in (50.0, 90.0)]
+    correction = correction_from_spectra(spectra, INSTRUMENT)
+    assert correction.relative is not absolute
+    corrected = model_for(INSTRUMENT, materials=(), highest_kV=90.0, correction=correction)
+    ratios = []
+    for spectrum in spectra:
+        for text in ("", "Al:2", "Cu:0.1"):
+            filters = filters_from_text(text)
+            response = detector_response(
+                scintillator=INSTRUMENT.scintillator, energies_keV=energy_grid_keV(spectrum.kV)
+            )
+            passed = transmission(filters, spectrum.energies_keV)
+            exact = np.sum(spectrum.fluence * passed * response.mean_deposited_keV) * spectrum.bin_width_keV / 100
+            signal = corrected.signal(np.zeros((1, len(corrected.names))), OpenBeam(kV=spectrum.kV, filters=filters))
+            ratios.append(float(signal.rate_DN_per_mAs[0] / exact))
+    ratios = np.array(ratios).reshape(2, 3)
+    if not absolute:
+        ratios = ratios / ratios[:, :1]
+    # half-keV bins of the file against the model's sums, smoothing over 1 keV, and the end point that is left out
+    assert ratios == pytest.approx(1.0, abs=0.02)
+
+
+def test_measured_spectra_fix_the_filtration_and_what_follows_from_it():
+    spectra = [measured_spectrum(kV) for kV in (50.0, 90.0)]
+    known = model_for(
+        INSTRUMENT, materials=(), highest_kV=90.0, correction=correction_from_spectra(spectra, INSTRUMENT)
+    )
+    truth = typical(known, inherent_filtration_mm_Al=0.0, spectrum_model=0.0)
+    levels = levels_of(known, truth, [OpenBeam(kV=50.0, filters=()), OpenBeam(kV=90.0, filters=())])
+    posterior = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(0), spectra=spectra).posterior
+    assert posterior.correction is not None
+    assert posterior.interval("inherent_filtration_mm_Al").high < 0.3
+    new = OpenBeam(kV=70.0, filters=filters_from_text("Al:1"))
+    draws = np.log(known.signal(posterior.samples, new).rate_DN_per_mAs)
+    exact = math.log(known.signal(truth[None, :], new).rate_DN_per_mAs[0])
+    assert abs(np.median(draws) - exact) < 0.015
+
+
+def test_what_cannot_be_fitted_is_said():
+    with pytest.raises(FitError, match="no flat series states its kV"):
+        fit_spectrum([], INSTRUMENT, rng=np.random.default_rng(0))
+    nameless = Spectrum(energies_keV=energy_grid_keV(40.0), fluence=np.ones(energy_grid_keV(40.0).size))
+    with pytest.raises(InputError, match="each spectrum with a tube voltage of its own"):
+        correction_from_spectra([nameless], INSTRUMENT)
+    twice = [measured_spectrum(50.0), measured_spectrum(50.0)]
+    with pytest.raises(InputError, match="write FILE:kV"):
+        correction_from_spectra(twice, INSTRUMENT)
+
+
+def test_an_unknown_gain_carries_no_weight(model):
+    truth = typical(model)
+    levels = []
+    for item in levels_of(model, truth, BEAMS[:2]):
+        wide = Estimate(value=item.gain_DN.value, low=-40.0, high=60.0)
+        levels.append(level(item.kV, item.filters, item.rate_DN_per_mAs.value / FACTOR, item.gain_DN.value))
+        object.__setattr__(levels[-1], "gain_DN", wide)
+        object.__setattr__(levels[-1], "photon_transfer_slope_DN", wide)
+    posterior = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(0)).posterior
+    assert np.std(posterior.column("log_DN_per_keV")) > 0.2

@@ -71,9 +71,11 @@ def test_quanta_have_the_mean_variance_and_skewness_of_a_compound_poisson_number
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("spread", [0.0, 0.1, 0.5])
-@pytest.mark.parametrize("level", [0.1, 0.5, 1.0, 3.0, 10.0, 19.9, 20.1, 50.0, 100.0, 240.0, 1e3, 2e3, 1e4, 1e5])
+@pytest.mark.parametrize(
+    ("level", "spread", "backend"),
+    [(level, spread, "cpu") for level in LEVELS for spread in (0.0, 0.3)]
+    + [(level, 0.3, "torch") for level in (0.1, 5.0, 20.1, 240.0)],
+)
 def test_ten_million_quanta_have_the_moments_of_a_compound_poisson_number(level, spread, backend):
     check_moments(level, spread, TEN_MILLION, backend, key=21)
 
@@ -98,10 +100,13 @@ def test_equal_quanta_follow_the_poisson_law(level):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("level", [0.1, 1.0, 3.0, 10.0, 19.9, 20.1, 25.0, 35.0, 100.0, 240.0, 2e3, 1e5])
+@pytest.mark.parametrize(
+    ("level", "backend"),
+    [(level, "cpu") for level in (0.1, 1.0, 3.0, 10.0, 19.9, 20.1, 25.0, 35.0, 100.0, 240.0, 2e3, 1e5)]
+    + [(level, "torch") for level in (1.0, 20.1, 240.0)],
+)
 def test_ten_million_equal_quanta_follow_the_poisson_law(level, backend):
-    assert check_poisson(level, TEN_MILLION, key=41, backend=backend) > 1e-3 / 24
+    assert check_poisson(level, TEN_MILLION, key=41, backend=backend) > 1e-3 / 15
 
 
 @pytest.mark.parametrize("level", [0.05, 0.7, 4.0])
@@ -157,8 +162,9 @@ def test_neighbours_have_the_covariance_of_the_spread(level, backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("level", [0.1, 1.0, 19.0, 150.0, 1.5e3, 1e5])
+@pytest.mark.parametrize(
+    ("level", "backend"), [(level, "cpu") for level in (0.1, 1.0, 19.0, 150.0, 1.5e3, 1e5)] + [(150.0, "torch")]
+)
 def test_ten_million_neighbours_have_the_covariance_of_the_spread(level, backend):
     check_covariances(level, TEN_MILLION, backend, key=61)
 

@@ -1,0 +1,119 @@
+"""Noise, spread and readout of a pair of frames against numpy's normal numbers and against the paper's recipe.
+
+    python benchmarks/generate_pair.py [--turns 15] [--device cuda]
+
+A pair is 2 x 760 x 956 pixels at the levels of 20 ms: 40 kV 90 to 240 photons, 90 kV 800 to 2000. The turns of all take
+place one after the other in one process. `cpu` is the time of all threads together, which other programs do not lengthen as
+they do `wall`; the peers run in one thread, so for them both are the same on an idle machine.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from raytwin.generator import noise_kernel_1d, project_polychromatic, sample_frames
+from raytwin.generator.as_published import sample_as_published
+
+SHAPE = (760, 956)
+SIGMA_PX = 0.6
+ENERGIES = 100
+
+
+def level_maps(rng: np.random.Generator) -> np.ndarray:
+    """Smooth maps of photons between the ends of each kV."""
+    ramp = np.linspace(0.0, 1.0, SHAPE[1], dtype=np.float32)[None, :] * np.ones((SHAPE[0], 1), np.float32)
+    ramp = np.clip(ramp + rng.normal(0.0, 0.02, SHAPE), 0.0, 1.0).astype(np.float32)
+    return np.stack([90.0 + 150.0 * ramp, 800.0 + 1200.0 * ramp])
+
+
+def timed(work: dict[str, Callable[[], object]], turns: int) -> dict[str, tuple[float, float]]:
+    """Median wall and processor seconds of each piece of work, run in turn."""
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
+    for one in work.values():
+        one()  # compiled or read from the cache, not timed
+    for _ in range(turns):
+        for name, one in work.items():
+            wall, processor = time.perf_counter(), time.process_time()
+            one()
+            found[name].append((time.perf_counter() - wall, time.process_time() - processor))
+    return {
+        name: (float(np.median(np.array(t)[:, 0])), float(np.median(np.array(t)[:, 1]))) for name, t in found.items()
+    }
+
+
+def on_gpu(device: str, levels: np.ndarray, settings: dict[str, object]) -> None:
+    """Pairs a second from thickness maps, and the bytes a second that this is at least."""
+    import torch
+
+    rng = np.random.default_rng(5)
+    thickness = np.stack([rng.uniform(5, 30, SHAPE), rng.uniform(0, 2, SHAPE)]).astype(np.float32)
+    energies_keV = np.linspace(15.0, 90.0, ENERGIES)
+    mu = np.stack([0.02 + 0.08 * (20 / energies_keV) ** 3, 0.03 + 0.5 * (20 / energies_keV) ** 3])
+    weights = np.stack([np.exp(-(((energies_keV - at) / 15) ** 2)) for at in (30.0, 50.0)])
+    pairs = 32
+
+    def projected() -> object:
+        return [project_polychromatic(thickness, mu, weights, backend="torch", device=device) for _ in range(pairs)]
+
+    def drawn() -> object:
+        signal = np.broadcast_to(levels, (pairs, *levels.shape)).reshape(-1, *SHAPE)
+        return sample_frames(signal, backend="torch", device=device, **settings)  # type: ignore[arg-type]
+
+    for name, work in (("projection", projected), ("noise, spread, readout", drawn)):
+        work()
+        torch.cuda.synchronize()
+        begin = time.perf_counter()
+        work()
+        torch.cuda.synchronize()
+        seconds = (time.perf_counter() - begin) / pairs
+        least = 2 * 4 * 2 * SHAPE[0] * SHAPE[1]  # two maps in, two out
+        print(
+            f"{device}, {name}: {1 / seconds:.0f} pairs a second, {least / seconds / 1e9:.0f} GB/s of input and output"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--turns", type=int, default=15)
+    parser.add_argument("--device", help="also time torch on this device, for example cuda")
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(1)
+    levels = level_maps(rng)
+    dark = rng.uniform(1100.0, 1400.0, SHAPE).astype(np.float32)
+    relative = rng.normal(1.0, 0.02, SHAPE).astype(np.float32)
+    settings = {
+        "gain_DN": 1.95,
+        "key": 1,
+        "gain_relative": relative,
+        "white_fraction": 0.02,
+        "kernel_1d": noise_kernel_1d("aperture", SIGMA_PX),
+        "read_noise_DN": 12.9,
+        "dark_DN": dark,
+        "bits": 16,
+    }
+    signal = levels * np.float32(1.95)
+    number = 2 * SHAPE[0] * SHAPE[1]
+    published = {"gain_DN": 1.95, "read_noise_DN": 12.9, "blur_px": 0.8, "dark_DN": dark}
+    work = {
+        "raytwin": lambda: sample_frames(signal, **settings),
+        "numpy standard_normal float32": lambda: rng.standard_normal(number, dtype=np.float32),
+        "numpy poisson": lambda: rng.poisson(levels),
+        "as_published": lambda: [sample_as_published(one, rng=rng, **published) for one in signal],
+    }
+    times = timed(work, arguments.turns)
+    mine = times["raytwin"]
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors, medians of {arguments.turns} turns")
+    for name, (wall, processor) in times.items():
+        print(
+            f"{name:32s} wall {1e3 * wall:7.1f} ms ({wall / mine[0]:5.2f} of raytwin)"
+            f"   cpu {1e3 * processor:7.1f} ms ({processor / mine[1]:5.2f} of raytwin)"
+        )
+    if arguments.device:
+        on_gpu(arguments.device, signal, settings)
+
+
+if __name__ == "__main__":
+    main()

@@ -383,6 +383,12 @@ class Placed:
     mirrored: bool
     place_mm: tuple[float, float]
 
+    @property
+    def radius_mm(self) -> float:
+        """Of a ball, or of a circle across the beam, about the place that holds the object."""
+        one = self.individual
+        return one.body.radius_mm if one.body is not None else max(layer.radius_mm for layer in one.layers.values())
+
     def lengths_mm(self, rays: Rays) -> dict[str, Array]:
         """Path lengths (row, column) by material, mm."""
         one = self.individual

@@ -16,7 +16,7 @@ from ..files import sha256_of_file
 from .binning import refuse_binning
 from .describe import Description, Individual, Scene, choose_kind, sample_individual, sample_scene
 from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise
-from .render import SUPERSAMPLING, ExpectedImage, Geometry, geometry_of, render_expected, sample_expected
+from .render import SUPERSAMPLING, ExpectedImage, Geometry, geometry_of, render_scene, sample_expected
 from .transfer import Channel
 from .twin import Twin
 
@@ -92,17 +92,16 @@ class DescribedScenes:
         which = number % known if known else number
         product = self._product(which)
         scene = sample_scene(self.description, product, rays=self.geometry.rays(), rng=rng)
-        rays = self.geometry.rays(self.supersampling)
-        lengths, foreign_mm = scene.lengths_mm(rays)
-        expected = render_expected(
-            lengths,
+        rendered = render_scene(
+            scene,
             twin=self.twin,
             channels=self._channels,
             geometry=self.geometry,
             supersampling=self.supersampling,
         )
-        foreign = self._mask(foreign_mm)
-        inside = self._mask(np.sum(list(lengths.values()), axis=0))
+        foreign = _mask(rendered.foreign_cover)
+        inside = _mask(rendered.cover)
+        expected = rendered.images
         objects = [one.individual for one in scene.foreign_objects]
         return DescribedPair(
             scene=scene,
@@ -154,16 +153,6 @@ class DescribedScenes:
         value = float(np.random.default_rng([self.seed, _SPLIT, product]).random())
         return "test" if value < test else "val" if value < test + validation else "train"
 
-    def _mask(self, fine_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Pixels at least half covered; the most covered one where none is."""
-        step = self.supersampling
-        rows, columns = self.geometry.rows, self.geometry.columns
-        covered = (fine_mm > 0).reshape(rows, step, columns, step).mean(axis=(1, 3))
-        mask = covered >= 0.5
-        if not mask.any() and covered.any():
-            mask.flat[int(covered.argmax())] = True
-        return np.asarray(mask)
-
     def _contrast(self, expected: tuple[ExpectedImage, ...], mask: NDArray[np.bool_]) -> float:
         if not mask.any():
             return math.nan
@@ -172,6 +161,14 @@ class DescribedScenes:
             return delta_r(expected[0].log_image, expected[1].log_image, mask, dilations=dilations)
         except InputError:
             return math.nan  # an object beside the product or across all of it has no ring to be compared with
+
+
+def _mask(cover: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels at least half covered; the most covered one where none is."""
+    mask = cover >= 0.5
+    if not mask.any() and cover.any():
+        mask.flat[int(cover.argmax())] = True
+    return np.asarray(mask)
 
 
 def generate_from_description(

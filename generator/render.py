@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from .noise import digitise, sample_frame_noise
+from .describe import Scene
+from .kernels import draw_key, sample_frames
 from .predict import spectral_model_of
 from .projection import project_polychromatic
-from .psf import convolve_separable, sampled_gaussian_1d
+from .psf import noise_kernel_1d, sampled_gaussian_1d
 from .shapes import Rays
 from .spectral_signal import OpenBeam
 from .transfer import Channel, DetectorNoise
@@ -26,6 +27,7 @@ from .twin import Twin
 Array = NDArray[np.float64]
 
 SUPERSAMPLING = 3
+_TILE_PX = 16
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
@@ -140,36 +142,153 @@ def render_expected(
     wrong = {name: one.shape for name, one in lengths_mm.items() if one.shape != shape}
     if wrong or not lengths_mm:
         raise InputError("path lengths", received=wrong or "none", expected=f"maps of {shape} (rows, columns)")
+    stack = np.stack([np.asarray(one, dtype=np.float32) for one in lengths_mm.values()])
+    moments = _moments_behind(stack, tuple(lengths_mm), twin=twin, channels=channels)
+    return _images(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RenderedScene:
+    """A scene as a detector shows it on average: images (a channel each); foreign_cover and cover (row, column): share of a
+    pixel's rays that cross a foreign object, or anything."""
+
+    images: tuple[ExpectedImage, ...]
+    foreign_cover: Array = field(repr=False)
+    cover: Array = field(repr=False)
+
+
+def render_scene(
+    scene: Scene,
+    *,
+    twin: Twin,
+    channels: Sequence[Channel],
+    geometry: Geometry,
+    supersampling: int = SUPERSAMPLING,
+) -> RenderedScene:
+    """`render_expected` of a scene, with sub-pixels where there are edges and one ray a pixel elsewhere.
+
+    Tiles of 16 x 16 pixels that hold an outline of the product, or that a foreign object can reach, are traced with all their
+    sub-pixels; in the others the path length is that of the pixel's middle (off by its curvature times pitch^2 / 24).
+
+    Raises:
+        InputError: a twin without spectral part.
+    """
+    rays, fine_rays = geometry.rays(), geometry.rays(supersampling)
+    lengths, foreign = scene.lengths_mm(rays)
+    names = tuple(lengths)
+    inside = np.sum(list(lengths.values()), axis=0) > 0
+    cover, foreign_cover = inside.astype(np.float64), (foreign > 0).astype(np.float64)
+    tiles = _tiles_with_edges(scene, rays, inside)
+    pieces, shapes = [], []
+    for rows, columns in tiles:
+        part = fine_rays.part(*(slice(one.start * supersampling, one.stop * supersampling) for one in (rows, columns)))
+        piece, foreign_piece = scene.lengths_mm(part)
+        stack = np.stack([piece[name] for name in names]).astype(np.float32)
+        cover[rows, columns] = _pixel_means(stack.sum(axis=0) > 0, supersampling)
+        foreign_cover[rows, columns] = _pixel_means(foreign_piece > 0, supersampling)
+        pieces.append(stack.reshape(len(names), -1))
+        shapes.append(part.shape)
+    coarse = np.stack([lengths[name] for name in names]).astype(np.float32).reshape(len(names), -1)
+    every = np.concatenate([coarse, *pieces], axis=1)[:, None]
+    moments = []
+    for signal, variance in _moments_behind(every, names, twin=twin, channels=channels):
+        planes = []
+        for values in (signal[0], variance[0]):
+            plane = values[: coarse.shape[1]].reshape(geometry.rows, geometry.columns)
+            fine = plane.repeat(supersampling, axis=0).repeat(supersampling, axis=1)
+            start = coarse.shape[1]
+            for (rows, columns), shape in zip(tiles, shapes, strict=True):
+                stop = start + shape[0] * shape[1]
+                fine[
+                    rows.start * supersampling : rows.stop * supersampling,
+                    columns.start * supersampling : columns.stop * supersampling,
+                ] = values[start:stop].reshape(shape)
+                start = stop
+            planes.append(fine)
+        moments.append((planes[0], planes[1]))
+    images = _images(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+    return RenderedScene(images=images, foreign_cover=foreign_cover, cover=cover)
+
+
+def _tiles_with_edges(scene: Scene, rays: Rays, inside: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
+    """Tiles (rows, columns) with an outline of the product, or within reach of a foreign object."""
+    busy = np.zeros(inside.shape, dtype=bool)
+    for axis in (0, 1):
+        first, last = ((slice(None),) * axis + (part,) for part in (slice(1, None), slice(None, -1)))
+        change = inside[first] != inside[last]
+        busy[first] |= change
+        busy[last] |= change
+    # a ray beside an outline may cross it within its pixel
+    busy |= np.roll(busy, 1, axis=0) | np.roll(busy, -1, axis=0)
+    busy |= np.roll(busy, 1, axis=1) | np.roll(busy, -1, axis=1)
+    for placed in scene.foreign_objects:
+        rows, columns = rays.window(np.array([*placed.place_mm, 0.0]), placed.radius_mm)
+        busy[max(rows.start - 1, 0) : rows.stop + 1, max(columns.start - 1, 0) : columns.stop + 1] = True
+    tiles = []
+    for row in range(0, inside.shape[0], _TILE_PX):
+        for column in range(0, inside.shape[1], _TILE_PX):
+            tile = (
+                slice(row, min(row + _TILE_PX, inside.shape[0])),
+                slice(column, min(column + _TILE_PX, inside.shape[1])),
+            )
+            if busy[tile].any():
+                tiles.append(tile)
+    return tiles
+
+
+Moments = Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
+
+
+def _moments_behind(
+    stack: NDArray[np.float32], names: Sequence[str], *, twin: Twin, channels: Sequence[Channel]
+) -> Moments:
+    """Signal and quantum variance behind path lengths (material, row, column), each over that of the open beam."""
     model = spectral_model_of(twin, highest_kV=max(one.setting.kV for one in channels))
     best = twin.spectral.best if twin.spectral is not None else model.default_parameters()
-    moments = [
-        model.moment_weights(best, OpenBeam(kV=one.setting.kV, filters=one.setting.filters))[:2] for one in channels
-    ]
+    found = []
+    for channel in channels:
+        setting = channel.setting
+        weights = model.moment_weights(best, OpenBeam(kV=setting.kV, filters=setting.filters))[:2]
+        mu = np.stack([model.mu(name)[: weights.shape[1]] for name in names])
+        signal, variance = project_polychromatic(stack, mu, weights / weights.sum(axis=1, keepdims=True))
+        found.append((signal, variance))
+    return found
+
+
+def _images(
+    moments: Moments, *, twin: Twin, channels: Sequence[Channel], geometry: Geometry, supersampling: int
+) -> tuple[ExpectedImage, ...]:
     focal = geometry.focal_blur_px * supersampling
     spread = twin.noise.psf_sigma_px.value * supersampling
-    stack = np.stack([np.asarray(one, dtype=np.float32) for one in lengths_mm.values()])
     images = []
-    for channel, weights in zip(channels, moments, strict=True):
-        used = weights / weights.sum(axis=1, keepdims=True)
-        mu = np.stack([model.mu(name)[: used.shape[1]] for name in lengths_mm])
-        signal, variance = project_polychromatic(stack, mu, used)
-        blurred = _pixel_means(_blur(signal, math.hypot(focal, spread)), supersampling)
-        quanta = _pixel_means(_blur(variance, focal), supersampling)
+    for channel, (signal, variance) in zip(channels, moments, strict=True):
+        blurred = _blurred_pixel_means(signal, math.hypot(focal, spread), supersampling)
+        quanta = _blurred_pixel_means(variance, focal, supersampling)
         images.append(
             ExpectedImage(
-                transmission=blurred, gain_DN=channel.gain_DN * quanta / np.maximum(blurred, np.finfo(np.float32).tiny)
+                transmission=blurred,
+                # behind what nothing crosses there are no quanta, whatever each of them would be worth
+                gain_DN=channel.gain_DN * np.clip(quanta / np.maximum(blurred, 1e-12), 1e-3, 1e3),
             )
         )
     return tuple(images)
 
 
-def _blur(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    if sigma < 0.05:
-        return image
-    return convolve_separable(image, sampled_gaussian_1d(sigma, math.ceil(4.5 * sigma) + 1))
+def _blurred_pixel_means(fine: NDArray[np.float32], sigma: float, supersampling: int) -> Array:
+    """Pixel means (row, column) of sub-pixels blurred by a Gaussian of `sigma` sub-pixels; one axis after the other."""
+    from scipy.ndimage import correlate1d
+
+    kernel = sampled_gaussian_1d(sigma, math.ceil(4.5 * sigma) + 1) if sigma >= 0.05 else None
+    image = fine
+    for axis in (0, 1):
+        if kernel is not None:
+            image = correlate1d(image, kernel, axis=axis, mode="nearest")
+        parts = [image[(slice(None),) * axis + (slice(k, None, supersampling),)] for k in range(supersampling)]
+        image = np.sum(parts, axis=0, dtype=np.float32) / np.float32(supersampling)
+    return image.astype(np.float64)
 
 
-def _pixel_means(fine: NDArray[np.float32], supersampling: int) -> Array:
+def _pixel_means(fine: NDArray[np.generic], supersampling: int) -> Array:
     rows, columns = (length // supersampling for length in fine.shape)
     blocks = fine.reshape(rows, supersampling, columns, supersampling)
     return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
@@ -179,21 +298,20 @@ def sample_expected(
     image: ExpectedImage, *, channel: Channel, detector: DetectorNoise, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """Counts with dark (row, column) of one frame, or of the mean of the setting's averaged frames, DN."""
-    frames = channel.setting.averaged
-    signal = channel.open_signal_DN * image.transmission
     # rounding comes with digitising
     rounding = 1.0 / 12.0 if detector.quantised else 0.0
-    noise = sample_frame_noise(
-        signal,
+    read_DN2 = np.asarray(detector.read_variance_DN2, dtype=np.float64) - rounding
+    frame = sample_frames(
+        channel.open_signal_DN * image.transmission,
         gain_DN=image.gain_DN,
+        key=draw_key(rng),
         gain_relative=detector.gain_relative,
         white_fraction=detector.white_fraction,
-        read_variance_DN2=np.maximum(np.asarray(detector.read_variance_DN2, dtype=np.float64) - rounding, 0.0),
-        psf_model=detector.psf_model,
-        psf_sigma_px=detector.psf_sigma_px,
-        rng=rng,
-        quantum_share=1.0 / frames,
-        third_cumulant_share=1.0 / frames**2,
-        read_share=1.0 / frames,
+        kernel_1d=noise_kernel_1d(detector.psf_model, detector.psf_sigma_px),
+        read_noise_DN=np.sqrt(np.maximum(read_DN2, 0.0)),
+        dark_DN=channel.dark_DN,
+        bits=detector.bits,
+        quantised=detector.quantised,
+        averaged=channel.setting.averaged,
     )
-    return digitise(signal + noise + channel.dark_DN, bits=detector.bits, quantised=detector.quantised, averaged=frames)
+    return np.asarray(frame, dtype=np.float32)

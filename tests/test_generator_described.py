@@ -371,3 +371,24 @@ def test_the_example_of_the_documentation_runs(tmp_path, twin):
     description = described(tmp_path, example)
     summary = generate_from_description(twin, description, tmp_path / "a.h5", low=LOW, high=HIGH, images=4, seed=1)
     assert summary.images == 4
+
+
+def test_a_scene_rendered_with_few_sub_pixels_is_the_one_rendered_with_all(tmp_path, twin):
+    from raytwin.generator.render import render_scene
+
+    text = PRODUCT + ROD + WIRE + "[images]\nwith_foreign_object = 1\nobjects = [2, 2]\n"
+    description = described(tmp_path, text)
+    geometry = geometry_of(twin, settings=(LOW, HIGH))
+    rng = np.random.default_rng(6)
+    product = sample_individual(description.products[0], name="p", rng=rng)
+    scene = sample_scene(description, product, rays=geometry.rays(), rng=rng)
+    options = {"twin": twin, "channels": channels_of(twin), "geometry": geometry}
+    few = render_scene(scene, **options)
+    lengths, foreign = scene.lengths_mm(geometry.rays(3))
+    for some, every in zip(few.images, render_expected(lengths, **options), strict=True):
+        np.testing.assert_allclose(some.transmission, every.transmission, rtol=1e-3)
+        np.testing.assert_allclose(some.gain_DN, every.gain_DN, rtol=1e-3)
+    blocks = (foreign > 0).reshape(SHAPE[0], 3, SHAPE[1], 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(few.foreign_cover, blocks, atol=1e-12)
+    inside = (sum(lengths.values()) > 0).reshape(SHAPE[0], 3, SHAPE[1], 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(few.cover, inside, atol=1e-12)

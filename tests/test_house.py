@@ -29,6 +29,7 @@ BELOW = {
     "calibration": {"acquisition", "materials", "spectra", "generator"},
     "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod"},
 }
+SHIPPED = {"raytwin.data.calibration": "data/calibration"}  # a folder of data without modules
 COMPOSERS = {"campaign", "commands"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
 HEAVY = {"torch", "matplotlib", "numpy", "scipy", "h5py", "numba", "spekpy", "xraylib", "xraydb", "dask"}
@@ -114,10 +115,10 @@ def test_packages_on_disk_and_in_pyproject_agree():
     setuptools = project()["tool"]["setuptools"]
     listed = set(setuptools["packages"])
     on_disk = {"raytwin", "raytwin.commands"} | {f"raytwin.{room}" for room in rooms_on_disk()}
-    assert listed == on_disk | set(subpackages_on_disk())
+    assert listed == on_disk | set(subpackages_on_disk()) | set(SHIPPED)
     places = setuptools["package-dir"]
     assert places.pop("raytwin") == "src/raytwin"
-    assert places == {f"raytwin.{room}": room for room in rooms_on_disk()} | subpackages_on_disk()
+    assert places == {f"raytwin.{room}": room for room in rooms_on_disk()} | subpackages_on_disk() | SHIPPED
 
 
 def test_check_and_format_of_the_makefile_cover_every_room():
@@ -138,7 +139,7 @@ def test_the_wheel_holds_nothing_but_raytwin(tmp_path):
     copy.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         (copy / name).write_bytes((ROOT / name).read_bytes())
-    for folder in ["src", *rooms_on_disk(), "tests"]:
+    for folder in ["src", *rooms_on_disk(), *SHIPPED.values(), "tests"]:
         for path in (ROOT / folder).rglob("*"):
             if path.is_file() and "__pycache__" not in path.parts and ".numba_cache" not in path.parts:
                 target = copy / path.relative_to(ROOT)
@@ -155,6 +156,7 @@ def test_the_wheel_holds_nothing_but_raytwin(tmp_path):
         assert relative.as_posix() in inside
     assert "raytwin/py.typed" in inside
     data = [path for room in rooms_on_disk() for path in (ROOT / room).rglob("*.toml")]
+    data += [path for folder in SHIPPED.values() for path in (ROOT / folder).iterdir()]
     for path in data:
         assert f"raytwin/{path.relative_to(ROOT).as_posix()}" in inside
 

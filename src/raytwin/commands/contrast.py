@@ -15,6 +15,7 @@ from ..acquisition.setting import Setting, filter_from_text, filters_from_text, 
 from ..errors import InputError
 from ..files import whole_file
 from ._answer import answer, say
+from ._twin_file import HELP, twin_file
 
 if TYPE_CHECKING:
     from ..generator.contrast import Contrast, UncalibratedLine
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--map-kv-high", metavar="FROM:TO:STEP", help="map over the high tube voltage")
     add("--map-filter", metavar="LAYERS;LAYERS", help="map over filters, the same in both beams; `none` is no filter")
     add("--plot", metavar="PNG", type=Path, help="draw the map")
-    add("--twin", metavar="TWIN", type=Path, help="twin file; without it the line is as the options below state it")
+    add("--twin", metavar="TWIN", type=twin_file, help=f"{HELP}; without it the line is as the options below state it")
     line = parser.add_argument_group("a line without a twin")
     line.add_argument("--anode", metavar="ELEMENT", help="anode (default W)")
     for option, (_, unit, meaning) in _LINE_OPTIONS.items():

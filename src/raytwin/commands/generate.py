@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ._answer import answer, say
+from ._twin_file import HELP, twin_file
 
 if TYPE_CHECKING:
     from ..acquisition import Setting
@@ -34,7 +35,7 @@ EXAMPLE = """example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin generate`."""
-    parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
+    parser.add_argument("twin", metavar="TWIN", type=twin_file, help=HELP)
     parser.add_argument(
         "reference",
         metavar="REFERENCE",

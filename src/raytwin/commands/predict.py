@@ -1,19 +1,20 @@
 """Predict the flatfield of a twin at a setting, measured or not, with 95 % intervals."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from ._answer import answer, say
+from ._twin_file import HELP, twin_file
 
 EXAMPLE = """example:
   raytwin predict twin.h5 --kv 60 --filter Cu:0.1 --power-w 30 --exposure-ms 20
+  raytwin predict virtual_lab --kv 60 --filter Cu:0.1 --power-w 30 --exposure-ms 20 --binning 2
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin predict`."""
-    parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
+    parser.add_argument("twin", metavar="TWIN", type=twin_file, help=HELP)
     parser.add_argument("--kv", type=float, required=True, help="tube voltage, kV")
     parser.add_argument("--filter", metavar="MATERIAL:mm", action="append", default=[], help="filter, repeatable")
     load = parser.add_mutually_exclusive_group(required=True)

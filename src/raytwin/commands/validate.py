@@ -13,6 +13,7 @@ from typing import Any
 from ..errors import InputError
 from ..files import whole_file
 from ._answer import answer, say
+from ._twin_file import HELP, twin_file
 
 EXAMPLE = """example:
   raytwin validate twin.h5 session.h5
@@ -24,7 +25,7 @@ _FORMATS = (".png", ".pdf", ".svg")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin validate`."""
-    parser.add_argument("twin", metavar="TWIN", type=Path, help="twin file")
+    parser.add_argument("twin", metavar="TWIN", type=twin_file, help=HELP)
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats")
     parser.add_argument(
         "--leave-one-out", action="store_true", help="predict each level of the twin from its other levels"

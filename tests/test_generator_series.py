@@ -12,7 +12,7 @@ from raytwin.acquisition.setting import filters_from_text, setting_from_text
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator._fine_picture import cell_coverage, find_borders, sampled_picture, transform_of_cells
 from raytwin.generator._spread import noise_pattern
-from raytwin.generator.effects import AppliedEffect
+from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.line_state import LineState
 from raytwin.generator.predict import predict_flatfield, slope_share, spectral_model_of
 from raytwin.generator.psf import noise_autocovariance_1d
@@ -436,3 +436,37 @@ def test_a_scene_needs_a_spectrum(series_line):
 def test_parameters_of_another_model_are_refused(series_line):
     with pytest.raises(InputError, match="spectral parameters"):
         expected_series(series_line, request(), parameters=np.zeros(2))
+
+
+# ------------------------------------------------------------------------------------------------ any detector
+
+
+@pytest.mark.parametrize("shape", [(1, 64), (64, 1), (2, 2), (3, 50), (37, 41)])
+def test_detectors_of_any_shape_take_any_effect(series_line, shape):
+    """Line detectors among them: finite expectations and frames of their shape."""
+
+    def crop(image):
+        return np.resize(np.asarray(image), shape).astype(image.dtype)
+
+    maps = series_line.maps
+    names = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels")
+    line = replace(
+        series_line,
+        maps=replace(maps, **{name: crop(getattr(maps, name)) for name in names}),
+        levels=tuple(replace(level, flat_shape=crop(level.flat_shape)) for level in series_line.levels),
+    )
+    plate = np.where(np.indices(shape)[1] > shape[1] // 2, 2.0, 0.0)
+    asked = request(
+        "object",
+        frames=2,
+        thickness_mm={"W": plate, "water_liquid": np.full(shape, 5.0)},
+        source_object_mm=700.0,
+        displacement_px=(0.1, 0.2),
+    )
+    cache = ModelCache()
+    for name in EFFECTS:
+        effects = (AppliedEffect(id=name, parameters={}, since="calibration"),)
+        found = expected_series(line, asked, effects=effects, cache=cache)
+        assert found.mean_DN.shape == shape and np.isfinite(found.mean_DN).all(), name
+        for frame in sample_series(line, asked, rng=np.random.default_rng(0), effects=effects, cache=cache):
+            assert frame.shape == shape and np.isfinite(frame).all(), name

@@ -28,7 +28,7 @@ _LEAST = 0.02  # transmissions below are mostly scatter
 _PIXELS = 20  # a step of fewer is left out
 _STEPS = 40  # a map of more different thicknesses is a ramp, and is cut into bins
 _BINS = 12
-_EDGE_SHARE = 0.03  # of the whole range: where neighbours differ by more there is an edge
+_EDGE_SHARE = 0.06  # of the whole range: where neighbours differ by more there is an edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +148,7 @@ def _flat_for(acquisition: AcquisitionFile, item: Series) -> Series | None:
         and sorted(map(str, flat.filters)) == wanted
         and (flat.source_detector_mm or distance) == (item.source_detector_mm or distance)
         and flat.panel_rotation_deg == item.panel_rotation_deg
+        and flat.layer == item.layer
         and not flat.corrected & {"log", "gain"}
         and flat.shape == item.shape
     ]

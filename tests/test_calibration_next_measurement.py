@@ -1,0 +1,174 @@
+"""The measurement that calibration names next: what it promises is what it does."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.setting import filters_from_text
+from raytwin.calibration.next_measurement import rank_measurements
+from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
+from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for
+from raytwin.generator.predict import predict_flatfield
+from raytwin.generator.spectral_signal import OpenBeam
+from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd
+
+SHAPE = (8, 8)
+INSTRUMENT = Instrument(
+    pixel_mm=0.15,
+    source_detector_mm=1059.0,
+    source_object_mm=990.0,
+    scintillator=filters_from_text("CsI:0.5"),
+    maximum_power_w=60.0,
+)
+FACTOR = geometry_factor(source_detector_mm=1059.0, pixel_mm=0.15)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_for(INSTRUMENT, materials=(), highest_kV=120.0)
+
+
+@pytest.fixture(scope="module")
+def truth(model):
+    values = {
+        "inherent_filtration_mm_Al": 0.8,
+        "log_DN_per_keV": math.log(0.1),
+        "log_swank": math.log(0.9),
+        "kV_error": 0.004,
+        "spectrum_model": 0.5,
+    }
+    full = np.zeros(len(model.names))
+    for name, value in values.items():
+        full[model.names.index(name)] = value
+    return full
+
+
+def twin_of(model, truth, beams, *, instrument=INSTRUMENT):
+    """A twin calibrated from exact levels of some beams, 20 ms and 30 W each."""
+    levels, points = [], []
+    for kV, text in beams:
+        filters = filters_from_text(text)
+        signal = model.signal(truth[None, :], OpenBeam(kV=kV, filters=filters))
+        rate, gain = float(signal.rate_DN_per_mAs[0]) * FACTOR, float(signal.gain_DN[0])
+        levels.append(
+            Level(
+                kV=kV,
+                filters=filters,
+                gain_DN=estimate_from_sd(gain, 0.015 * gain),
+                photon_transfer_slope_DN=estimate_from_sd(0.5 * gain, 0.005 * gain),
+                rate_DN_per_mAs=estimate_from_sd(rate, 0.001 * rate),
+                source_detector_mm=1059.0,
+                saturation_DN=None,
+                flat_shape=np.ones(SHAPE, dtype=np.float32),
+                series=(f"{kV:g} {text}",),
+                role="calibration",
+            )
+        )
+        load = 30.0 / kV * 0.02
+        points.append(
+            {
+                "series": levels[-1].series[0],
+                "kV": kV,
+                "used": True,
+                "load_mAs": load,
+                "exposure_ms": 20.0,
+                "signal_DN": rate * load,
+            }
+        )
+    fit = fit_spectrum(levels, instrument, rng=np.random.default_rng(0))
+    zero = np.zeros(SHAPE, dtype=np.float32)
+    return Twin(
+        instrument=instrument,
+        maps=DetectorMaps(
+            dark_DN=zero,
+            dark_exposure_ms=20.0,
+            dark_DN_per_ms=zero,
+            gain_relative=zero + 1,
+            read_variance_DN2=zero + 1,
+            bad_pixels=np.zeros(SHAPE, dtype=np.uint8),
+        ),
+        noise=NoiseModel(
+            psf_model="aperture",
+            psf_sigma_px=estimate_from_sd(0.5, 0.01),
+            white_fraction=0.0,
+            read_noise_DN=estimate_from_sd(1.0, 0.01),
+            quantised=True,
+        ),
+        dark_DN=estimate_from_sd(10.0, 0.1),
+        levels=tuple(levels),
+        spectral=fit.posterior,
+        evidence={"photon_transfer": points},
+        warnings=(),
+    )
+
+
+def mean_width(twin, settings):
+    """Mean relative width of the levels' intervals over some settings."""
+    found = [predict_flatfield(twin, setting).mean_DN for setting in settings]
+    return float(np.mean([(item.high - item.low) / item.value for item in found]))
+
+
+def test_the_named_measurement_shrinks_the_intervals_as_it_says(model, truth):
+    beams = [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")]
+    before = twin_of(model, truth, beams)
+    ranked = rank_measurements(before)
+    best, worst = (next(item for item in order if not item.layers) for order in (ranked, ranked[::-1]))
+    text = "+".join(str(layer) for layer in best.setting.filters)
+    after = twin_of(model, truth, [*beams, (best.setting.kV, text)])
+    after_worst = twin_of(
+        model, truth, [*beams, (worst.setting.kV, "+".join(str(layer) for layer in worst.setting.filters))]
+    )
+    # the grid that it was ranked by, less what was measured meanwhile
+    grid = []
+    for entry in best.grid:
+        kV, _, filters = entry.partition(" kV")
+        layers = filters_from_text(filters.strip())
+        if (float(kV), layers) not in {(item.setting.kV, item.setting.filters) for item in (best, worst)}:
+            grid.append(replace(best.setting, kV=float(kV), power_W=30.0, exposure_ms=20.0, filters=layers))
+    now, then, otherwise = (mean_width(twin, grid) for twin in (before, after, after_worst))
+    # intervals here are of levels alone, the promise is of levels and noise; 512 draws know a width to 5 %
+    assert then / now == pytest.approx(best.shrinks_to, abs=0.12)
+    assert then < otherwise
+
+
+def test_candidates_are_sorted_within_reach_and_not_measured_yet(model, truth):
+    twin = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")])
+    ranked = rank_measurements(twin)
+    shares = [item.shrinks_to for item in ranked]
+    assert shares == sorted(shares)
+    assert 0.2 < shares[0] < 0.95
+    assert max(shares) <= 1.0 + 1e-9
+    for item in ranked:
+        assert item.setting.power_W <= 60.0
+        assert 20.0 <= item.setting.exposure_ms <= 200.0
+        assert item.setting.kV <= 120.0
+        if not item.layers:
+            assert (item.setting.kV, item.setting.filters) not in {(level.kV, level.filters) for level in twin.levels}
+    assert {len(item.layers) for item in ranked} == {0, 4}  # flats, and wedges of four steps
+    answer = ranked[0].as_dict()
+    assert f"{100 * answer['shrinks_to']:.0f} %" in answer["text"]
+    assert answer["setting"] in answer["text"] or answer["wedge"]
+
+
+def test_one_kV_is_told_to_measure_another(model, truth):
+    ranked = rank_measurements(twin_of(model, truth, [(90.0, "Cu:0.05")]))
+    best = next(item for item in ranked if not item.layers)
+    assert best.setting.kV != 90.0
+    assert best.shrinks_to < 0.6
+
+
+def test_a_twin_without_spectrum_or_load_names_nothing(model, truth):
+    twin = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")])
+    assert rank_measurements(replace(twin, spectral=None)) == ()
+    unknown = tuple(replace(level, rate_DN_per_mAs=None) for level in twin.levels)
+    assert rank_measurements(replace(twin, levels=unknown)) == ()
+    assert rank_measurements(replace(twin, evidence={})) == ()
+
+
+def test_learned_discrepancies_of_exact_levels_stay_small(model, truth):
+    posterior = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")]).spectral
+    assert posterior.level_discrepancy < 4 * LEVEL_DISCREPANCY
+    assert posterior.gain_discrepancy < 4 * GAIN_DISCREPANCY

@@ -194,6 +194,7 @@ class _Planner:
         self.takes: list[SessionTake] = []
         self.scenes: dict[str, SessionScene] = {}
         self._names: set[str] = set()
+        self._scales: dict[str, dict[str, float]] = {}
 
     def take(self, name: str, kind: str, setting: Setting, frames: int, **more: Any) -> None:
         number, free = 2, name
@@ -234,15 +235,27 @@ class _Planner:
         )
 
     def scene(
-        self, name: str, *, kind: str, stated: Scene, source_object_mm: float, spread_percent: float, **more: Any
+        self,
+        name: str,
+        *,
+        kind: str,
+        stated: Scene,
+        source_object_mm: float,
+        spread_percent: float,
+        piece: str = "",
+        **more: Any,
     ) -> str:
-        """Put an object on the bench: +-0.2 px off, its layers off by `spread_percent` (one standard deviation)."""
+        """Put an object on the bench: +-0.2 px off, its layers off by `spread_percent` (one standard deviation).
+
+        The same `piece` has the same layers wherever it is put.
+        """
         pixel_mm = self.system.pixel_mm * source_object_mm / self.system.source_detector_mm
         shift_y_mm, shift_x_mm = self.rng.uniform(-0.2, 0.2, size=2) * pixel_mm
-        scale = {
+        drawn = {
             material: 1.0 + spread_percent / 100.0 * float(np.clip(self.rng.standard_normal(), -2.0, 2.0))
             for material in stated.materials
         }
+        scale = self._scales.setdefault(piece or name, drawn)
         true = Posed(scene=stated, shift_y_mm=float(shift_y_mm), shift_x_mm=float(shift_x_mm), scale=scale)
         self.scenes[name] = SessionScene(kind=kind, stated=stated, true=true, **more)
         return name
@@ -347,13 +360,20 @@ def _plan_full(plan: _Planner, products: int) -> None:
         for place in ("a", "b"):
             wedge = Wedge(half_mm=0.84 * half_mm, steps_mm={"pmma": thick[0], "Al": thick[1]}, turned=place == "b")
             name = plan.scene(
-                f"wedge_{gap}_{place}", kind="wedge", stated=wedge, source_object_mm=distance_mm, spread_percent=0.7
+                f"wedge_{gap}_{place}",
+                kind="wedge",
+                stated=wedge,
+                source_object_mm=distance_mm,
+                spread_percent=0.7,
+                piece="wedge",
             )
             objects(name, usual, distance_mm, some)
     plan.dark(longest_ms, few, role="evaluation")
     for gap, distance_mm in plan.gaps():
         slab = Slab(layers_mm={PRODUCT_MATERIAL: SLAB_MM})
-        name = plan.scene(f"slab_{gap}", kind="slab", stated=slab, source_object_mm=distance_mm, spread_percent=0.4)
+        name = plan.scene(
+            f"slab_{gap}", kind="slab", stated=slab, source_object_mm=distance_mm, spread_percent=0.4, piece="slab"
+        )
         objects(name, usual, distance_mm, some)
     equal_signal = [
         plan.setting(high_kV, exposure_ms, filtered=True, load=0.5 * longest_ms / exposure_ms)

@@ -94,8 +94,10 @@ def test_stated_thickness_maps_are_what_was_meant_and_the_true_objects_a_little_
         assert session.scenes["slab_far"].thickness_mm["chicken_breast"] == pytest.approx(20.0)
         assert session.scenes["edge_far_x"].thickness_mm["W"].max() == 2.0
     poses = truth["scenes"].values()
-    scales = [scale for pose in poses for scale in pose["scale"].values() if scale != 1.0]
-    assert len(scales) >= 10 and 0.001 < np.std(scales) < 0.012
+    # One wedge and one slab, wherever they are put; every product is another.
+    wedges = {json.dumps(pose["scale"]) for name, pose in truth["scenes"].items() if name.startswith("wedge")}
+    scales = {scale for pose in poses for scale in pose["scale"].values() if scale != 1.0}
+    assert len(wedges) == 1 and len(scales) >= 5 and 0.001 < np.std(list(scales)) < 0.015
     outputs = [told["output"] for told in truth["series"].values() if "output" in told]
     assert 1.5e-4 < np.std(outputs) < 4e-4 and np.mean(outputs) == pytest.approx(1.0, abs=3e-4)
     shifts = [abs(pose["shift_x_mm"]) for pose in poses]

@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-ROOMS := acquisition calibration campaign generator lab materials pod segmentation spectra
+ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
 .PHONY: demo test test-slow validation benchmark check format clean

@@ -1,0 +1,1099 @@
+"""Session and twin -> the problem that inference solves: residual probes, nuisance factors, responses to every effect."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import AcquisitionFile
+from ..errors import InputError
+from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series
+from ..generator.twin import Twin
+from . import changes as scales
+from .changes import TwinChange, Variant, smooth_twin, twin_changes
+from .inference import Curve
+from .probes import (
+    OUTLIER_SD,
+    MapProjection,
+    ProbeName,
+    Scalar,
+    ScalarContext,
+    Template,
+    edge_templates,
+    expected_scalars,
+    measured_scalars,
+    smooth_templates,
+    transmission_templates,
+)
+from .registration import Placement, fill, gradient, register, render_variance, resample
+from .session import SessionSeries, read_session
+from .summaries import BLOCK_PX, SeriesSummary, summarise_series
+
+Map = NDArray[np.float32]
+_LABEL_PIXELS = 150  # that a noise label needs
+_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+_AXIS_OF_EFFECT = {
+    "object_scatter": "level",
+    "veiling_glare": "sharpness",
+    "focal_spot": "sharpness",
+    "mtf_tail": "sharpness",
+    "k_fluorescence": "sharpness",
+    "motion_blur": "sharpness",
+    "misregistration": "sharpness",
+    "image_lag": "time",
+    "dark_drift": "level",
+    "nonlinearity": "level",
+    "kv_error": "energy",
+    "filtration_error": "energy",
+    "composition_error": "energy",
+    "heel": "position",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesView:
+    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
+
+    session: SessionSeries
+    summary: SeriesSummary
+    expected: ExpectedSeries
+    signal_DN: Map
+    residual_DN: Map
+    noise_DN: Map
+    mask: NDArray[np.bool_]
+    floor_rms: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """Everything that inference needs; probes are standardised.
+
+    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
+    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; blocks (probe,):
+    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
+    part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
+    calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
+    cannot be judged here and why.
+    """
+
+    residual: NDArray[np.float64]
+    factors: NDArray[np.float64]
+    factor_names: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    variants: tuple[Variant, ...]
+    names: tuple[ProbeName, ...]
+    series_of: NDArray[np.intp]
+    sd: NDArray[np.float64]
+    groups: NDArray[np.intp]
+    group_names: tuple[str, ...]
+    parts: NDArray[np.intp]
+    part_names: tuple[str, ...]
+    blocks: NDArray[np.intp]
+    views: tuple[SeriesView, ...]
+    base: Twin
+    gain_shares: dict[str, float]
+    dark_weights: dict[float, dict[str, float]]
+    skipped: tuple[str, ...]
+    missing_effects: dict[str, str]
+
+
+@dataclass(slots=True)
+class _Change:
+    """A change asked of the forward model; what it did to darks and gain map of the calibration is filled in."""
+
+    label: str
+    twin: Twin
+    effects: tuple[AppliedEffect, ...]
+    parameters: NDArray[np.float64] | None
+    step_sd: float = 1.0
+    failed: str = ""
+
+
+def _compact(image: NDArray[np.floating], scale: float) -> NDArray[np.float32]:
+    """The map as float32, or (1, 1) where it is the same everywhere."""
+    first = float(image.flat[0])
+    if float(np.max(image)) - float(np.min(image)) <= 1e-7 * max(scale, 1e-12):
+        return np.full((1, 1), first, np.float32)
+    return np.asarray(image, dtype=np.float32)
+
+
+def _labels(
+    signal: NDArray[np.float64], open_DN: float, kind: str, good: NDArray[np.bool_]
+) -> tuple[Any, tuple[str, ...]]:
+    """Noise labels: the whole field, or quartiles of signal away from edges."""
+    if kind != "object":
+        return np.where(good, 0, -1).astype(np.int64), ("field",)
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    flatness = (maximum_filter(signal, 5) - minimum_filter(signal, 5)) / np.maximum(signal, 1e-9)
+    usable = good & (flatness < 0.15) & (signal > 0.01 * open_DN)
+    if usable.sum() < 64:
+        usable = good
+    covered = usable & (signal < 0.97 * open_DN)
+    labels = np.full(signal.shape, -1, dtype=np.int64)
+    names: list[str] = []
+    if (usable & ~covered).sum() >= 64:
+        labels[usable & ~covered] = 0
+        names.append("open field")
+    if covered.sum() >= 3 * _LABEL_PIXELS:
+        edges = np.quantile(signal[covered], [0.0, 1 / 3, 2 / 3, 1.0])
+        for low, high, name in zip(edges[:-1], edges[1:], ("dark third", "middle third", "bright third"), strict=True):
+            inside = covered & (signal >= low) & (signal <= high) & (labels < 0)
+            if inside.sum() >= _LABEL_PIXELS:
+                labels[inside] = len(names)
+                names.append(name)
+    if not names:
+        return np.where(good, 0, -1).astype(np.int64), ("field",)
+    return labels, tuple(names)
+
+
+def _dark_weights(darks: Sequence[SessionSeries], exposure_ms: float) -> dict[str, float]:
+    """Weights with which calibrating darks add up to the dark of an exposure; empty without darks."""
+    if not darks:
+        return {}
+    same = [item for item in darks if abs((item.series.exposure_ms or 0.0) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
+    if same:
+        frames = sum(item.series.n_frames for item in same)
+        return {item.name: item.series.n_frames / frames for item in same}
+    x = np.array([item.series.exposure_ms or 0.0 for item in darks])
+    n = np.array([item.series.n_frames for item in darks], dtype=float)
+    if np.ptp(x) <= 0:
+        return {item.name: float(w) for item, w in zip(darks, n / n.sum(), strict=True)}
+    # a straight line through the darks, evaluated at the exposure: linear in the darks
+    design = np.stack([np.ones_like(x), x], axis=1)
+    solved = np.linalg.solve(design.T @ (n[:, None] * design), design.T * n)
+    weights = np.array([1.0, exposure_ms]) @ solved
+    return {item.name: float(w) for item, w in zip(darks, weights, strict=True)}
+
+
+def build_problem(
+    acquisition: AcquisitionFile,
+    twin: Twin,
+    *,
+    variants: Sequence[Variant],
+    calibrated_elsewhere: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Problem:
+    """Probes, nuisances and effect responses of a session.
+
+    Args:
+        acquisition: open file.
+        twin: calibrated from this session's calibrating series, or from another session.
+        variants: effects to try.
+        calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
+            marked as calibrating).
+        progress: called with the name of each stage.
+
+    Raises:
+        InputError: nothing that can be judged: no darks and flats, or another detector than the twin's.
+    """
+    tell = progress or (lambda stage: None)
+    session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere)
+    base = smooth_twin(twin)
+    shape = twin.maps.shape
+    good = twin.maps.bad_pixels == 0
+    skipped: list[str] = []
+    usable: list[SessionSeries] = []
+    for item in session:
+        series = item.series
+        if series.shape != shape:
+            raise InputError(
+                f"series {series.name}",
+                received=f"frames of {series.shape}",
+                expected=f"the twin's detector of {shape}",
+                remedy="diagnose sessions of the detector that the twin was calibrated from",
+            )
+        reason = _why_not(item, acquisition)
+        if reason:
+            skipped.append(f"{series.name}: {reason}")
+        else:
+            usable.append(item)
+    caches: dict[int, ModelCache] = {}
+
+    def expect(request: SeriesRequest, change: _Change, unchanged: ExpectedSeries | None = None) -> ExpectedSeries:
+        if unchanged is not None and not _touches(change, request.kind):
+            return unchanged
+        cache = caches.setdefault(id(change.twin), ModelCache())
+        return expected_series(
+            change.twin,
+            request,
+            effects=change.effects,
+            parameters=change.parameters,
+            cache=cache,
+            use_measured_level=False,
+        )
+
+    nothing = _Change("base", base, (), None)
+    tell("expectation")
+    kept: list[SessionSeries] = []
+    expected: dict[str, ExpectedSeries] = {}
+    for item in usable:
+        try:
+            expected[item.name] = expect(item.request, nothing)
+        except InputError as error:
+            skipped.append(f"{item.name}: {error}")
+            continue
+        kept.append(item)
+    if not kept:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="; ".join(skipped) or "no series",
+            expected="darks and flats whose kV, exposure and tube load are stated",
+        )
+    tell("frames")
+    summaries: dict[str, SeriesSummary] = {}
+    label_names: dict[str, tuple[str, ...]] = {}
+    labels: dict[str, NDArray[np.int64]] = {}
+    for item in kept:
+        model = expected[item.name]
+        signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float64), shape)
+        open_DN = float(signal.max())
+        kind = item.series.kind
+        labels[item.name], label_names[item.name] = _labels(signal, open_DN, kind, good)
+        pattern = None
+        if kind in ("flat", "object"):
+            mean = float(signal[good].mean())
+            if mean > 0:
+                pattern = signal / mean
+        tell(f"frames of {item.name}")
+        summaries[item.name] = summarise_series(
+            item.series.iter_frames(),
+            good=good,
+            labels=labels[item.name],
+            pattern=pattern,
+            name=f"series {item.name}",
+            saturation_DN=None if acquisition.instrument.bits is None else 2.0**acquisition.instrument.bits - 1,
+        )
+        full = summaries[item.name].saturated_share
+        if full > 1e-3 and kind != "dark":
+            skipped.append(f"{item.name}: saturated in {100 * full:.2g} % of the pixels")
+    kept = [item for item in kept if not any(text.startswith(f"{item.name}: saturated") for text in skipped)]
+
+    darks = [item for item in kept if item.calibrates and item.series.kind == "dark"]
+    flats = [item for item in kept if item.calibrates and item.series.kind == "flat"]
+    weights_of_exposure: dict[float, dict[str, float]] = {}
+
+    def dark_weights(item: SessionSeries) -> dict[str, float]:
+        exposure = item.series.exposure_ms or 0.0
+        if exposure not in weights_of_exposure:
+            weights_of_exposure[exposure] = _dark_weights(darks, exposure)
+        return weights_of_exposure[exposure]
+
+    def dark_map(item: SessionSeries) -> NDArray[np.float64]:
+        if "offset" in item.series.corrected:
+            return np.zeros(shape)
+        weights = dark_weights(item)
+        if not weights:
+            return np.asarray(twin.maps.dark_at(item.series.exposure_ms), dtype=np.float64)
+        result = np.zeros(shape)
+        for name, weight in weights.items():
+            result += weight * summaries[name].mean_DN
+        return result
+
+    def dark_noise_of(item: SessionSeries) -> float:
+        """Variance of the dark that is subtracted, one pixel, DN^2."""
+        if "offset" in item.series.corrected:
+            return 0.0
+        total = 0.0
+        for name, weight in dark_weights(item).items():
+            variance = float(np.mean(np.broadcast_to(expected[name].white_variance_DN2, shape)[good]))
+            total += weight**2 * variance / summaries[name].frames
+        return total
+
+    # gain map: what the calibrating flats show over what the smooth model expects
+    shares: dict[str, float] = {}
+    gain = np.zeros(shape)
+    gain_variance = 0.0
+    if flats:
+        for item in flats:
+            model = expected[item.name]
+            level = float(np.mean(np.broadcast_to(model.signal_DN, shape)[good]))
+            variance = float(
+                np.mean(np.broadcast_to(model.quantum_variance_DN2 + model.white_variance_DN2, shape)[good])
+            )
+            shares[item.name] = level**2 / max(variance, 1e-12) * item.series.n_frames
+        total = sum(shares.values())
+        gain_variance = 1.0 / total
+        shares = {name: value / total for name, value in shares.items()}
+        for item in flats:
+            signal_map = np.maximum(np.broadcast_to(expected[item.name].signal_DN, shape), 1e-9)
+            gain += shares[item.name] * (summaries[item.name].mean_DN - dark_map(item)) / signal_map
+    else:
+        gain = _gain_of_twin(twin)
+    good = good & (gain > 0.05)
+    outlying = _new_outliers(kept, expected, summaries, dark_map, gain, good, shape)
+    clean = good & ~outlying
+
+    tell("registration")
+    corrected: dict[str, NDArray[np.float64]] = {}
+    for item in kept:
+        measured = summaries[item.name].mean_DN - dark_map(item)
+        if item.series.kind in ("flat", "object") and "gain" not in item.series.corrected:
+            measured = measured / np.where(good, gain, 1.0)
+        corrected[item.name] = measured
+    placements: dict[str, Placement] = {}
+    first_of_place: set[str] = set()
+    for members in _places(kept).values():
+        models = [
+            np.broadcast_to(np.asarray(expected[item.name].signal_DN, dtype=np.float64), shape) for item in members
+        ]
+        noises = [
+            np.broadcast_to(
+                np.asarray(expected[item.name].quantum_variance_DN2 + expected[item.name].white_variance_DN2), shape
+            )
+            / item.series.n_frames
+            for item in members
+        ]
+        placement = register([corrected[item.name] for item in members], models, noises, clean)
+        if not placement.found:
+            continue
+        first_of_place.add(members[0].name)
+        for item in members:
+            placements[item.name] = placement
+            corrected[item.name] = resample(fill(corrected[item.name], clean), placement)
+
+    # every change: effects at their strengths, then what calibration fitted
+    all_changes: list[_Change] = []
+    for variant in variants:
+        for strength in variant.strengths:
+            all_changes.append(_Change(variant.effect, base, (variant.applied(strength),), None))
+    nuisance_changes: list[TwinChange] = twin_changes(base)
+    for step in nuisance_changes:
+        all_changes.append(_Change(step.name, step.twin, (), step.parameters, step.step_sd))
+
+    contexts: dict[str, ScalarContext] = {}
+    base_scalars: dict[str, dict[str, float]] = {}
+    mean_signal: dict[str, float] = {}
+    for item in kept:
+        mean_signal[item.name] = float(np.mean(np.broadcast_to(expected[item.name].signal_DN, shape)[clean]))
+    for position, item in enumerate(kept):
+        model = expected[item.name]
+        before = next(
+            (mean_signal[other.name] for other in reversed(kept[:position]) if other.series.kind in ("flat", "object")),
+            None,
+        )
+        frames = item.series.n_frames
+        pattern_noise, block_noise = _pattern_noise(
+            model, clean, frames, gain_variance * mean_signal[item.name] ** 2 + dark_noise_of(item)
+        )
+        contexts[item.name] = ScalarContext(
+            kind=item.series.kind,
+            frames=frames,
+            good=clean,
+            labels=np.where(clean, labels[item.name], -1),
+            label_names=label_names[item.name],
+            reference_signal_DN=max(mean_signal[item.name], 1e-9) if item.series.kind in ("flat", "object") else 1.0,
+            previous_signal_DN=before,
+            calibrates=item.calibrates,
+            codes_usable=item.series.kind in ("dark", "flat")
+            and summaries[item.name].code_range > 0
+            and summaries[item.name].code_range < 0.02 * clean.sum() * min(frames, 16),
+            pattern_noise_DN2=pattern_noise,
+            block_noise_DN2=block_noise,
+        )
+        base_scalars[item.name] = expected_scalars(model, contexts[item.name])
+
+    tell("responses")
+    # 1. what each change does to the calibrating series, and through them to darks and gain
+    calibrating = [item for item in kept if item.calibrates]
+    delta: list[dict[str, Map]] = []
+    scalar_change: list[dict[str, dict[str, float]]] = []
+    dark_of: list[dict[float, Map]] = []
+    absorbed: list[Map] = []
+    for change in all_changes:
+        own: dict[str, Map] = {}
+        own_scalars: dict[str, dict[str, float]] = {}
+        for item in calibrating:
+            try:
+                model = expect(item.request, change, expected[item.name])
+            except InputError as error:
+                change.failed = str(error)
+                break
+            scale = max(mean_signal[item.name], 1.0)
+            own[item.name] = _compact(np.asarray(model.mean_DN) - np.asarray(expected[item.name].mean_DN), scale)
+            own_scalars[item.name] = expected_scalars(model, contexts[item.name])
+        delta.append(own)
+        scalar_change.append(own_scalars)
+        dark_change: dict[float, Map] = {}
+        taken = np.zeros((1, 1), np.float32)
+        if not change.failed:
+            for item in kept:
+                exposure = item.series.exposure_ms or 0.0
+                if exposure not in dark_change:
+                    total_dark = np.zeros((1, 1), np.float32)
+                    for name, weight in dark_weights(item).items():
+                        total_dark = total_dark + np.float32(weight) * own[name]
+                    dark_change[exposure] = total_dark
+            for item in flats:
+                signal_map = np.maximum(np.asarray(expected[item.name].signal_DN, dtype=np.float32), 1e-6)
+                lit = own[item.name] - dark_change[item.series.exposure_ms or 0.0]
+                taken = taken + np.float32(shares[item.name]) * (lit / _compact(signal_map, 1.0))
+        dark_of.append(dark_change)
+        absorbed.append(taken)
+
+    # 2. series by series: templates, projections, responses
+    blocks: list[dict[str, Any]] = []
+    views: list[SeriesView] = []
+    for item in kept:
+        tell(f"responses of {item.name}")
+        model = expected[item.name]
+        signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float64), shape)
+        exposure = item.series.exposure_ms or 0.0
+        kind = item.series.kind
+        maps: list[Map | None] = []
+        scalars: list[dict[str, float] | None] = []
+        for index, change in enumerate(all_changes):
+            if change.failed:
+                maps.append(None)
+                scalars.append(None)
+                continue
+            if item.calibrates:
+                moved = delta[index][item.name]
+                values = scalar_change[index][item.name]
+            else:
+                try:
+                    changed = expect(item.request, change, model)
+                except InputError as error:
+                    change.failed = str(error)
+                    maps.append(None)
+                    scalars.append(None)
+                    continue
+                moved = _compact(
+                    np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), max(mean_signal[item.name], 1.0)
+                )
+                dark_shift = dark_of[index].get(exposure, np.zeros((1, 1), np.float32))
+                values = expected_scalars(changed, contexts[item.name], dark_change_DN=-dark_shift)
+            moved = moved - dark_of[index].get(exposure, np.zeros((1, 1), np.float32))
+            if item.name in placements and _only_displaces(change):
+                moved = np.zeros((1, 1), np.float32)
+            if kind in ("flat", "object"):
+                moved = moved - np.asarray(signal, dtype=np.float32) * absorbed[index]
+            maps.append(np.asarray(moved, dtype=np.float32))
+            scalars.append(values)
+        residual_map = corrected[item.name] - signal
+        lies = placements.get(item.name)
+        mask = clean if lies is None else _inside(clean, lies)
+        frames = item.series.n_frames
+        quantum = np.broadcast_to(np.asarray(model.quantum_variance_DN2, dtype=np.float64), shape) / frames
+        white = (
+            np.broadcast_to(np.asarray(model.white_variance_DN2, dtype=np.float64), shape) / frames
+            + signal**2 * gain_variance
+            + dark_noise_of(item)
+        )
+        if kind == "object":
+            white = white + render_variance(signal)
+            if acquisition.scenes[item.series.scene].kind not in ("edge", "disc"):
+                # steps of wedges and outlines of products are rendered no better than their maps' pixels
+                mask = mask & ~_near_steps(signal)
+        templates = smooth_templates(signal, mask, kind=kind)
+        if kind == "object":
+            open_map = np.full(shape, float(np.max(signal)))
+            templates += transmission_templates(signal, open_map, mask)
+            templates += edge_templates(signal)
+        if kind == "afterglow":
+            templates += _ghost_templates(item, kept, expected, shape)
+        position = 0
+        for variant in variants:
+            image = maps[position]
+            position += len(variant.strengths)
+            if image is not None and image.shape == shape:
+                templates.append(
+                    Template(
+                        axis=_AXIS_OF_EFFECT.get(variant.effect, "position"),
+                        name=f"like {variant.effect} {variant.name}".strip(),
+                        unit="1",
+                        image=image,
+                    )
+                )
+        projection = MapProjection(
+            templates,
+            mask=mask,
+            quantum_DN2=quantum,
+            white_DN2=white,
+            autocovariance_table=model.noise_autocovariance,
+        )
+        pattern_DN2, block_DN2, outliers = _pattern_statistics(
+            residual_map, projection, quantum + white, clean, good, kind
+        )
+        scalar_probes = measured_scalars(
+            summaries[item.name],
+            model,
+            contexts[item.name],
+            dark_mean_DN=float(np.mean(dark_map(item)[clean])),
+            fixed_pattern_DN2=pattern_DN2,
+            block_pattern_DN2=block_DN2,
+            outliers=outliers,
+        )
+        scalar_probes = [probe for probe in scalar_probes if probe.name in base_scalars[item.name]]
+        if lies is not None and item.name in first_of_place:
+            scalar_probes += _displacement_probes(lies)
+            base_scalars[item.name] |= {"displacement along rows": 0.0, "displacement along columns": 0.0}
+            for index, change in enumerate(all_changes):
+                there = scalars[index]
+                if there is not None:
+                    there |= _displacement_of(change)
+        floor_map = _half_difference(item, summaries[item.name])
+        views.append(
+            SeriesView(
+                session=item,
+                summary=summaries[item.name],
+                expected=model,
+                signal_DN=np.asarray(signal, np.float32),
+                residual_DN=np.asarray(residual_map, np.float32),
+                noise_DN=np.sqrt(quantum + white).astype(np.float32),
+                mask=mask,
+                floor_rms=floor_map,
+            )
+        )
+        thicker: dict[str, Map] = {}
+        for material in item.request.thickness_mm or {} if kind == "object" else {}:
+            request = _thicker(item.request, material, 1.0 + scales.THICKNESS_SD)
+            thicker[material] = np.asarray(
+                np.asarray(expected_series(base, request, effects=(), use_measured_level=False).mean_DN)
+                - np.asarray(model.mean_DN),
+                dtype=np.float32,
+            )
+        blocks.append(
+            _block(
+                item,
+                projection,
+                residual_map,
+                signal,
+                scalar_probes,
+                base_scalars[item.name],
+                maps,
+                scalars,
+                thicker,
+                shape,
+            )
+        )
+    return _join(
+        blocks,
+        views,
+        kept,
+        variants,
+        all_changes,
+        nuisance_changes,
+        skipped,
+        base=base,
+        gain_shares=shares,
+        dark_weights=weights_of_exposure,
+    )
+
+
+def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:
+    """What effects add to each view's corrected mean frame (row, column), DN, calibration having taken in its part."""
+    shape = problem.base.maps.shape
+    cache = ModelCache()
+    moved: dict[str, NDArray[np.float64]] = {}
+    for view in problem.views:
+        changed = expected_series(
+            problem.base, view.session.request, effects=effects, cache=cache, use_measured_level=False
+        )
+        moved[view.session.name] = np.asarray(changed.mean_DN) - np.asarray(view.expected.mean_DN)
+
+    def lit(view: SeriesView) -> NDArray[np.float64]:
+        weights = problem.dark_weights.get(view.session.series.exposure_ms or 0.0, {})
+        return moved[view.session.name] - sum((w * moved[name] for name, w in weights.items()), np.zeros(shape))
+
+    taken = np.zeros(shape)
+    for view in problem.views:
+        share = problem.gain_shares.get(view.session.name)
+        if share:
+            taken = taken + share * lit(view) / np.maximum(view.signal_DN, 1e-6)
+    result = []
+    for view in problem.views:
+        change = lit(view)
+        if view.session.series.kind in ("flat", "object"):
+            change = change - view.signal_DN * taken
+        result.append(np.asarray(change, dtype=np.float32))
+    return result
+
+
+def _touches(change: _Change, kind: str) -> bool:
+    """Whether a change can show in a series of this kind."""
+    if not change.effects:
+        return True
+    for effect in change.effects:
+        stage = EFFECTS[effect.id].stage
+        if effect.id in ("misregistration", "object_scatter", "composition_error") or stage == "object_blur":
+            touched = kind == "object" and not _only_displaces(change)
+        elif stage in ("beam", "arrivals", "quanta", "optics"):
+            touched = kind in ("flat", "object")
+        else:
+            touched = True
+        if touched:
+            return True
+    return False
+
+
+def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[SessionSeries]]:
+    """Object series by where their scene stood."""
+    places: dict[tuple[str, float], list[SessionSeries]] = {}
+    for item in kept:
+        if item.series.kind == "object":
+            places.setdefault((item.series.scene, item.request.source_object_mm or 0.0), []).append(item)
+    return places
+
+
+def _inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:
+    """The mask less the border that a displaced picture does not cover."""
+    margin = 2 + math.ceil(max(abs(placement.row_px), abs(placement.column_px)))
+    inside = np.zeros_like(mask)
+    inside[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin]
+    return inside
+
+
+def _near_steps(signal: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels within two of a step in the signal."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
+    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
+    return steps
+
+
+def _displacement_probes(placement: Placement) -> list[Scalar]:
+    return [
+        Scalar(
+            axis="sharpness",
+            name=f"displacement along {name}",
+            unit="px",
+            value=value,
+            sd=math.hypot(sd, scales.POSITION_SD_PX),
+        )
+        for name, value, sd in (
+            ("rows", placement.row_px, placement.row_sd_px),
+            ("columns", placement.column_px, placement.column_sd_px),
+        )
+        if sd < 0.3
+    ]
+
+
+def _displacement_of(change: _Change) -> dict[str, float]:
+    """Displacement (px) that a change brings to a scene's picture."""
+    for effect in change.effects:
+        if effect.id == "misregistration":
+            size = effect.parameters["strength"] * math.cos(
+                math.radians(effect.parameters.get("magnification_deg", 0.0))
+            )
+            angle = math.radians(effect.parameters.get("direction_deg", 0.0))
+            return {
+                "displacement along rows": size * math.cos(angle),
+                "displacement along columns": size * math.sin(angle),
+            }
+    return {}
+
+
+def _only_displaces(change: _Change) -> bool:
+    """Whether a change is a mere shift of the scene, which registration takes out of the pictures."""
+    return any(
+        effect.id == "misregistration" and abs(effect.parameters.get("magnification_deg", 0.0)) < 1.0
+        for effect in change.effects
+    )
+
+
+def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
+    series = item.series
+    if "log" in series.corrected:
+        return "log images: counts are needed"
+    if series.kind == "dark":
+        return "" if series.exposure_ms is not None else "exposure unknown"
+    if series.kind == "afterglow":
+        return ""
+    if series.setting is None or series.setting.tube_load_mAs is None:
+        return "kV, exposure or tube load unknown"
+    if series.kind == "object":
+        scene = acquisition.scenes.get(series.scene)
+        if scene is None or not len(scene.thickness_mm):
+            return "object of unknown thickness"
+    return ""
+
+
+def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
+    shapes = [level.flat_shape for level in twin.levels]
+    gain = np.asarray(twin.maps.gain_relative, dtype=np.float64)
+    if shapes:
+        gain = np.asarray(np.mean(np.stack(shapes), axis=0), dtype=np.float64)
+    return gain
+
+
+def _ghost_templates(
+    item: SessionSeries, kept: Sequence[SessionSeries], expected: dict[str, ExpectedSeries], shape: tuple[int, int]
+) -> list[Template]:
+    lit = [
+        other for other in kept if other.series.kind in ("flat", "object") and other.series.index < item.series.index
+    ]
+    if not lit:
+        return []
+    image = np.broadcast_to(np.asarray(expected[lit[-1].name].signal_DN, dtype=np.float64), shape)
+    return [Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=image)]
+
+
+def _pattern_noise(model: ExpectedSeries, mask: NDArray[np.bool_], frames: int, maps_DN2: float) -> tuple[float, float]:
+    """Noise of the corrected mean frame from pixel to pixel and of block means, DN^2; maps_DN2: that of dark and gain."""
+    from .probes import autocovariance, correlation_sum
+
+    q = float(np.mean(np.broadcast_to(model.quantum_variance_DN2, mask.shape)[mask])) / frames
+    w = float(np.mean(np.broadcast_to(model.white_variance_DN2, mask.shape)[mask])) / frames + maps_DN2
+    pixel = q * (1.0 - autocovariance(model, 0, 1)) + w
+    block = (q * correlation_sum(model, BLOCK_PX, BLOCK_PX) + w) / BLOCK_PX**2
+    return max(pixel, 1e-12), max(block, 1e-12)
+
+
+def _pattern_statistics(
+    residual: NDArray[np.float64],
+    projection: MapProjection,
+    variance: NDArray[np.float64],
+    clean: NDArray[np.bool_],
+    good: NDArray[np.bool_],
+    kind: str,
+) -> tuple[float | None, float | None, int | None]:
+    """Pixel-to-pixel and block variance of a flat's or dark's residual map, and how many good pixels stand out."""
+    if kind not in ("flat", "dark"):
+        return None, None, None
+    pair = clean[:, 1:] & clean[:, :-1]
+    step = (residual[:, 1:] - residual[:, :-1])[pair]
+    pixel = float(np.mean(step**2)) / 2.0
+    rows, columns = (side - side % BLOCK_PX for side in clean.shape)
+    part = clean[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+    weight = part.sum(axis=(1, 3))
+    values = np.where(clean, residual, 0.0)[:rows, :columns].reshape(part.shape).sum(axis=(1, 3))
+    means = values / np.maximum(weight, 1)
+    # neighbouring blocks' differences: free of the smooth shapes that the map probes hold
+    across = (means[:, 1:] - means[:, :-1])[(weight[:, 1:] > 32) & (weight[:, :-1] > 32)]
+    block = float(np.mean(across**2)) / 2.0 if across.size >= 8 else None
+    centre = float(np.median(residual[clean]))
+    standing_out = np.abs(residual - centre) > OUTLIER_SD * np.sqrt(variance) * max(
+        1.0, math.sqrt(pixel / max(float(np.mean(variance[clean])), 1e-30))
+    )
+    return pixel, block, int(np.count_nonzero(standing_out & good))
+
+
+def _new_outliers(
+    kept: Sequence[SessionSeries],
+    expected: dict[str, ExpectedSeries],
+    summaries: dict[str, SeriesSummary],
+    dark_map: Callable[[SessionSeries], NDArray[np.float64]],
+    gain: NDArray[np.float64],
+    good: NDArray[np.bool_],
+    shape: tuple[int, int],
+) -> NDArray[np.bool_]:
+    """Good pixels that stand out in any dark or flat: they count as outliers and are left out of everything else."""
+    outlying = np.zeros(shape, dtype=bool)
+    for item in kept:
+        if item.series.kind not in ("dark", "flat"):
+            continue
+        summary = summaries[item.name]
+        residual = summary.mean_DN - dark_map(item)
+        if item.series.kind == "flat":
+            signal = np.broadcast_to(expected[item.name].signal_DN, shape)
+            residual = residual / np.where(good, gain, 1.0)
+            residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
+        centre = float(np.median(residual[good]))
+        spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
+        outlying |= np.abs(residual - centre) > 8.0 * max(spread, 1e-9)
+        if summary.frames > 9:
+            ratio = summary.pair_variance_DN2 / max(float(np.median(summary.pair_variance_DN2[good])), 1e-12)
+            signal = np.broadcast_to(np.asarray(expected[item.name].signal_DN), shape)
+            limit = 1.0 + 8.0 * math.sqrt(3.0 / summary.frames)
+            outlying |= (ratio > max(limit, 2.5)) & good
+    outlying &= good
+    # a detector full of outliers is a pattern, not a set of defects
+    return outlying if outlying.sum() < 0.1 * good.sum() else np.zeros(shape, dtype=bool)
+
+
+def _half_difference(item: SessionSeries, summary: SeriesSummary) -> float:
+    """Scatter of the mean frame as repeats show it, over what differences of frames predict (1 = noise only)."""
+    if summary.frames < 4:
+        return 1.0
+    steps = np.diff(summary.frame_mean_DN)
+    white = float(np.mean(steps**2)) / 2.0
+    total = float(np.var(summary.frame_mean_DN, ddof=1))
+    return math.sqrt(total / white) if white > 0 else 1.0
+
+
+def _block(
+    item: SessionSeries,
+    projection: MapProjection,
+    residual_map: NDArray[np.float64],
+    signal: NDArray[np.float64],
+    scalar_probes: Sequence[Scalar],
+    base_scalars: dict[str, float],
+    maps: Sequence[Map | None],
+    scalars: Sequence[dict[str, float] | None],
+    thicker: dict[str, Map],
+    shape: tuple[int, int],
+) -> dict[str, Any]:
+    names = projection.names() + [
+        ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit) for probe in scalar_probes
+    ]
+    scalar_residual = np.array([(probe.value - base_scalars[probe.name]) / probe.sd for probe in scalar_probes])
+    residual = np.concatenate([projection.apply(residual_map), scalar_residual])
+    responses = np.zeros((len(maps), len(residual)))
+    for index, (image, values) in enumerate(zip(maps, scalars, strict=True)):
+        if image is None or values is None:
+            continue
+        responses[index, : len(projection)] = projection.apply(np.broadcast_to(image, shape))
+        responses[index, len(projection) :] = [
+            (values.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd
+            for probe in scalar_probes
+        ]
+    local = _local_nuisances(item, projection, signal, scalar_probes, thicker)
+    if item.series.kind == "object":
+        # unit noise again once the floor is added
+        shrink = np.array(
+            [
+                1.0 / math.hypot(1.0, scales.SHARPNESS_FLOOR)
+                if name.axis == "sharpness" and name.statistic == "mean frame"
+                else 1.0
+                for name in names
+            ]
+        )
+        residual = residual * shrink
+        responses = responses * shrink
+        local = {key: column * shrink for key, column in local.items()}
+    return {
+        "item": item,
+        "names": names,
+        "residual": residual,
+        "responses": responses,
+        "local": local,
+        "sd": np.concatenate([np.ones(len(projection)), [probe.sd for probe in scalar_probes]]),
+        "maps": len(projection),
+    }
+
+
+def _local_nuisances(
+    item: SessionSeries,
+    projection: MapProjection,
+    signal: NDArray[np.float64],
+    scalar_probes: Sequence[Scalar],
+    thicker: dict[str, Map],
+) -> dict[str, NDArray[np.float64]]:
+    """Factors of one series, by name; equal names in several series are one nuisance."""
+    series = item.series
+    pad = np.zeros(len(scalar_probes))
+
+    def of_map(image: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.concatenate([projection.apply(image), pad])
+
+    def of_scalars(change: Callable[[Scalar], float]) -> NDArray[np.float64]:
+        return np.concatenate([np.zeros(len(projection)), [change(probe) / probe.sd for probe in scalar_probes]])
+
+    result: dict[str, NDArray[np.float64]] = {}
+    result["shape of the noise"] = of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
+    rows, columns = signal.shape
+    y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
+    x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
+    if series.kind in ("dark", "afterglow"):
+        result[f"dark of {series.name}"] = of_map(np.full(signal.shape, scales.DARK_SD_DN))
+        return result
+    beam = f"{series.kV:g} kV " + "+".join(str(layer) for layer in series.filters)
+    result[f"level of {beam}"] = of_map(scales.LEVEL_OF_BEAM_SD * signal)
+    result[f"level of {series.name}"] = of_map(scales.LEVEL_OF_SERIES_SD * signal)
+    result[f"tilt x of {series.name}"] = of_map(scales.TILT_SD * x * signal)
+    result[f"tilt y of {series.name}"] = of_map(scales.TILT_SD * y * signal)
+    result[f"gain of {beam}"] = of_scalars(
+        lambda probe: scales.GAIN_OF_BEAM_SD if probe.name.startswith("log_variance") else 0.0
+    )
+    if series.kind == "object":
+        dy, dx = gradient(signal)
+        scene = series.scene
+        place = f"{scene} at {series.source_object_mm or 0:g}"
+        result[f"column of {place}"] = of_map(scales.REGISTERED_SD_PX * dx)
+        result[f"row of {place}"] = of_map(scales.REGISTERED_SD_PX * dy)
+        result[f"outline of {place}"] = of_map(scales.OUTLINE_SD_PX * np.asarray(np.hypot(dy, dx)))
+        row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
+        across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
+        result[f"magnification of {place}"] = of_map(scales.MAGNIFICATION_SD * (row * dy + across * dx))
+        result[f"rotation of {place}"] = of_map(scales.MAGNIFICATION_SD * (across * dy - row * dx))
+        for label, image in _edge_profiles(dy, dx):
+            column_of = of_map(image)
+            result[f"edges, {label}, of {place}"] = column_of
+            # the pixels that an edge cuts are not rendered quite alike for different beams
+            result[f"edges, {label}, of {series.name}"] = scales.EDGE_OF_SERIES * column_of
+        for number, field in enumerate(_rough_edges(dy, dx, place)):
+            result[f"rough edge {number} of {place}"] = of_map(field)
+        for material, moved in thicker.items():
+            response = of_map(moved)
+            result[f"thickness of {material} in {scene}"] = response
+            result[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
+            result[f"attenuation of {material} at {series.kV:g} kV"] = response * (
+                scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
+            )
+    return result
+
+
+def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> list[tuple[str, NDArray[np.float64]]]:
+    """Derivatives across edges of second to fourth order, times what rendering leaves open of each."""
+    slope = np.hypot(dy, dx)
+    (yy, _), (_, xx) = gradient(dy), gradient(dx)
+    normal_y, normal_x = dy / np.maximum(slope, 1e-9), dx / np.maximum(slope, 1e-9)
+    steeper_y, steeper_x = gradient(xx + yy)
+    third = normal_y * steeper_y + normal_x * steeper_x
+    fourth = gradient(steeper_y)[0] + gradient(steeper_x)[1]
+    half = 0.5 * scales.EDGE_SD_PX2
+    return [
+        ("columns", half * xx),
+        ("rows", half * yy),
+        ("third order", scales.EDGE_SD_PX3 * third),
+        ("fourth order", scales.EDGE_SD_PX4 * fourth),
+    ]
+
+
+def _rough_edges(dy: NDArray[np.float64], dx: NDArray[np.float64], place: str) -> list[NDArray[np.float64]]:
+    """Fields along edges, the same for every series of a place: what rendering gets wrong from pixel to pixel."""
+    from zlib import crc32
+
+    from scipy.ndimage import gaussian_filter
+
+    # fixed fields, not draws: the same scene always has the same ones
+    rng = np.random.default_rng(crc32(place.encode()))
+    slope = np.hypot(dy, dx)
+    result = []
+    for number in range(scales.ROUGH_FIELDS):
+        field = gaussian_filter(rng.standard_normal(slope.shape), (0.7, 2.0, 5.0)[number % 3])
+        field /= float(np.std(field))
+        result.append(scales.ROUGH_SHARE / math.sqrt(scales.ROUGH_FIELDS) * slope * field)
+    return result
+
+
+def _join(
+    blocks: Sequence[dict[str, Any]],
+    views: Sequence[SeriesView],
+    kept: Sequence[SessionSeries],
+    variants: Sequence[Variant],
+    all_changes: Sequence[_Change],
+    nuisance_changes: Sequence[TwinChange],
+    skipped: Sequence[str],
+    *,
+    base: Twin,
+    gain_shares: dict[str, float],
+    dark_weights: dict[float, dict[str, float]],
+) -> Problem:
+    residual = np.concatenate([block["residual"] for block in blocks])
+    sizes = [len(block["residual"]) for block in blocks]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    responses = np.concatenate([block["responses"] for block in blocks], axis=1)
+    names = tuple(name for block in blocks for name in block["names"])
+    series_of = np.repeat(np.arange(len(blocks)), sizes)
+    factor_columns: dict[str, NDArray[np.float64]] = {}
+    first_nuisance = sum(len(variant.strengths) for variant in variants)
+    for offset, step in enumerate(nuisance_changes):
+        if not all_changes[first_nuisance + offset].failed:
+            factor_columns[step.name] = responses[first_nuisance + offset] / step.step_sd
+    for number, block in enumerate(blocks):
+        for name, column in block["local"].items():
+            whole = factor_columns.setdefault(name, np.zeros(len(residual)))
+            whole[starts[number] : starts[number + 1]] += column
+    factors = {name: column for name, column in factor_columns.items() if float(np.max(np.abs(column))) > 1e-3}
+    curves: list[Curve] = []
+    chosen: list[Variant] = []
+    missing: dict[str, str] = {}
+    position = 0
+    for variant in variants:
+        rows = range(position, position + len(variant.strengths))
+        position += len(variant.strengths)
+        failed = next((all_changes[row].failed for row in rows if all_changes[row].failed), "")
+        if failed:
+            missing.setdefault(variant.effect, failed)
+            continue
+        block_responses = responses[list(rows)]
+        if not float(np.max(np.abs(block_responses))) > 1e-3:
+            missing.setdefault(variant.effect, "nothing in this session responds to it")
+            continue
+        curves.append(
+            Curve(
+                effect=variant.effect,
+                variant=variant.name,
+                parameters=dict(variant.parameters),
+                low=variant.low,
+                high=variant.high,
+                strengths=np.array(variant.strengths),
+                responses=block_responses,
+                since=variant.since,
+                spread=_spread(variant, blocks, starts, len(residual)),
+            )
+        )
+        chosen.append(variant)
+    for curve in curves:
+        missing.pop(curve.effect, None)
+    group_keys: dict[str, int] = {}
+    groups = np.empty(len(residual), dtype=np.intp)
+    part_keys: dict[str, int] = {}
+    parts = np.empty(len(residual), dtype=np.intp)
+    for index, name in enumerate(names):
+        series = kept[int(series_of[index])].series
+        group = f"{name.axis}, {series.kind} {series.scene} {series.kV if series.kind != 'dark' else ''}".strip()
+        part = f"{name.axis} of {series.kind} {series.scene}".strip()
+        groups[index] = group_keys.setdefault(group, len(group_keys))
+        parts[index] = part_keys.setdefault(part, len(part_keys))
+    block_keys: dict[tuple[str, float], int] = {}
+    block_of = []
+    for item in kept:
+        place = (
+            (item.series.scene, item.request.source_object_mm or 0.0)
+            if item.series.kind == "object"
+            else (f"series {item.name}", 0.0)
+        )
+        block_of.append(block_keys.setdefault(place, len(block_keys)))
+    return Problem(
+        residual=residual,
+        factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(residual), 0)),
+        factor_names=tuple(factors),
+        curves=tuple(curves),
+        variants=tuple(chosen),
+        names=names,
+        series_of=series_of,
+        sd=np.concatenate([block["sd"] for block in blocks]),
+        groups=groups,
+        group_names=tuple(group_keys),
+        parts=parts,
+        part_names=tuple(part_keys),
+        blocks=np.array([block_of[number] for number in series_of], dtype=np.intp),
+        views=tuple(views),
+        base=base,
+        gain_shares=gain_shares,
+        dark_weights=dark_weights,
+        skipped=tuple(skipped),
+        missing_effects=missing,
+    )
+
+
+def _spread(
+    variant: Variant, blocks: Sequence[dict[str, Any]], starts: NDArray[np.intp], size: int
+) -> NDArray[np.float64] | None:
+    """Random responses a unit of strength: a drifting output moves each lit series' level and trend by chance."""
+    if variant.effect != "output_drift":
+        return None
+    columns = []
+    for number, block in enumerate(blocks):
+        series = block["item"].series
+        if series.kind not in ("flat", "object"):
+            continue
+        level = np.zeros(size)
+        level[starts[number] : starts[number + 1]] = block["local"][f"level of {series.name}"] * (
+            0.007 / scales.LEVEL_OF_SERIES_SD
+        )
+        columns.append(level)
+        for index, name in enumerate(block["names"]):
+            if name.statistic.startswith("trend") or name.statistic == "frame_factor":
+                column = np.zeros(size)
+                amount = 0.005 if name.statistic.startswith("trend") else 0.5
+                column[starts[number] + index] = amount / block["sd"][index]
+                columns.append(column)
+    return np.stack(columns, axis=1) if columns else None
+
+
+def _thicker(request: SeriesRequest, material: str, factor: float) -> SeriesRequest:
+    """The request with one material of its scene thicker by a factor."""
+    thickness = {
+        name: (image * np.float32(factor) if name == material else image)
+        for name, image in (request.thickness_mm or {}).items()
+    }
+    return replace(request, thickness_mm=thickness)

@@ -1,0 +1,232 @@
+"""What may differ from the base twin: effects with their variants and strengths, and nuisances that are no effect.
+
+A change is anything that the forward model can be asked with: applied effects, other spectral parameters, another
+spread or read noise, another thickness. Its response is what the probes would do.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration.priors import ATTENUATION_SCALE, PRIORS, UNDECLARED_SCINTILLATOR
+from ..generator.effects import EFFECTS, AppliedEffect, Effect
+from ..generator.twin import Estimate, Twin
+
+STRENGTH_SHARES = (0.15, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
+_MOST_VARIANTS = 4
+
+# scales of the session that any repeat shows; relative standard deviations unless the name says otherwise
+THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
+ATTENUATION_SD = 0.015  # of a material's attenuation: tables differ by 1-4 %
+ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube voltage
+LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
+LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
+GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
+POSITION_SD_PX = 0.15  # of a scene against its thickness maps
+REGISTERED_SD_PX = 0.02  # of what registration leaves of it
+SHARPNESS_FLOOR = 1.0  # of a scene's map probes at edges, in their own sds: rendering beyond all the nuisances
+OUTLINE_SD_PX = 0.1  # of where an object's outline lies: rendering of the pixels that it cuts, true size
+MAGNIFICATION_SD = 0.001
+EDGE_SD_PX2 = 0.08  # of the variance of an edge's blur: how a pixel's thickness stands for what its square sees
+EDGE_SD_PX3 = 0.06  # of the third and fourth order of an edge's profile
+EDGE_SD_PX4 = 0.04
+EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
+ROUGH_FIELDS = 16
+ROUGH_SHARE = 0.5  # of the local slope: rendering along an edge, from place to place
+SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
+READ_NOISE_SD = 0.005
+TILT_SD = 0.0005  # of the field's gradient between series
+KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
+DARK_SD_DN = 0.05  # of the dark between series
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """An effect with its inner parameters fixed.
+
+    Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
+    the strength; strengths at which the response is computed.
+    """
+
+    effect: str
+    name: str
+    parameters: Mapping[str, float]
+    sign: float
+    since: str
+    low: float
+    high: float
+    strengths: tuple[float, ...]
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    def applied(self, strength: float) -> AppliedEffect:
+        """The effect at a strength, as the forward model takes it."""
+        return AppliedEffect(
+            id=self.effect,
+            parameters={**self.parameters, "strength": self.sign * strength},
+            since=self.since,
+            options=dict(self.options),
+        )
+
+
+def variants_of(effect: Effect) -> list[Variant]:
+    """The variants of an effect that compete: ends and middle of each inner parameter, both signs, both onsets.
+
+    An effect that usually sets in after calibration is tried as such only; one that usually was always there, also so
+    only: a constant kV offset or filtration is absorbed by calibration and is no gap.
+    """
+    strength = effect.strength
+    inner = [item for item in effect.parameters[1:] if item.fitted]
+    choices: list[dict[str, float]] = [{}]
+    for item in inner:
+        if item.log:
+            middle = math.sqrt(item.low * item.high)
+            values = [item.low * (middle / item.low) ** 0.5, item.high * (middle / item.high) ** 0.5]
+        elif item.signed:
+            values = [-item.high, item.high] if len(inner) == 1 else [-item.default, item.default]
+        else:
+            span = item.high - item.low
+            count = 4 if item.name.endswith("_deg") else 2
+            values = (
+                [item.low + span * k / count for k in range(count)]
+                if count == 4
+                else [item.low + 0.25 * span, item.low + 0.75 * span]
+            )
+        grown = [{**choice, item.name: value} for choice in choices for value in values]
+        choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
+    if effect.id == "misregistration":
+        choices = [{"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)]
+        choices += [{"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)]
+    signs = (1.0, -1.0) if strength.signed else (1.0,)
+    low, high = strength.low, strength.high
+    nodes = tuple(low * (high / low) ** share for share in STRENGTH_SHARES)
+    since = "calibration" if effect.after_calibration else "always"
+    result = []
+    for choice in choices:
+        for sign in signs:
+            label = ", ".join(f"{name} {value:.3g}" for name, value in choice.items())
+            if sign < 0:
+                label = f"{label}, negative".strip(", ")
+            result.append(
+                Variant(
+                    effect=effect.id,
+                    name=label,
+                    parameters=choice,
+                    sign=sign,
+                    since=since,
+                    low=low,
+                    high=high,
+                    strengths=nodes,
+                )
+            )
+    return result
+
+
+def catalogue_variants(*, without: Sequence[str] = ()) -> list[Variant]:
+    """The variants of the whole catalogue, less the effects in `without`."""
+    return [variant for name, effect in EFFECTS.items() if name not in without for variant in variants_of(effect)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TwinChange:
+    """A nuisance that lies in the twin: its name, the changed twin or parameters, and how many prior sds the step is."""
+
+    name: str
+    twin: Twin
+    parameters: NDArray[np.float64] | None
+    step_sd: float
+
+
+def twin_changes(twin: Twin) -> list[TwinChange]:
+    """Steps in what calibration has fitted, each with the step's size in prior standard deviations.
+
+    Spectral parameters are taken with the priors that calibration started from, not its posterior: the calibrating
+    series are among the probes and say again what they know.
+    """
+    result: list[TwinChange] = []
+    posterior = twin.spectral
+    if posterior is not None:
+        best = np.asarray(posterior.best, dtype=np.float64)
+        draws = posterior.samples.std(axis=0)
+        for index, name in enumerate(posterior.names):
+            prior = PRIORS.get(name, ATTENUATION_SCALE)
+            sd = prior.sd
+            if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
+                sd = UNDECLARED_SCINTILLATOR.sd
+            if name in ("log_output", "log_DN_per_keV"):
+                # fixed by the level within percents; a wide prior would only leave the linear range
+                sd = 0.03
+            step = min(max(float(draws[index]), 0.05 * sd), sd)
+            if name == "inherent_filtration_mm_Al" and best[index] - step < 0:
+                step = abs(step)
+            changed = best.copy()
+            changed[index] += step
+            result.append(TwinChange(name=name, twin=twin, parameters=changed, step_sd=step / sd))
+    sigma = twin.noise.psf_sigma_px
+    sd = max(SPREAD_SD * sigma.value, (sigma.high - sigma.low) / (2 * 1.959964), 0.01)
+    step = 0.5 * sd
+    wider = Estimate(value=sigma.value + step, low=sigma.low, high=max(sigma.high, sigma.value + step))
+    result.append(
+        TwinChange(
+            name="optical spread",
+            twin=replace(twin, noise=replace(twin.noise, psf_sigma_px=wider)),
+            parameters=None,
+            step_sd=step / sd,
+        )
+    )
+    read = twin.noise.read_noise_DN
+    sd = max(READ_NOISE_SD * read.value, (read.high - read.low) / (2 * 1.959964), 1e-3)
+    noisier = Estimate(value=read.value + sd, low=read.low, high=max(read.high, read.value + sd))
+    scale = np.float32((noisier.value / max(read.value, 1e-9)) ** 2)
+    result.append(
+        TwinChange(
+            name="read noise",
+            twin=replace(
+                twin,
+                noise=replace(twin.noise, read_noise_DN=noisier),
+                maps=replace(twin.maps, read_variance_DN2=twin.maps.read_variance_DN2 * scale),
+            ),
+            parameters=None,
+            step_sd=1.0,
+        )
+    )
+    white = twin.noise.white_fraction
+    result.append(
+        TwinChange(
+            name="secondary quanta",
+            twin=replace(twin, noise=replace(twin.noise, white_fraction=white + 0.01)),
+            parameters=None,
+            step_sd=1.0,
+        )
+    )
+    return result
+
+
+def smooth_twin(twin: Twin) -> Twin:
+    """The twin with all pixels alike: dark, gain and noise at their medians, no bad pixels.
+
+    The diagnosis takes pixel patterns from the calibrating series themselves, so that an effect which calibration took in
+    is taken in by the same arithmetic when it is simulated.
+    """
+    maps = twin.maps
+    good = maps.bad_pixels == 0
+
+    def level(image: NDArray[np.floating]) -> NDArray[np.float32]:
+        return np.full(maps.shape, float(np.median(image[good])) if good.any() else float(np.median(image)), np.float32)
+
+    flat = np.ones(maps.shape, np.float32)
+    return replace(
+        twin,
+        maps=replace(
+            maps,
+            dark_DN=level(maps.dark_DN),
+            dark_DN_per_ms=level(maps.dark_DN_per_ms),
+            gain_relative=flat,
+            read_variance_DN2=level(maps.read_variance_DN2),
+            bad_pixels=np.zeros(maps.shape, np.uint8),
+        ),
+        levels=tuple(replace(item, flat_shape=flat) for item in twin.levels),
+        effects=(),
+    )

@@ -1,0 +1,466 @@
+"""Where the gap between a session and its twin lies, which effect explains it, and how far it shrinks."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import AcquisitionFile
+from ..calibration.calibrate import calibrate_twin
+from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.twin import Twin
+from .assemble import Problem, build_problem
+from .changes import catalogue_variants
+from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
+from .session import calibrating_names
+from .whitening import whiten
+
+VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
+EXPLAINED_FROM = 0.6  # probability of the leading named hypothesis from which the answer is `explained`
+POWER = 1.0
+_WORST_PLACES = 30
+# the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
+_REPLICATES = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cause:
+    """An effect, how probable it is, its strength and inner parameters, and how far the gap shrinks with it."""
+
+    effect: str
+    probability: float
+    strength: tuple[float, float, float]
+    unit: str
+    parameters: Mapping[str, float]
+    sign: float
+    since: str
+    shrinks_by: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """A probe that departs from the twin: axis, series, statistic, location, unit; z after the nuisances took their part."""
+
+    axis: str
+    series: str
+    statistic: str
+    location: str
+    unit: str
+    z: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gap:
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor."""
+
+    before: float
+    after: float
+    floor: float
+    shrinks_by: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Diagnosis:
+    """The answer; `twin` is the twin with the effects of the leading hypothesis added (unchanged where none is named)."""
+
+    verdict: str
+    hypotheses: tuple[Hypothesis, ...]
+    causes: tuple[Cause, ...]
+    probability_no_gap: float
+    probability_unknown: float
+    unknown_location: str
+    where: tuple[Place, ...]
+    threshold_z: float
+    gap: Gap
+    held_out: tuple[tuple[str, float, float, float], ...]
+    ambiguous_with: tuple[tuple[str, str], ...]
+    next_measurement: Mapping[str, Any] | None
+    twin: Twin
+    added: tuple[AppliedEffect, ...]
+    problem: Problem = field(repr=False)
+    warnings: tuple[str, ...] = ()
+
+
+def calibrated_twin(
+    acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
+) -> Twin:
+    """The twin from the series that calibrate (see diagnosis.session)."""
+    names = calibrating_names(acquisition.series)
+    part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
+    return calibrate_twin(part, rng=rng, progress=progress)
+
+
+def diagnose(
+    acquisition: AcquisitionFile,
+    *,
+    twin: Twin | None = None,
+    rng: np.random.Generator,
+    without: Sequence[str] = (),
+    priors: Priors | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Diagnose a session.
+
+    Args:
+        acquisition: open acquisition file, anything from two flats with darks to the full protocol.
+        twin: calibrated elsewhere; absent, the session's own calibrating series make it.
+        rng: source of randomness.
+        without: effects to leave out of the catalogue.
+        priors: probabilities of the kinds of hypothesis before looking.
+        progress: called with the name of each stage.
+
+    Raises:
+        InputError: nothing in the session can be judged.
+    """
+    tell = progress or (lambda stage: None)
+    elsewhere = twin is not None
+    if twin is None:
+        tell("calibration")
+        twin = calibrated_twin(acquisition, rng=rng, progress=progress)
+    problem = build_problem(
+        acquisition,
+        twin,
+        variants=catalogue_variants(without=without),
+        calibrated_elsewhere=elsewhere,
+        progress=progress,
+    )
+    return judge(problem, twin, rng=rng, priors=priors, progress=progress)
+
+
+def judge(
+    problem: Problem,
+    twin: Twin,
+    *,
+    rng: np.random.Generator,
+    priors: Priors | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """The answer to an assembled problem."""
+    tell = progress or (lambda stage: None)
+    tell("hypotheses")
+    nuisances = Nuisances(problem.factors)
+    white = whiten(problem.residual, problem.factors, problem.curves, problem.blocks)
+    hypotheses = weigh_hypotheses(
+        white.residual,
+        curves=white.curves,
+        nuisances=Nuisances(white.factors),
+        groups=problem.groups,
+        group_names=problem.group_names,
+        unknown_groups=problem.parts,
+        unknown_names=problem.part_names,
+        priors=priors or Priors(),
+        power=POWER,
+    )
+    own = {(curve.effect, curve.variant): curve for curve in problem.curves}
+    hypotheses = tuple(
+        replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
+        for item in hypotheses
+    )
+    marginal: dict[str, float] = {}
+    for hypothesis in hypotheses:
+        for effect in hypothesis.effects:
+            marginal[effect] = marginal.get(effect, 0.0) + hypothesis.probability
+    none = next((item.probability for item in hypotheses if not item.effects), 0.0)
+    unknown = marginal.pop(UNKNOWN, 0.0)
+    leading = hypotheses[0]
+    tied: list[Hypothesis] = []
+    if not leading.effects:
+        verdict = "no_gap"
+    elif leading.effects == (UNKNOWN,):
+        verdict = "unknown_effect"
+    elif leading.probability >= EXPLAINED_FROM:
+        verdict = "explained"
+    else:
+        verdict = "ambiguous"
+        total = 0.0
+        for item in hypotheses:
+            if item.effects and item.effects != (UNKNOWN,):
+                tied.append(item)
+            total += item.probability
+            if total > 0.9 and len(tied) > 1:
+                break
+        if len({effect for item in tied for effect in item.effects}) < 2:
+            verdict = "explained"
+    tell("held-out data")
+    gap, held_out, shares = _held_out(problem, leading, rng)
+    named = leading.effects if leading.effects and leading.effects != (UNKNOWN,) else ()
+    order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
+    listed = set(named) | {effect for item in tied for effect in item.effects}
+    causes = []
+    for effect in order:
+        if effect not in listed and marginal[effect] < 0.02:
+            continue
+        best = next(item for item in hypotheses if effect in item.effects)
+        curve = best.variants[effect]
+        variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+        causes.append(
+            Cause(
+                effect=effect,
+                probability=min(marginal[effect], 1.0),
+                strength=best.strengths[effect],
+                unit=EFFECTS[effect].strength.unit,
+                parameters=dict(curve.parameters),
+                sign=variant.sign,
+                since=variant.since,
+                shrinks_by=shares.get(effect),
+            )
+        )
+    causes.sort(key=lambda item: -item.probability)
+    z = _leave_one_out_z(problem, nuisances)
+    threshold = _threshold(problem, nuisances, rng)
+    places = [
+        Place(
+            axis=problem.names[index].axis,
+            series=problem.views[problem.series_of[index]].session.name,
+            statistic=problem.names[index].statistic,
+            location=problem.names[index].location,
+            unit=problem.names[index].unit,
+            z=float(z[index]),
+        )
+        for index in np.argsort(-np.abs(z))[:_WORST_PLACES]
+        if abs(z[index]) > threshold
+    ]
+    added = tuple(_applied(problem, leading.variants[effect], leading.strengths[effect][0]) for effect in named)
+    improved = replace(twin, effects=(*twin.effects, *added))
+    pairs = sorted(
+        {
+            (min(a, b), max(a, b))
+            for first in tied
+            for second in tied
+            for a in first.effects
+            for b in second.effects
+            if a != b and not (set(first.effects) <= set(second.effects) or set(second.effects) <= set(first.effects))
+        }
+    )
+    return Diagnosis(
+        verdict=verdict,
+        hypotheses=hypotheses,
+        causes=tuple(causes),
+        probability_no_gap=none,
+        probability_unknown=unknown,
+        unknown_location=next((item.location for item in hypotheses if item.effects == (UNKNOWN,)), ""),
+        where=tuple(places),
+        threshold_z=threshold,
+        gap=gap,
+        held_out=held_out,
+        ambiguous_with=tuple(pairs) if verdict == "ambiguous" else (),
+        next_measurement=None,
+        twin=improved,
+        added=added,
+        problem=problem,
+        warnings=tuple(problem.skipped),
+    )
+
+
+def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
+    variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+    return variant.applied(strength)
+
+
+def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:
+    """z of each probe given all others: (C^-1 r)_i / sqrt((C^-1)_ii)."""
+    from scipy.linalg import solve_triangular
+
+    solved = nuisances.solve(problem.residual)
+    factor = solve_triangular(nuisances._cholesky, nuisances.factors.T, lower=True)
+    diagonal = 1.0 - np.sum(factor**2, axis=0)
+    return np.asarray(solved / np.sqrt(np.maximum(diagonal, 1e-12)))
+
+
+def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator) -> float:
+    """The |z| that the largest of all probes exceeds in 5 % of sessions without a gap (by simulation)."""
+    from scipy.linalg import solve_triangular
+
+    size = len(problem.residual)
+    factor = solve_triangular(nuisances._cholesky, nuisances.factors.T, lower=True)
+    diagonal = np.sqrt(np.maximum(1.0 - np.sum(factor**2, axis=0), 1e-12))
+    draws = rng.standard_normal((_REPLICATES, size))
+    draws += rng.standard_normal((_REPLICATES, nuisances.factors.shape[1])) @ nuisances.factors.T
+    solved = draws - (draws @ factor.T) @ factor
+    return float(np.quantile(np.max(np.abs(solved / diagonal), axis=1), 0.95))
+
+
+def _folds(problem: Problem) -> NDArray[np.intp]:
+    """Fold 0 or 1 of each series: alternating in time within each kind, scene and beam."""
+    counts: dict[tuple[Any, ...], int] = {}
+    folds = []
+    for view in problem.views:
+        series = view.session.series
+        key = (series.kind, series.scene.rstrip("0123456789"), series.kV if series.kind != "dark" else None)
+        counts[key] = counts.get(key, -1) + 1
+        folds.append(counts[key] % 2)
+    return np.array(folds, dtype=np.intp)
+
+
+def _predictive(
+    problem: Problem, fit: NDArray[np.bool_], response: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Held-out residuals (probe,) and their standard deviations, nuisances fitted on `fit` only."""
+    residual = problem.residual if response is None else problem.residual - response
+    inner = Nuisances(problem.factors[fit])
+    fitted = inner.fitted(residual[fit])
+    held = ~fit
+    from scipy.linalg import solve_triangular
+
+    left = residual[held] - problem.factors[held] @ fitted
+    half = solve_triangular(inner._cholesky, problem.factors[held].T, lower=True)
+    return left, np.sqrt(1.0 + np.sum(half**2, axis=0))
+
+
+def _held_out(
+    problem: Problem, leading: Hypothesis, rng: np.random.Generator
+) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
+    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
+    folds = _folds(problem)[problem.series_of]
+    size = len(problem.residual)
+    before, after = np.full(size, np.nan), np.full(size, np.nan)
+    alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}
+    sds = np.ones(size)
+    effects = [effect for effect in leading.effects if effect != UNKNOWN]
+    for fold in (0, 1):
+        fit = folds != fold
+        held = ~fit
+        if not fit.any() or not held.any():
+            continue
+        before[held], sds[held] = _predictive(problem, fit, None)
+        inner = Nuisances(problem.factors[fit])
+        strengths = _strengths_on(problem, leading, effects, fit, inner)
+        responses = {effect: leading.variants[effect].response(strengths[effect]) for effect in effects}
+        whole = sum(responses.values(), np.zeros(size))
+        after[held] = _predictive(problem, fit, whole)[0] if effects else before[held]
+        for effect in effects:
+            alone[effect][held] = _predictive(problem, fit, responses[effect])[0]
+    known = np.isfinite(before)
+    before, after, sd, series = before[known], after[known], sds[known], problem.series_of[known]
+    axes = np.array([name.axis for name in problem.names])[known]
+    if before.size == 0:
+        return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
+
+    def rms(values: NDArray[np.float64], chosen: NDArray[np.bool_] | None = None) -> float:
+        use = values / sd if chosen is None else (values / sd)[chosen]
+        return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
+
+    floor = 1.0
+    rows = []
+    for axis in dict.fromkeys(axes):
+        chosen = axes == axis
+        rows.append((str(axis), rms(before, chosen), rms(after, chosen), floor))
+
+    def share(values: NDArray[np.float64]) -> tuple[float, float, float] | None:
+        scale = 1.0 / math.sqrt(2.0 * before.size)
+        if rms(before) < floor + 3.0 * scale:
+            return None
+        point = (rms(before) - rms(values)) / (rms(before) - floor)
+        draws = []
+        numbers = np.unique(series)
+        members = [np.nonzero(series == number)[0] for number in numbers]
+        b2, v2 = (before / sd) ** 2, (values / sd) ** 2
+        sums = np.array([[b2[m].sum(), v2[m].sum(), len(m)] for m in members])
+        for _ in range(300):
+            total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)
+            b, v = math.sqrt(total[0] / total[2]), math.sqrt(total[1] / total[2])
+            if b > floor + scale:
+                draws.append((b - v) / (b - floor))
+        if len(draws) < 100:
+            return None
+        low, high = np.quantile(draws, [0.025, 0.975])
+        return point, min(float(low), point), max(float(high), point)
+
+    shares = {}
+    for effect, values in alone.items():
+        found = share(values[known])
+        if found is not None:
+            shares[effect] = found
+    gap = Gap(before=rms(before), after=rms(after), floor=floor, shrinks_by=share(after) if effects else None)
+    return gap, tuple(rows), shares
+
+
+def _strengths_on(
+    problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_], inner: Nuisances
+) -> dict[str, float]:
+    """Strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
+    strengths = {effect: leading.strengths[effect][0] for effect in effects}
+    for _ in range(3 if len(effects) > 1 else 1):
+        for effect in effects:
+            curve = leading.variants[effect]
+            others = sum(
+                (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
+                np.zeros(len(problem.residual)),
+            )
+            part = replace(curve, responses=curve.responses[:, fit], spread=None)
+            result = fit_curve((problem.residual - others)[fit], part, inner, problem.groups[fit])
+            strengths[effect] = result.best
+    return strengths
+
+
+def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """`diagnosis.json`, the form of the interfaces page."""
+
+    def interval(value: tuple[float, float, float] | None) -> dict[str, float] | None:
+        return None if value is None else {"value": value[0], "low": value[1], "high": value[2]}
+
+    def parameters(cause: Cause) -> dict[str, Any]:
+        effect = EFFECTS[cause.effect]
+        units = {item.name: item.unit for item in effect.parameters}
+        values = {
+            "strength": {
+                "value": cause.sign * cause.strength[0],
+                "low": min(cause.sign * cause.strength[1], cause.sign * cause.strength[2]),
+                "high": max(cause.sign * cause.strength[1], cause.sign * cause.strength[2]),
+                "unit": cause.unit,
+            }
+        }
+        for name, value in cause.parameters.items():
+            values[name] = {"value": value, "low": value, "high": value, "unit": units.get(name, "")}
+        return values
+
+    return {
+        "format": "raytwin-diagnosis",
+        "version": 1,
+        "verdict": diagnosis.verdict,
+        "gap": {
+            "before": diagnosis.gap.before,
+            "after": diagnosis.gap.after,
+            "floor": diagnosis.gap.floor,
+            "shrinks_by": interval(diagnosis.gap.shrinks_by),
+        },
+        "causes": [
+            {
+                "effect": cause.effect,
+                "probability": cause.probability,
+                "strength": {**(interval(cause.strength) or {}), "unit": cause.unit},
+                "parameters": parameters(cause),
+                "since": cause.since,
+                "shrinks_by": interval(cause.shrinks_by),
+            }
+            for cause in diagnosis.causes
+        ],
+        "hypotheses": [
+            {"effects": list(item.effects), "probability": item.probability} for item in diagnosis.hypotheses
+        ],
+        "probability_no_gap": diagnosis.probability_no_gap,
+        "probability_unknown": diagnosis.probability_unknown,
+        "where": [
+            {
+                "axis": place.axis,
+                "series": place.series,
+                "statistic": place.statistic,
+                "z": place.z,
+                "location": place.location,
+                "unit": place.unit,
+            }
+            for place in diagnosis.where
+        ],
+        "ambiguous_with": [list(pair) for pair in diagnosis.ambiguous_with],
+        "next_measurement": diagnosis.next_measurement,
+        "held_out": [
+            {"axis": axis, "before": before, "after": after, "floor": floor}
+            for axis, before, after, floor in diagnosis.held_out
+        ],
+        "task": None,
+        "warnings": list(diagnosis.warnings),
+        "inputs": dict(inputs),
+    }

@@ -1,0 +1,83 @@
+"""The diagnosis in plain words: one paragraph that can be read once."""
+
+import math
+from collections.abc import Sequence
+
+from ..generator.effects import EFFECTS
+from .diagnose import Cause, Diagnosis, Place
+
+_AXIS_WORDS = {
+    "level": "brightness",
+    "noise": "noise",
+    "sharpness": "sharpness at edges",
+    "texture": "noise texture",
+    "time": "change with time",
+    "position": "pattern across the field",
+    "energy": "change with tube voltage",
+    "tails": "outlying pixels and codes",
+}
+
+
+def title_of(effect: str) -> str:
+    """The effect's name in words."""
+    return EFFECTS[effect].title if effect in EFFECTS else effect
+
+
+def _percent(value: tuple[float, float, float]) -> str:
+    return f"{100 * value[0]:.0f} % ({100 * value[1]:.0f} to {100 * value[2]:.0f})"
+
+
+def strength_text(cause: Cause) -> str:
+    """Strength with its 95 % interval and unit."""
+    value, low, high = cause.strength
+    digits = max(0, 2 - math.floor(math.log10(max(value, 1e-9))))
+    sign = "-" if cause.sign < 0 else ""
+    return f"{sign}{value:.{min(digits, 4)}f} {cause.unit} ({low:.{min(digits, 4)}f} to {high:.{min(digits, 4)}f})"
+
+
+def _place_text(place: Place) -> str:
+    what = place.statistic if not place.location else f"{place.statistic}, {place.location}"
+    return f"{_AXIS_WORDS.get(place.axis, place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
+
+
+def _where_text(places: Sequence[Place]) -> str:
+    if not places:
+        return "No single probe stands out beyond noise and what calibration leaves open."
+    axes = list(dict.fromkeys(_AXIS_WORDS.get(place.axis, place.axis) for place in places[:12]))
+    return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
+
+
+def paragraph(diagnosis: Diagnosis) -> str:
+    """Verdict, where, which, how far."""
+    gap = diagnosis.gap
+    figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
+    if diagnosis.verdict == "no_gap":
+        return (
+            f"The session agrees with its twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing). "
+            f"{figures}."
+        )
+    where = _where_text(diagnosis.where)
+    if diagnosis.verdict == "unknown_effect":
+        return (
+            f"{where} No effect of the catalogue, and no pair of them, explains it (probability"
+            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue), seen in the"
+            f" {diagnosis.unknown_location}. {figures}."
+        )
+    if diagnosis.verdict == "ambiguous":
+        named = ", ".join(f"{title_of(cause.effect)} ({cause.probability:.2f})" for cause in diagnosis.causes[:5])
+        text = f"{where} These data cannot tell apart what causes it: {named}. {figures}."
+        if diagnosis.next_measurement:
+            text += f" To tell them apart: {diagnosis.next_measurement['text']}."
+        return text
+    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.hypotheses[0].effects]
+    named = " and ".join(
+        f"{title_of(cause.effect)} of {strength_text(cause)} (probability {cause.probability:.2f})" for cause in leading
+    )
+    text = f"{where} {named[:1].upper()}{named[1:]} explain{'s' if len(leading) == 1 else ''} it. {figures}"
+    if gap.shrinks_by is not None:
+        text += (
+            f" and falls to {gap.after:.2f} once that is added, by {_percent(gap.shrinks_by)} of what is above noise."
+        )
+    else:
+        text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
+    return text

@@ -1,0 +1,193 @@
+"""Pictures of a diagnosis: gap maps, curves by axis, before and after, hypotheses."""
+
+import io
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .assemble import SeriesView
+from .diagnose import Diagnosis
+from .inference import UNKNOWN
+
+_BEFORE, _AFTER, _FLOOR = "#b3402a", "#2a6fb3", "#777777"
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Residual over noise after averaging over 5 x 5 pixels (row, column)."""
+    from scipy.ndimage import uniform_filter
+
+    inside = view.mask.astype(np.float64)
+    weight = uniform_filter(inside, 5)
+    value = uniform_filter(np.where(view.mask, residual, 0.0).astype(np.float64), 5) / np.maximum(weight, 1e-9)
+    noise = uniform_filter(np.where(view.mask, view.noise_DN, 0.0).astype(np.float64) ** 2, 5) / np.maximum(
+        weight, 1e-9
+    )
+    return np.asarray(np.where(weight > 0.2, value / np.sqrt(np.maximum(noise, 1e-30)), np.nan))
+
+
+def plot_gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, count: int = 4) -> bytes:
+    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after, the series with most gap."""
+    views = diagnosis.problem.views
+    chosen = _worst_views(diagnosis, count)
+    figure, axes = _figure(3.1 * len(chosen) + 0.8, 6.0, 2, len(chosen))
+    image = None
+    for column, index in enumerate(chosen):
+        view = views[index]
+        before = _smoothed_z(view, view.residual_DN)
+        limit = max(3.0, float(np.nanquantile(np.abs(before), 0.98)))
+        for row, residual in enumerate((view.residual_DN, after[index])):
+            axis = axes[row][column]
+            image = axis.imshow(_smoothed_z(view, residual), cmap="RdBu_r", vmin=-limit, vmax=limit)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if row == 0:
+                axis.set_title(view.session.name, fontsize=8)
+            if column == 0:
+                axis.set_ylabel("before" if row == 0 else "after", fontsize=10)
+            figure.colorbar(image, ax=axis, fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
+    figure.suptitle("Measured less twin, in units of one pixel's noise", fontsize=10)
+    return _png(figure)
+
+
+def _worst_views(diagnosis: Diagnosis, count: int) -> list[int]:
+    problem = diagnosis.problem
+    power = np.zeros(len(problem.views))
+    is_map = np.array([name.statistic == "mean frame" for name in problem.names])
+    for index in range(len(problem.views)):
+        chosen = (problem.series_of == index) & is_map
+        power[index] = float(np.mean(problem.residual[chosen] ** 2)) if chosen.any() else 0.0
+    seen: set[tuple[Any, ...]] = set()
+    result = []
+    for index in np.argsort(-power):
+        series = problem.views[index].session.series
+        key = (series.kind, series.scene, series.kV)
+        if key in seen:
+            continue
+        seen.add(key)
+        result.append(int(index))
+        if len(result) == count:
+            break
+    return result
+
+
+def plot_transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> bytes:
+    """Gap in percent of the open field against -log transmission, every scene with known thickness; before and after."""
+    figure, grid = _figure(9.0, 3.6, 1, 2, sharey=True)
+    axes = grid[0]
+    shown = 0
+    for index, view in enumerate(diagnosis.problem.views):
+        if view.session.series.kind != "object":
+            continue
+        open_DN = float(view.signal_DN.max())
+        depth = -np.log(np.clip(view.signal_DN / open_DN, 1e-6, None))
+        edges = np.unique(np.quantile(depth[view.mask], np.linspace(0, 1, 13)))
+        middle, values = [], ([], [])  # type: ignore[var-annotated]
+        for low, high in pairwise(edges):
+            inside = view.mask & (depth >= low) & (depth <= high)
+            if inside.sum() < 16:
+                continue
+            middle.append(0.5 * (low + high))
+            for part, residual in zip(values, (view.residual_DN, after[index]), strict=True):
+                part.append(100.0 * float(np.mean(residual[inside])) / open_DN)
+        if len(middle) > 1:
+            shown += 1
+            color = f"C{shown % 10}"
+            for axis, part in zip(axes, values, strict=True):
+                axis.plot(middle, part, "o-", ms=3, lw=1, color=color, label=view.session.name if shown <= 8 else None)
+    for axis, title in zip(axes, ("before", "after"), strict=True):
+        axis.axhline(0, color="k", lw=0.6)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("-log transmission (twin)")
+    axes[0].set_ylabel("measured less twin, % of open field")
+    if shown:
+        axes[1].legend(fontsize=6)
+    else:
+        axes[0].text(0.5, 0.5, "no scene of known thickness", transform=axes[0].transAxes, ha="center")
+    return _png(figure)
+
+
+def plot_by_axis(diagnosis: Diagnosis) -> bytes:
+    """Held-out gap by axis, before and after, and the noise floor."""
+    rows = diagnosis.held_out
+    figure, grid = _figure(6.4, 0.45 * max(len(rows), 2) + 1.2)
+    axis = grid[0, 0]
+    y = np.arange(len(rows))
+    axis.barh(y - 0.18, [row[1] for row in rows], 0.34, color=_BEFORE, label="before")
+    axis.barh(y + 0.18, [row[2] for row in rows], 0.34, color=_AFTER, label="after")
+    axis.axvline(1.0, color=_FLOOR, lw=1, ls="--", label="noise")
+    axis.set_yticks(y, [row[0] for row in rows])
+    axis.invert_yaxis()
+    if rows and max(row[1] for row in rows) > 20:
+        axis.set_xscale("log")
+    axis.set_xlabel("root mean square of standardised residuals, held-out series")
+    axis.legend(fontsize=8)
+    return _png(figure)
+
+
+def plot_places(diagnosis: Diagnosis) -> bytes:
+    """Every probe's z over the series in time order, coloured by axis, with the threshold of chance."""
+    from .diagnose import _leave_one_out_z
+    from .inference import Nuisances
+
+    problem = diagnosis.problem
+    z = _leave_one_out_z(problem, Nuisances(problem.factors))
+    figure, grid = _figure(9.0, 4.4)
+    axis = grid[0, 0]
+    axes_names = list(dict.fromkeys(name.axis for name in problem.names))
+    for number, name in enumerate(axes_names):
+        chosen = np.array([probe.axis == name for probe in problem.names])
+        jitter = (number - len(axes_names) / 2) / (1.4 * len(axes_names))
+        axis.plot(problem.series_of[chosen] + jitter, z[chosen], ".", ms=4, label=name, color=f"C{number}")
+    for sign in (-1, 1):
+        axis.axhline(sign * diagnosis.threshold_z, color=_FLOOR, lw=1, ls="--")
+    if float(np.max(np.abs(z))) > 30:
+        axis.set_yscale("symlog", linthresh=10)
+    axis.set_xticks(range(len(problem.views)), [view.session.name for view in problem.views], rotation=90, fontsize=5)
+    axis.set_ylabel("z given all other probes")
+    axis.legend(fontsize=7, ncol=4)
+    return _png(figure)
+
+
+def plot_hypotheses(diagnosis: Diagnosis) -> bytes:
+    """Probabilities of the leading hypotheses."""
+    shown = [item for item in diagnosis.hypotheses if item.probability > 1e-4][:10]
+    labels = [
+        "no gap" if not item.effects else "unknown effect" if item.effects == (UNKNOWN,) else " + ".join(item.effects)
+        for item in shown
+    ]
+    figure, grid = _figure(6.4, 0.36 * len(shown) + 1.0)
+    axis = grid[0, 0]
+    y = np.arange(len(shown))
+    axis.barh(y, [item.probability for item in shown], color=_AFTER)
+    for position, item in zip(y, shown, strict=True):
+        axis.text(min(item.probability + 0.01, 0.9), position, f"{item.probability:.3f}", va="center", fontsize=8)
+    axis.set_yticks(y, labels)
+    axis.invert_yaxis()
+    axis.set_xlim(0, 1)
+    axis.set_xlabel("probability")
+    return _png(figure)
+
+
+def rms(values: NDArray[np.floating]) -> float:
+    """Root mean square of finite values."""
+    finite = values[np.isfinite(values)]
+    return math.sqrt(float(np.mean(finite**2))) if finite.size else float("nan")

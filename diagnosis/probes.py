@@ -1,0 +1,603 @@
+"""Probes of one series: numbers with known noise, each tied to an axis, that frames and forward model both give.
+
+Two families. *Map probes* are projections of the mean frame's residual on a set of templates: smooth shapes, bins of
+transmission, derivatives at edges, long tails, and what each effect and nuisance would do there. They are made
+orthogonal one after the other under the noise's own covariance, so that each has unit variance, is independent of the
+others and bears the name of the template that it adds. *Scalar probes* are noise by level, correlation between neighbours and
+frames, lines, blocks, the common factor, codes, fixed pattern and outliers.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..generator.series import ExpectedSeries
+from .registration import gradient
+from .summaries import BLOCK_PX, LAGS, SeriesSummary
+
+AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
+_AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
+OUTLIER_SD = 7.0
+_KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
+
+# what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
+FLOORS: Mapping[str, float] = {
+    "log_variance": 0.004,
+    "correlation": 0.002,
+    "row_ratio": 0.03,
+    "column_ratio": 0.03,
+    "block_ratio": 0.03,
+    "temporal_correlation": 0.002,
+    "kurtosis": 0.02,
+    "frame_factor": 0.15,
+    "trend": 0.0001,
+    "dark_trend_DN": 0.02,
+    "afterglow": 2e-5,
+    "codes": 0.03,
+    "fixed_pattern": 0.05,
+    "outliers": 0.3,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Template:
+    """A map (row, column) to project on, DN, and what it stands for."""
+
+    axis: str
+    name: str
+    unit: str
+    image: NDArray[np.floating]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scalar:
+    """A scalar probe: axis, name, unit, measured value, its standard deviation."""
+
+    axis: str
+    name: str
+    unit: str
+    value: float
+    sd: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeName:
+    """What a probe is called: axis, statistic, location (where within the series), unit."""
+
+    axis: str
+    statistic: str
+    location: str
+    unit: str
+
+
+def quantum_mean(expected: ExpectedSeries, mask: NDArray[np.bool_]) -> tuple[float, float]:
+    """Quantum and white variance averaged over a mask, DN^2."""
+    return float(np.mean(expected.quantum_variance_DN2[mask])), float(
+        np.mean(np.broadcast_to(expected.white_variance_DN2, mask.shape)[mask])
+    )
+
+
+def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
+    """Correlation of the quantum part at a lag; 0 beyond what the model gives."""
+    table = expected.noise_autocovariance
+    r, c = abs(dr), abs(dc)
+    return float(table[r, c]) if r < table.shape[0] and c < table.shape[1] else 0.0
+
+
+def correlation_sum(expected: ExpectedSeries, rows: int, columns: int) -> float:
+    """Sum of the quantum part's correlations over lags with triangular weights of a rows x columns block."""
+    table = expected.noise_autocovariance
+    total = 0.0
+    for r in range(-min(rows, table.shape[0]) + 1, min(rows, table.shape[0])):
+        for c in range(-min(columns, table.shape[1]) + 1, min(columns, table.shape[1])):
+            total += (1 - abs(r) / rows) * (1 - abs(c) / columns) * float(table[abs(r), abs(c)])
+    return total
+
+
+def _lag_loss(expected: ExpectedSeries) -> float:
+    correlation = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
+    return 1.0 - float(correlation[0]) if correlation.size else 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScalarContext:
+    """What scalar probes of a series refer to; the same for measured frames and forward model.
+
+    Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
+    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; integer: whole-number
+    frames.
+    """
+
+    kind: str
+    frames: int
+    good: NDArray[np.bool_]
+    labels: NDArray[np.int64]
+    label_names: tuple[str, ...]
+    reference_signal_DN: float
+    previous_signal_DN: float | None
+    calibrates: bool
+    codes_usable: bool
+    pattern_noise_DN2: float
+    block_noise_DN2: float
+
+
+def time_templates(frames: int) -> list[tuple[str, NDArray[np.float64]]]:
+    """Orthonormal profiles over frames (n,), each free of the mean: early rise or fall, slow settling, linear trend."""
+    if frames < 6:
+        return []
+    t = np.arange(frames, dtype=np.float64)
+    result: list[tuple[str, NDArray[np.float64]]] = []
+    basis = [np.ones(frames) / math.sqrt(frames)]
+    for name, profile in (
+        ("linear trend", t - t.mean()),
+        ("first frames", np.exp(-t / 1.5)),
+        ("settling", np.exp(-t / (0.15 * frames + 2.0))),
+    ):
+        rest = profile - sum(float(profile @ item) * item for item in basis)
+        norm = float(np.linalg.norm(rest))
+        if norm < 0.05 * float(np.linalg.norm(profile)):
+            continue
+        basis.append(rest / norm)
+        result.append((name, basis[-1]))
+    return result
+
+
+def expected_scalars(
+    expected: ExpectedSeries, context: ScalarContext, *, dark_change_DN: NDArray[np.floating] | float = 0.0
+) -> dict[str, float]:
+    """The scalar probes' values by the forward model, by name; only those that this kind of series has.
+
+    dark_change_DN: what the effects changed in the dark that is subtracted (an afterglow is judged against it).
+    """
+    values: dict[str, float] = {}
+    good = context.good
+    n_good = int(good.sum())
+    rows, columns = good.shape
+    keep = _lag_loss(expected)
+    row, column = expected.row_variance_DN2, expected.column_variance_DN2
+    mean_q, mean_w = quantum_mean(expected, good)
+    total = mean_q * keep + mean_w + row + column
+    if context.frames > 2:
+        for label, name in enumerate(context.label_names):
+            mask = good & (context.labels == label)
+            q, w = quantum_mean(expected, mask)
+            here = q * keep + w + row + column
+            values[f"log_variance {name}"] = math.log(max(here, 1e-12))
+            for dr, dc in LAGS:
+                covariance = (
+                    q * keep * autocovariance(expected, dr, dc) + (row if dr == 0 else 0) + (column if dc == 0 else 0)
+                )
+                values[f"correlation {name} ({dr},{dc})"] = covariance / max(here, 1e-12)
+        line_q = mean_q * keep
+        values["row_ratio"] = math.log(
+            max(row * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w, 1e-12) / total
+        )
+        values["column_ratio"] = math.log(
+            max(column * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w, 1e-12) / total
+        )
+        values["block_ratio"] = math.log(
+            max(
+                line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX) + mean_w + BLOCK_PX * (row + column),
+                1e-12,
+            )
+            / total
+        )
+        temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
+        full = mean_q + mean_w + row + column
+        for step in (1, 2):
+            correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
+            values[f"temporal_correlation {step}"] = correlation * mean_q / full
+        values["kurtosis"] = 0.0
+        if context.kind in ("flat", "object"):
+            signal = context.reference_signal_DN
+            quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / n_good
+            quantum += row / rows + column / columns
+            values["frame_factor"] = math.log(quantum + (expected.frame_factor_rms * signal) ** 2)
+    profiles = time_templates(context.frames)
+    if profiles and context.kind != "afterglow":
+        profile = frame_profile(expected, good)
+        scale = 1.0 if context.kind == "dark" else 1.0 / context.reference_signal_DN
+        for name, template in profiles:
+            values[f"trend {name}"] = float(profile @ template) * scale / math.sqrt(context.frames)
+    if context.kind == "afterglow" and context.previous_signal_DN:
+        profile = frame_profile(expected, good) + float(
+            np.mean((expected.mean_DN - expected.dark_DN + np.asarray(dark_change_DN))[good])
+        )
+        for start, stop in _afterglow_bins(context.frames):
+            values[f"afterglow frames {start}-{stop - 1}"] = (
+                float(profile[start:stop].mean()) / context.previous_signal_DN
+            )
+    if context.codes_usable:
+        values["codes"] = math.log(max(expected.quantisation_step_DN, 1.0))
+    if not context.calibrates and context.kind in ("flat", "dark"):
+        signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
+        pattern = expected.fixed_pattern_rms**2 * signal2
+        values["fixed_pattern"] = math.log(1.0 + pattern / context.pattern_noise_DN2)
+        values["fixed_pattern blocks"] = math.log(1.0 + pattern / BLOCK_PX**2 / context.block_noise_DN2)
+        values["outliers"] = math.sqrt(0.7 * expected.bad_pixel_share * n_good + 0.375)
+    return values
+
+
+def frame_profile(expected: ExpectedSeries, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Change of the mean over good pixels from frame to frame (n,), DN, mean 0 as the model defines it."""
+    profile = np.zeros(expected.frames)
+    for image, course in expected.trend_DN or ():
+        mean = float(np.mean(np.broadcast_to(image, good.shape)[good]))
+        profile = profile + mean * np.asarray(course, dtype=np.float64)
+    return profile
+
+
+def _afterglow_bins(frames: int) -> list[tuple[int, int]]:
+    bins = []
+    for start, stop in pairwise(_AFTERGLOW_EDGES):
+        if start >= frames:
+            break
+        bins.append((start, min(stop, frames)))
+    return bins
+
+
+def measured_scalars(
+    summary: SeriesSummary,
+    base: ExpectedSeries,
+    context: ScalarContext,
+    *,
+    dark_mean_DN: float,
+    fixed_pattern_DN2: float | None,
+    block_pattern_DN2: float | None,
+    outliers: int | None,
+) -> list[Scalar]:
+    """The scalar probes of measured frames with their standard deviations (sampling and floor together)."""
+    result: list[Scalar] = []
+    good = context.good
+    n_good = int(good.sum())
+    rows, columns = good.shape
+    frames = summary.frames
+
+    def add(axis: str, name: str, unit: str, value: float, sampling: float, floor: str) -> None:
+        if math.isfinite(value) and math.isfinite(sampling):
+            result.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=math.hypot(sampling, FLOORS[floor])))
+
+    mean_q, mean_w = quantum_mean(base, good)
+    if frames > 2:
+        freedom = 2.0 * (frames - 1) ** 2 / (3.0 * frames - 4.0)
+        for label, name in enumerate(context.label_names):
+            variance = float(summary.label_variance_DN2[label])
+            pixels = int(summary.label_pixels[label])
+            if not variance > 0 or pixels < 16:
+                continue
+            mask = good & (context.labels == label)
+            q, w = quantum_mean(base, mask)
+            share = q / max(q + w, 1e-12)
+            shared = 1.0 + share**2 * (_squared_correlations(base) - 1.0)
+            add(
+                "noise",
+                f"log_variance {name}",
+                "1",
+                math.log(variance),
+                math.sqrt(2.0 * shared / (freedom * pixels)),
+                "log_variance",
+            )
+            for index, (dr, dc) in enumerate(LAGS):
+                add(
+                    "texture",
+                    f"correlation {name} ({dr},{dc})",
+                    "1",
+                    float(summary.label_autocovariance_DN2[label, index]) / variance,
+                    math.sqrt(1.3 * shared / (freedom * pixels)),
+                    "correlation",
+                )
+        total = float(np.mean(summary.pair_variance_DN2[good]))
+        if total > 0:
+            for axis_name, value, count, lines in (
+                ("row_ratio", summary.row_variance_DN2, columns, rows),
+                ("column_ratio", summary.column_variance_DN2, rows, columns),
+            ):
+                add(
+                    "texture",
+                    axis_name,
+                    "1",
+                    math.log(max(value * count / total, 1e-12)),
+                    math.sqrt(3.0 / (freedom * lines)),
+                    axis_name,
+                )
+            blocks = n_good / BLOCK_PX**2
+            if summary.block_variance_DN2 > 0:
+                add(
+                    "texture",
+                    "block_ratio",
+                    "1",
+                    math.log(summary.block_variance_DN2 * BLOCK_PX**2 / total),
+                    math.sqrt(2.5 / (freedom * blocks)),
+                    "block_ratio",
+                )
+            if frames > 5:
+                q_share = mean_q / max(mean_q + mean_w, 1e-12)
+                shared = 1.0 + q_share**2 * (_squared_correlations(base) - 1.0)
+                stack = float(np.mean(summary.stack_variance_DN2[good]))
+                for step in (1, 2):
+                    add(
+                        "time",
+                        f"temporal_correlation {step}",
+                        "1",
+                        float(summary.temporal_covariance_DN2[step - 1]) / stack,
+                        math.sqrt(shared / (n_good * (frames - step))),
+                        "temporal_correlation",
+                    )
+            if frames >= _KURTOSIS_FRAMES:
+                add(
+                    "tails",
+                    "kurtosis",
+                    "1",
+                    summary.kurtosis_excess,
+                    math.sqrt(40.0 / (n_good * freedom)),
+                    "kurtosis",
+                )
+            if context.kind in ("flat", "object"):
+                steps = np.diff(summary.frame_mean_DN)
+                variance = float(np.mean(steps**2)) / 2.0
+                add(
+                    "time",
+                    "frame_factor",
+                    "1",
+                    math.log(max(variance, 1e-12)),
+                    math.sqrt(2.0 / freedom),
+                    "frame_factor",
+                )
+    profiles = time_templates(frames)
+    if profiles and context.kind != "afterglow":
+        steps = np.diff(summary.frame_mean_DN)
+        noise = math.sqrt(max(float(np.mean(steps**2)) / 2.0, 1e-12))
+        scale = 1.0 if context.kind == "dark" else 1.0 / context.reference_signal_DN
+        for name, template in profiles:
+            add(
+                "time",
+                f"trend {name}",
+                "DN" if context.kind == "dark" else "1",
+                float(summary.frame_mean_DN @ template) * scale / math.sqrt(frames),
+                noise * scale / math.sqrt(frames),
+                "dark_trend_DN" if context.kind == "dark" else "trend",
+            )
+    if context.kind == "afterglow" and context.previous_signal_DN:
+        white_sd = math.sqrt(mean_w / n_good)
+        for start, stop in _afterglow_bins(frames):
+            level = float(summary.frame_mean_DN[start:stop].mean()) - dark_mean_DN
+            add(
+                "time",
+                f"afterglow frames {start}-{stop - 1}",
+                "1",
+                level / context.previous_signal_DN,
+                math.hypot(white_sd / math.sqrt(stop - start), 0.02) / context.previous_signal_DN,
+                "afterglow",
+            )
+    if context.codes_usable and summary.distinct_codes > 0:
+        add(
+            "tails",
+            "codes",
+            "1",
+            math.log(summary.code_range / summary.distinct_codes),
+            0.0,
+            "codes",
+        )
+    if fixed_pattern_DN2 is not None and not context.calibrates:
+        add(
+            "position",
+            "fixed_pattern",
+            "1",
+            math.log(max(fixed_pattern_DN2, 1e-12) / context.pattern_noise_DN2),
+            math.sqrt(3.0 / n_good),
+            "fixed_pattern",
+        )
+        if block_pattern_DN2 is not None:
+            add(
+                "position",
+                "fixed_pattern blocks",
+                "1",
+                math.log(max(block_pattern_DN2, 1e-12) / context.block_noise_DN2),
+                math.sqrt(3.0 * BLOCK_PX**2 / n_good),
+                "fixed_pattern",
+            )
+    if outliers is not None and not context.calibrates:
+        add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
+    return result
+
+
+def _squared_correlations(expected: ExpectedSeries) -> float:
+    table = np.asarray(expected.noise_autocovariance, dtype=np.float64) ** 2
+    return float(table[0, 0] + 2.0 * table[0, 1:].sum() + 2.0 * table[1:, 0].sum() + 4.0 * table[1:, 1:].sum())
+
+
+class MapProjection:
+    """Projection of residual maps onto templates that are made orthogonal in their order; unit noise.
+
+    q = T^T W r; Cov q = T^T W C W T = L L^T (Cholesky in the templates' order, dependent ones dropped); y = L^-1 q.
+    """
+
+    def __init__(
+        self,
+        templates: Sequence[Template],
+        *,
+        mask: NDArray[np.bool_],
+        quantum_DN2: NDArray[np.floating],
+        white_DN2: NDArray[np.floating],
+        autocovariance_table: NDArray[np.floating],
+        tolerance: float = 1e-3,
+    ) -> None:
+        """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
+        from scipy.ndimage import convolve
+
+        self.mask = mask
+        inside = mask.astype(np.float64)
+        total = np.asarray(quantum_DN2 + white_DN2, dtype=np.float64)
+        weight = np.where(mask, 1.0 / np.maximum(total, 1e-30), 0.0)
+        table = np.asarray(autocovariance_table, dtype=np.float64)
+        kernel = np.concatenate([table[:0:-1], table], axis=0)
+        kernel = np.concatenate([kernel[:, :0:-1], kernel], axis=1)
+        chosen: list[Template] = []
+        rows: list[NDArray[np.float64]] = []
+        spread: list[NDArray[np.float64]] = []
+        lower = np.zeros((0, 0))
+        for template in templates:
+            image = np.where(mask, template.image, 0.0).astype(np.float64)
+            norm = math.sqrt(float(np.sum(image**2 * weight)))
+            if not (norm > 0 and math.isfinite(norm)):
+                continue
+            weighted = weight * image / norm
+            part = weighted * np.sqrt(np.maximum(quantum_DN2, 0.0))
+            covered = np.sqrt(np.maximum(quantum_DN2, 0.0)) * convolve(part, kernel, mode="constant")
+            covered = (covered + weighted * white_DN2) * inside
+            own = float(np.sum(weighted * covered))
+            flat = weighted[mask]
+            cross = np.array([float(other @ flat) for other in spread]) if spread else np.zeros(0)
+            if len(cross):
+                from scipy.linalg import solve_triangular
+
+                solved = solve_triangular(lower, cross, lower=True)
+                rest = own - float(solved @ solved)
+            else:
+                solved, rest = cross, own
+            if not rest > tolerance * own:
+                continue
+            size = len(chosen)
+            grown = np.zeros((size + 1, size + 1))
+            grown[:size, :size] = lower
+            grown[size, :size] = solved
+            grown[size, size] = math.sqrt(rest)
+            lower = grown
+            chosen.append(template)
+            rows.append(flat)
+            spread.append(covered[mask])
+        self.templates = tuple(chosen)
+        self._lower = lower
+        self._rows = np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
+
+    def __len__(self) -> int:
+        return len(self.templates)
+
+    def apply(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Standardised projections (probe,) of a map (row, column), DN."""
+        if not self.templates:
+            return np.zeros(0)
+        from scipy.linalg import solve_triangular
+
+        q = self._rows @ np.asarray(image, dtype=np.float64)[self.mask]
+        return np.asarray(solve_triangular(self._lower, q, lower=True))
+
+    def names(self) -> list[ProbeName]:
+        """One name a probe."""
+        return [
+            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
+            for item in self.templates
+        ]
+
+
+def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:
+    """Level, gradients and curvatures across the field, relative to the signal (darks: in DN)."""
+    rows, columns = mask.shape
+    y = np.linspace(-1.0, 1.0, rows)[:, None]
+    x = np.linspace(-1.0, 1.0, columns)[None, :]
+    base = np.ones(mask.shape) if kind in ("dark", "afterglow") else np.asarray(signal_DN, dtype=np.float64)
+    unit = "DN" if kind in ("dark", "afterglow") else "1"
+    shapes = [
+        ("level", "whole field", np.ones(mask.shape)),
+        ("position", "along columns", x + 0 * y),
+        ("position", "along rows", y + 0 * x),
+        ("position", "curved along columns", x**2 + 0 * y),
+        ("position", "curved along rows", y**2 + 0 * x),
+        ("position", "diagonal", x * y),
+        ("position", "cubic along columns", x**3 + 0 * y),
+        ("position", "cubic along rows", y**3 + 0 * x),
+    ]
+    result = [Template(axis=axis, name=name, unit=unit, image=base * shape) for axis, name, shape in shapes]
+    # left half against right, upper against lower quarter: seams of tiles and panels
+    for count, axis_name in ((2, "halves"), (4, "quarters")):
+        for direction in (0, 1):
+            index = (np.arange(mask.shape[direction]) * count // mask.shape[direction]) % 2
+            step = np.where(index == 0, 1.0, -1.0)
+            step_map = step[:, None] * np.ones(mask.shape) if direction == 0 else step[None, :] * np.ones(mask.shape)
+            result.append(
+                Template(
+                    axis="position",
+                    name=f"{axis_name} along {'rows' if direction == 0 else 'columns'}",
+                    unit=unit,
+                    image=base * step_map,
+                )
+            )
+    return result
+
+
+def transmission_templates(
+    signal_DN: NDArray[np.floating], open_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, bins: int = 6
+) -> list[Template]:
+    """Bins of transmission: the signal where -log T lies in each, relative; the open field apart."""
+    log_t = -np.log(np.clip(np.asarray(signal_DN / np.maximum(open_DN, 1e-12), dtype=np.float64), 1e-9, None))
+    covered = mask & (log_t > 0.02)
+    result = [
+        Template(axis="level", name="open field", unit="1", image=np.where(mask & ~covered, signal_DN, 0.0)),
+    ]
+    if covered.sum() < 64:
+        return result
+    # behind 6 and more nothing of the primary is left to speak of: one bin, in DN of the open field
+    shadow = covered & (log_t > 6.0)
+    if shadow.sum() >= 32:
+        result.append(
+            Template(
+                axis="level",
+                name="shadow, -log T above 6",
+                unit="1",
+                image=np.where(shadow, np.asarray(open_DN, dtype=np.float64), 0.0),
+            )
+        )
+    lit = covered & ~shadow
+    if lit.sum() < 64:
+        return result
+    edges = np.unique(np.quantile(log_t[lit], np.linspace(0, 1, bins + 1)))
+    for low, high in pairwise(edges):
+        inside = lit & (log_t >= low) & (log_t <= high)
+        if inside.sum() >= 32:
+            result.append(
+                Template(
+                    axis="level",
+                    name=f"-log T {low:.2f}-{high:.2f}",
+                    unit="1",
+                    image=np.where(inside, signal_DN, 0.0),
+                )
+            )
+    return result
+
+
+def edge_templates(signal_DN: NDArray[np.floating]) -> list[Template]:
+    """Displacement, blur along each direction at three scales, ringing, and tails of several lengths."""
+    from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+    image = np.asarray(signal_DN, dtype=np.float64)
+    dy, dx = gradient(image)
+    rows, columns = image.shape
+    y = (np.arange(rows) - (rows - 1) / 2)[:, None] / rows
+    x = (np.arange(columns) - (columns - 1) / 2)[None, :] / columns
+    result = [
+        Template(axis="sharpness", name="shift along columns", unit="px", image=dx),
+        Template(axis="sharpness", name="shift along rows", unit="px", image=dy),
+        Template(axis="sharpness", name="magnification", unit="1", image=x * dx + y * dy),
+        Template(axis="sharpness", name="rotation", unit="rad", image=x * dy - y * dx),
+    ]
+    for sigma in (0.6, 1.5, 4.0):
+        for axis, name in ((1, "columns"), (0, "rows")):
+            blurred = gaussian_filter1d(image, sigma, axis=axis, mode="nearest")
+            result.append(
+                Template(axis="sharpness", name=f"blur of {sigma:g} px along {name}", unit="1", image=blurred - image)
+            )
+    for sigma in (8.0, 20.0):
+        if sigma < 0.4 * min(image.shape):
+            result.append(
+                Template(
+                    axis="sharpness",
+                    name=f"tail of {sigma:g} px",
+                    unit="1",
+                    image=gaussian_filter(image, sigma, mode="nearest") - image,
+                )
+            )
+    return result

@@ -1,0 +1,128 @@
+"""Where a scene really lies: the displacement of measured pictures against their thickness maps.
+
+A wedge or an edge is put down within fractions of a pixel, and at a sharp edge a tenth of a pixel is hundreds of standard
+deviations. So each placement of a scene is registered first, over all its series together, and pictures are compared
+where they lie; the displacement itself stays as a probe.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
+_CAUTION = (0.5, 0.3, 0.15, 0.12, 0.12, 0.12)
+_LARGEST_PX = 6.0
+_WEAK = 0.05
+RENDER_SHARE = 0.12  # of the local range: how well a pixel that an edge cuts is rendered
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """Displacement of the measured picture along rows and columns, px, with standard deviations."""
+
+    row_px: float
+    column_px: float
+    row_sd_px: float
+    column_sd_px: float
+
+    @property
+    def found(self) -> bool:
+        """Whether anything in the scene has shown where it lies."""
+        return self.row_sd_px < 0.3 or self.column_sd_px < 0.3
+
+
+def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes along rows and along columns (row, column), a pixel."""
+    along_rows, along_columns = np.gradient(np.asarray(image, dtype=np.float64))
+    return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
+
+
+def render_variance(signal_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    local = maximum_filter(signal_DN, 3) - minimum_filter(signal_DN, 3)
+    return np.asarray((RENDER_SHARE * local) ** 2, dtype=np.float64)
+
+
+def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The image with pixels outside the mask taken from the median of their neighbours."""
+    from scipy.ndimage import median_filter
+
+    if mask.all():
+        return np.asarray(image, dtype=np.float64)
+    rough = np.where(mask, image, float(np.median(image[mask])))
+    return np.asarray(np.where(mask, image, median_filter(rough, 5)), dtype=np.float64)
+
+
+def resample(image: NDArray[np.floating], placement: Placement) -> NDArray[np.float64]:
+    """The measured picture brought to where the thickness maps are (cubic splines)."""
+    from scipy.ndimage import shift
+
+    return np.asarray(
+        shift(image, (-placement.row_px, -placement.column_px), order=3, mode="nearest"), dtype=np.float64
+    )
+
+
+def register(
+    measured: Sequence[NDArray[np.floating]],
+    expected: Sequence[NDArray[np.floating]],
+    variance: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    *,
+    prior_px: float = 1.0,
+) -> Placement:
+    """Placement of a scene from the pictures of all its series: Gauss-Newton, the level left free.
+
+    Args:
+        measured, expected: signals (row, column), DN, of each series.
+        variance: of the measured ones.
+        mask: pixels to use; the outermost three are left out.
+        prior_px: standard deviation of a displacement before looking.
+    """
+    inner = mask.copy()
+    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
+        edge[...] = False
+    current = np.zeros(2)
+    precision = np.eye(2) / prior_px**2
+    covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+    filled = [fill(image, mask) for image in measured]
+    # edges are rendered with errors that any number of series share
+    share = 1.0 / max(len(measured), 1)
+    for caution in _CAUTION:
+        placement = _placement(current, covariance)
+        normal, right = precision.copy(), precision @ current
+        for image, model, noise in zip(filled, expected, variance, strict=True):
+            moved = resample(image, placement)
+            dy, dx = gradient(model)
+            doubt = render_variance(model) * (caution / RENDER_SHARE) ** 2
+            weight = (inner / (noise + doubt))[inner] * share
+            design = np.stack([dy[inner], dx[inner]])
+            level = np.asarray(model, dtype=np.float64)[inner]
+            residual = (moved - model)[inner]
+            level_weight = float((level * weight) @ level) + 1e-30
+            cross = (design * weight) @ level
+            normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
+            right += (design * weight) @ residual - cross * float((level * weight) @ residual) / level_weight
+        # along a single edge nothing shows the displacement: a weak direction stays where the prior has it
+        values, vectors = np.linalg.eigh(normal - precision)
+        weak = values < _WEAK * values[-1]
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
+        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        # where the measured picture still lies further on than the model, the residual falls along the model's slope
+        step = -((vectors * inverse) @ vectors.T) @ right
+        current = np.clip(current + np.clip(step, -1.0, 1.0), -_LARGEST_PX, _LARGEST_PX)
+    return _placement(current, covariance)
+
+
+def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:
+    sd = np.sqrt(np.diag(covariance))
+    return Placement(
+        row_px=float(values[0]),
+        column_px=float(values[1]),
+        row_sd_px=math.sqrt(float(sd[0] ** 2) + 1e-6),
+        column_sd_px=math.sqrt(float(sd[1] ** 2) + 1e-6),
+    )

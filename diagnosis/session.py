@@ -1,0 +1,140 @@
+"""A measured session as the diagnosis sees it: which series calibrate, what each one asks of the forward model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..errors import InputError
+from ..generator.series import SeriesRequest
+
+_GAP_S = 1.0  # between series whose times are not stated
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionSeries:
+    """One series and its part: `calibrates` (dark and gain maps come from it), `after` (later than the calibration)."""
+
+    series: Series
+    request: SeriesRequest
+    calibrates: bool
+    after: bool
+
+    @property
+    def name(self) -> str:
+        """The series' name."""
+        return self.series.name
+
+
+def calibrating_names(series: Sequence[Series]) -> frozenset[str]:
+    """Names of the series from which the twin is calibrated.
+
+    Series whose role is `calibration` where there are any; else, of raw darks and unrotated flats without role, those
+    that came first: the darks before the first beam, and of each kV and filter the first run of flats (all exposures and
+    loads of one visit to that beam).
+    """
+    usable = [
+        item
+        for item in series
+        if item.kind in ("dark", "flat") and item.role != "evaluation" and not item.corrected & {"log", "gain"}
+    ]
+    stated = [item for item in usable if item.role == "calibration"]
+    if stated:
+        chosen = {item.name for item in stated}
+        if not any(item.kind == "dark" for item in stated):
+            # flats are marked, darks are not: those up to the last marked flat belong to them
+            last = max(item.index for item in stated)
+            darks = [item for item in usable if item.kind == "dark"]
+            before = [item for item in darks if item.index <= last]
+            chosen |= {item.name for item in before or darks}
+        return frozenset(chosen)
+    ordered = sorted((item for item in usable if item.panel_rotation_deg % 360.0 == 0.0), key=lambda item: item.index)
+    chosen = set()
+    seen_darks: set[float | None] = set()
+    seen_flats: set[tuple[object, ...]] = set()
+    for item in ordered:
+        if item.kind == "dark":
+            if item.exposure_ms not in seen_darks:
+                seen_darks.add(item.exposure_ms)
+                chosen.add(item.name)
+            continue
+        load = None if item.setting is None else item.setting.tube_load_mAs
+        key = (item.kV, item.filters, item.exposure_ms, load, item.source_detector_mm)
+        if key not in seen_flats:
+            seen_flats.add(key)
+            chosen.add(item.name)
+    return frozenset(chosen)
+
+
+def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False) -> tuple[SessionSeries, ...]:
+    """The series of an acquisition in order of time, each with its request to the forward model.
+
+    Args:
+        acquisition: open file.
+        calibrated_elsewhere: the twin comes from another session and no series here is marked as calibrating: all were
+            taken after calibration.
+
+    Raises:
+        InputError: no series that the diagnosis can use.
+    """
+    ordered = sorted(acquisition.series, key=lambda item: item.index)
+    if not ordered:
+        raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
+    stated = any(item.role == "calibration" for item in ordered)
+    calibrating = frozenset() if calibrated_elsewhere and not stated else calibrating_names(ordered)
+    instrument = acquisition.instrument
+    clock = 0.0
+    result: list[SessionSeries] = []
+    requests: list[SeriesRequest] = []
+    scenes: dict[str, dict[str, NDArray[np.float32]]] = {}
+    for item in ordered:
+        exposure_ms = item.exposure_ms or 0.0
+        interval_ms = item.frame_interval_ms
+        if interval_ms is None:
+            interval_ms = exposure_ms * item.averaged + (instrument.readout_ms or 0.0)
+        if item.time_s is not None and len(item.time_s):
+            start = float(item.time_s[0])
+            if item.frame_interval_ms is None and len(item.time_s) > 1:
+                interval_ms = 1000.0 * float(np.median(np.diff(item.time_s)))
+            clock = float(item.time_s[-1]) + interval_ms / 1000.0
+        else:
+            start = clock
+            clock += item.n_frames * interval_ms / 1000.0 + _GAP_S
+        scene = acquisition.scenes.get(item.scene) if item.scene else None
+        thickness: dict[str, NDArray[np.float32]] | None = None
+        if scene is not None and len(scene.thickness_mm):
+            # one mapping a scene: the forward model knows a scene that it has projected by its identity
+            if item.scene not in scenes:
+                scenes[item.scene] = {material: scene.thickness_mm[material] for material in scene.thickness_mm}
+            thickness = scenes[item.scene]
+        calibrates = item.name in calibrating
+        if calibrated_elsewhere and not stated:
+            after = True
+        elif item.role is not None:
+            after = item.role != "calibration"
+        elif calibrates:
+            after = False
+        else:
+            after = not calibrates
+        request = SeriesRequest(
+            kind=item.kind,
+            setting=item.setting,
+            frames=item.n_frames,
+            exposure_ms=exposure_ms,
+            frame_interval_ms=interval_ms,
+            start_s=start,
+            index=item.index,
+            thickness_mm=thickness,
+            source_object_mm=item.source_object_mm or instrument.source_object_mm,
+            source_detector_mm=item.source_detector_mm or instrument.source_detector_mm,
+            belt_speed_mm_s=item.belt_speed_mm_s,
+            belt_axis=instrument.belt_axis or "row",
+            panel_rotation_deg=item.panel_rotation_deg,
+            after_calibration=after,
+            previous=tuple(replace(before, previous=()) for before in requests[-1:]),
+        )
+        requests.append(request)
+        result.append(SessionSeries(series=item, request=request, calibrates=calibrates, after=after))
+    return tuple(result)

@@ -1,0 +1,170 @@
+"""Weighing hypotheses on probes whose truth is planted: no data, only vectors."""
+
+import numpy as np
+import pytest
+
+from raytwin.diagnosis.inference import UNKNOWN, Curve, Nuisances, Priors, fit_curve, weigh_hypotheses
+from raytwin.diagnosis.whitening import whiten
+
+PROBES = 600
+GROUPS = np.repeat(np.arange(30), 20)
+NAMES = tuple(f"group {number}" for number in range(30))
+
+
+def curves(rng, effects=8, variants=2, low=0.5, high=100.0):
+    """Effects with sparse random directions; response about the strength in standard deviations."""
+    result = []
+    for effect in range(effects):
+        for variant in range(variants):
+            direction = rng.standard_normal(PROBES) * (rng.random(PROBES) < 0.1)
+            direction /= np.linalg.norm(direction)
+            result.append(
+                Curve(
+                    effect=f"effect{effect}",
+                    variant=f"{variant}",
+                    parameters={},
+                    low=low,
+                    high=high,
+                    strengths=np.array([5.0, 50.0]),
+                    responses=np.array([5.0 * direction, 52.0 * direction]),
+                )
+            )
+    return tuple(result)
+
+
+@pytest.fixture
+def setup():
+    rng = np.random.default_rng(5)
+    factors = rng.standard_normal((PROBES, 20))
+    return rng, factors, curves(rng)
+
+
+def noise(rng, factors):
+    return factors @ rng.standard_normal(factors.shape[1]) + rng.standard_normal(len(factors))
+
+
+def weigh(residual, factors, chosen, **options):
+    return weigh_hypotheses(
+        residual, curves=chosen, nuisances=Nuisances(factors), groups=GROUPS, group_names=NAMES, **options
+    )
+
+
+def test_projection_gives_the_inner_product_of_the_inverse_covariance(setup):
+    rng, factors, _ = setup
+    a, b = rng.standard_normal((2, PROBES))
+    covariance = np.eye(PROBES) + factors @ factors.T
+    nuisances = Nuisances(factors)
+    assert nuisances.inner(a[None], b[None])[0, 0] == pytest.approx(a @ np.linalg.solve(covariance, b), rel=1e-9)
+    assert nuisances.solve(a) == pytest.approx(np.linalg.solve(covariance, a), rel=1e-8, abs=1e-10)
+    assert nuisances.log_determinant == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-10)
+    more = rng.standard_normal((PROBES, 3))
+    wide = nuisances.widened(more)
+    assert wide.log_determinant == pytest.approx(np.linalg.slogdet(covariance + more @ more.T)[1], rel=1e-10)
+
+
+def test_whitening_local_nuisances_leaves_the_likelihood_as_it_was(setup):
+    rng, factors, chosen = setup
+    blocks = np.repeat(np.arange(6), 100)
+    local = np.zeros((PROBES, 12))
+    for block in range(6):
+        local[blocks == block, 2 * block : 2 * block + 2] = 3.0 * rng.standard_normal((100, 2))
+    everything = np.concatenate([factors, local], axis=1)
+    residual = noise(rng, everything)
+    white = whiten(residual, everything, chosen, blocks)
+    assert white.factors.shape == factors.shape
+    whole, part = Nuisances(everything), Nuisances(white.factors)
+    for before, after in zip(chosen, white.curves, strict=True):
+        assert part.inner(after.responses, white.residual[None]) == pytest.approx(
+            whole.inner(before.responses, residual[None]), rel=1e-6, abs=1e-6
+        )
+        assert part.inner(after.responses, after.responses) == pytest.approx(
+            whole.inner(before.responses, before.responses), rel=1e-6, abs=1e-8
+        )
+
+
+def test_curve_passes_through_its_nodes_and_through_zero(setup):
+    curve = setup[2][0]
+    assert curve.response(0.0) == pytest.approx(np.zeros(PROBES))
+    assert curve.response(5.0) == pytest.approx(curve.responses[0])
+    assert curve.response(50.0) == pytest.approx(curve.responses[1])
+
+
+def test_noise_alone_is_rarely_called_an_effect(setup):
+    rng, factors, chosen = setup
+    wrong = sum(bool(weigh(noise(rng, factors), factors, chosen)[0].effects) for _ in range(60))
+    # 5 % aimed at; 9 of 60 would have probability 1e-3 at 5 %
+    assert wrong <= 8
+
+
+def test_planted_effect_is_named_with_a_strength_interval_that_holds_it(setup):
+    rng, factors, chosen = setup
+    named = inside = 0
+    for _ in range(20):
+        curve = chosen[rng.integers(len(chosen))]
+        strength = 10.0
+        leading = weigh(noise(rng, factors) + curve.response(strength), factors, chosen)[0]
+        named += leading.effects == (curve.effect,)
+        if curve.effect in leading.strengths:
+            _, low, high = leading.strengths[curve.effect]
+            inside += low <= strength <= high
+    assert named >= 16
+    assert inside >= 15
+
+
+def test_both_of_a_planted_pair_are_named(setup):
+    rng, factors, chosen = setup
+    both = 0
+    for _ in range(10):
+        first, second = chosen[0], chosen[5]
+        residual = noise(rng, factors) + first.response(12.0) + second.response(20.0)
+        both += set(weigh(residual, factors, chosen)[0].effects) == {first.effect, second.effect}
+    assert both >= 8
+
+
+def test_departure_that_no_effect_makes_is_unknown_and_placed(setup):
+    rng, factors, chosen = setup
+    residual = noise(rng, factors)
+    residual[GROUPS == 4] += 6.0 * rng.standard_normal(20)
+    leading = weigh(residual, factors, chosen)[0]
+    assert leading.effects == (UNKNOWN,)
+    assert leading.location == "group 4"
+    assert leading.probability > 0.9
+
+
+def test_effects_with_the_same_response_share_the_probability(setup):
+    rng, factors, chosen = setup
+    twin = chosen[0]
+    same = Curve(
+        effect="double",
+        variant="0",
+        parameters={},
+        low=twin.low,
+        high=twin.high,
+        strengths=twin.strengths,
+        responses=twin.responses,
+    )
+    only = (chosen[0], same, *chosen[2:])
+    found = weigh(noise(rng, factors) + twin.response(15.0), factors, only)
+    probability = {item.effects: item.probability for item in found}
+    assert probability[("double",)] == pytest.approx(probability[(twin.effect,)], rel=1e-6)
+    assert probability[("double",)] < 0.51
+
+
+def test_probabilities_sum_to_one_and_follow_the_priors(setup):
+    rng, factors, chosen = setup
+    residual = noise(rng, factors)
+    found = weigh(residual, factors, chosen)
+    assert sum(item.probability for item in found) == pytest.approx(1.0)
+    less = weigh(residual, factors, chosen, priors=Priors(none=1e-6))
+    assert next(i.probability for i in less if not i.effects) < next(i.probability for i in found if not i.effects)
+
+
+def test_a_law_off_by_a_tenth_in_places_is_still_named(setup):
+    rng, factors, chosen = setup
+    curve = chosen[3]
+    wrong = curve.response(60.0) * (1.0 + 0.1 * rng.standard_normal(30))[GROUPS]
+    leading = weigh(noise(rng, factors) + wrong, factors, chosen)[0]
+    assert leading.effects == (curve.effect,)
+    fit = fit_curve(noise(rng, factors) + wrong, curve, Nuisances(factors), GROUPS)
+    _, low, high = fit.interval()
+    assert high / low > 1.01

@@ -160,6 +160,26 @@ class LineMemory:
 
 
 @dataclass(frozen=True, slots=True)
+class _Choice:
+    """What a caller asks the model with besides twin and request."""
+
+    effects: Sequence[AppliedEffect] | None
+    parameters: NDArray[np.float64] | None
+    use_measured_level: bool
+
+    def state(self, twin: Twin, request: SeriesRequest, cache: ModelCache) -> LineState:
+        """The final state of the line for a request."""
+        return final_state(
+            twin,
+            request,
+            effects=self.effects,
+            parameters=self.parameters,
+            cache=cache,
+            use_measured_level=self.use_measured_level,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class _Charge:
     """What one exposure of a series brings to the pixels, before lag: mean and variances in DN, gain and shape applied."""
 
@@ -328,7 +348,7 @@ def _paused(law: LagLaw, trapped: FloatArray, pause_s: float) -> tuple[FloatArra
 
 
 def _trapped_before(
-    twin: Twin, request: SeriesRequest, law: LagLaw, calls: Mapping[str, object], cache: ModelCache
+    twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Choice, cache: ModelCache
 ) -> tuple[FloatArray, FloatArray]:
     """Charge in the traps (trap, row, column) at the begin of the series, and what its first exposure finds, DN."""
     trapped = np.zeros((len(law.trapped), *twin.maps.shape))
@@ -343,8 +363,7 @@ def _trapped_before(
         left = decay**exposures
         trapped = trapped * left
         if earlier.beam_on:
-            state = final_state(twin, earlier, cache=cache, **calls)  # type: ignore[arg-type]
-            brought = _charge(twin, earlier, state).mean
+            brought = _charge(twin, earlier, choice.state(twin, earlier, cache)).mean
             trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
         clock = earlier.start_s + exposures * interval
     if clock is None:
@@ -441,8 +460,8 @@ def expected_series(
         InputError: a beam without known level, a scene for a twin without spectral part, an unknown effect or parameter.
     """
     cache = ModelCache() if cache is None else cache
-    calls = {"effects": effects, "parameters": parameters, "use_measured_level": use_measured_level}
-    state = final_state(twin, request, cache=cache, **calls)  # type: ignore[arg-type]
+    choice = _Choice(effects, parameters, use_measured_level)
+    state = choice.state(twin, request, cache)
     charge = _charge(twin, request, state)
     averaged = request.exposures_per_frame
     exposures = request.frames * averaged
@@ -453,7 +472,7 @@ def expected_series(
     if state.lag is not None:
         law = state.lag
         decay = _decays(law, interval)
-        before, found = _trapped_before(twin, request, law, calls, cache)
+        before, found = _trapped_before(twin, request, law, choice, cache)
         number = np.arange(exposures)
         for trapped, left, held in zip(law.trapped, decay, before, strict=True):
             # y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i]
@@ -581,8 +600,8 @@ def sample_series(
         InputError: as `expected_series`.
     """
     cache = ModelCache() if cache is None else cache
-    calls = {"effects": effects, "parameters": parameters, "use_measured_level": use_measured_level}
-    state = final_state(twin, request, cache=cache, **calls)  # type: ignore[arg-type]
+    choice = _Choice(effects, parameters, use_measured_level)
+    state = choice.state(twin, request, cache)
     charge = _charge(twin, request, state)
     shape = twin.maps.shape
     interval = request.interval_s(twin.instrument.readout_ms)
@@ -594,7 +613,7 @@ def sample_series(
     if state.lag is not None:
         decay = _decays(state.lag, interval)[:, None, None]
         if carried.trapped_DN is None:
-            trapped, found = _trapped_before(twin, request, state.lag, calls, cache)
+            trapped, found = _trapped_before(twin, request, state.lag, choice, cache)
         else:
             trapped, found = _paused(state.lag, carried.trapped_DN, request.start_s - carried.time_s)
         share = np.asarray(state.lag.trapped)[:, None, None]

@@ -441,7 +441,7 @@ def test_parameters_of_another_model_are_refused(series_line):
 # ------------------------------------------------------------------------------------------------ any detector
 
 
-@pytest.mark.parametrize("shape", [(1, 64), (64, 1), (2, 2), (3, 50), (37, 41)])
+@pytest.mark.parametrize("shape", [(1, 64), (2, 2), (37, 41)])
 def test_detectors_of_any_shape_take_any_effect(series_line, shape):
     """Line detectors among them: finite expectations and frames of their shape."""
 

@@ -15,6 +15,7 @@ from raytwin.generator.effects.fluorescence import line_energy_keV
 from raytwin.generator.effects.registration import displacement_px
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
+from raytwin.generator.psf import blur_variance_share
 from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
 from raytwin.generator.spectral_signal import OpenBeam
 
@@ -741,3 +742,74 @@ def test_beam_effects_need_a_spectrum(series_line):
     for name in ("kv_error", "filtration_error", "heel"):
         with pytest.raises(InputError, match="twin without spectral part"):
             expect(bare, request(), applied(name))
+
+
+# ------------------------------------------------------------------------------------------------ texture
+
+
+def light_pairs(name, parameters, line, rng, count):
+    """Two light photons of each X-ray photon (row, column), px, as the effect's words have it, drawn one by one.
+
+    The variance that quanta leave in a pixel is the chance that two light photons of one quantum land in it; the
+    covariance of two pixels that one lands in each. No transfer function is used.
+    """
+    place = rng.random((2, count))
+    sigma = line.noise.psf_sigma_px.value
+
+    def disc(reach):
+        distance, angle = rng.exponential(reach, count), rng.uniform(0, 2 * math.pi, count)
+        return distance * np.stack([np.cos(angle), np.sin(angle)])
+
+    landed = []
+    origin = np.zeros((2, 2, count))
+    if name == "k_fluorescence":
+        model = spectral_model_of(line)
+        beam = OpenBeam(kV=90.0, filters=filters_from_text("Cu:0.05"))
+        weights = model.moment_weights(line.spectral.best, beam)[1]
+        energies = model.energies_keV[: weights.size]
+        energy = rng.choice(energies, size=count, p=weights / weights.sum())
+        line_keV = line_energy_keV(energy, model.scintillator)
+        splits = (rng.random(count) < parameters["strength"] / 100) & (line_keV > 0)
+        away = disc(parameters["range_mm"] / line.instrument.pixel_mm)
+        for photon in range(2):
+            from_line = splits & (rng.random(count) < line_keV / energy)
+            origin[photon] = np.where(from_line, away, 0.0)
+    for photon in range(2):
+        step = sigma * rng.standard_normal((2, count))
+        if name == "mtf_tail":
+            # a Gaussian of exponentially distributed variance has the transfer function 1 / (1 + H f^2)
+            wide = parameters["reach_px"] * np.sqrt(2 * rng.exponential(1.0, count)) * rng.standard_normal((2, count))
+            step = np.where(rng.random(count) < parameters["strength"] / 100, wide, step)
+        if name == "veiling_glare":
+            far = disc(parameters["length_mm"] / line.instrument.pixel_mm)
+            step = step + np.where(rng.random(count) < parameters["strength"] / 100, far, 0.0)
+        landed.append(np.floor(place + origin[photon] + step).astype(int))
+    return landed
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("mtf_tail", {"strength": 30.0, "reach_px": 1.0}),
+        ("veiling_glare", {"strength": 5.0, "length_mm": 1.0}),
+        ("k_fluorescence", {"strength": 40.0, "range_mm": 0.2}),
+    ],
+)
+def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(series_line, name, parameters):
+    count = 200_000
+    first, second = light_pairs(name, parameters, series_line, np.random.default_rng(11), count)
+    found, base = (expect(series_line, request(), effects) for effects in (applied(name, **parameters), ()))
+    half = blur_variance_share("aperture", 0.5)
+    share = half * np.median(found.quantum_variance_DN2 / base.quantum_variance_DN2)
+    for lag in ((0, 0), (0, 1), (1, 1), (0, 2)):
+        apart = second - first
+        # by symmetry the four directions of a lag are alike
+        seen = np.mean(
+            [
+                np.mean((apart[0] == down * lag[0]) & (apart[1] == right * lag[1]))
+                for down in (-1, 1)
+                for right in (-1, 1)
+            ]
+        )
+        known = share * found.noise_autocovariance[lag]
+        assert abs(seen - known) < 4 * math.sqrt(max(known, 1e-6) / count), lag

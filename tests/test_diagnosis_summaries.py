@@ -1,0 +1,147 @@
+"""Statistics of a series against what was planted in its frames."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from raytwin.diagnosis.registration import Placement, register, resample
+from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series
+from raytwin.errors import InputError
+
+SHAPE = (48, 64)
+FRAMES = 40
+
+
+def flat_frames(rng, *, factor=None, rows=0.0, spread=0.0, sd=10.0):
+    noise = rng.standard_normal((FRAMES, *SHAPE))
+    if spread:
+        noise = np.stack([gaussian_filter(frame, spread, mode="wrap") for frame in noise])
+        noise /= noise.std()
+    frames = 1000.0 + sd * noise
+    if rows:
+        frames += rows * rng.standard_normal((FRAMES, SHAPE[0], 1))
+    if factor is not None:
+        frames *= factor[:, None, None]
+    return frames.astype(np.float32)
+
+
+def summary_of(frames, **options):
+    good = np.ones(SHAPE, dtype=bool)
+    return summarise_series([frames], good=good, labels=np.zeros(SHAPE, dtype=np.int64), **options)
+
+
+def test_variance_of_white_frames_is_that_of_the_noise():
+    found = summary_of(flat_frames(np.random.default_rng(1)))
+    # differences of 40 frames: about 2 / (27 x 3072) of relative variance
+    tolerance = 5 * np.sqrt(2.0 / (0.667 * FRAMES * 48 * 64))
+    assert found.label_variance_DN2[0] == pytest.approx(100.0, rel=tolerance)
+    assert found.label_autocovariance_DN2[0] == pytest.approx(np.zeros(len(LAGS)), abs=100 * tolerance)
+    assert found.row_variance_DN2 * SHAPE[1] == pytest.approx(100.0, rel=0.2)
+    assert found.block_variance_DN2 * BLOCK_PX**2 == pytest.approx(100.0, rel=0.2)
+    assert abs(found.temporal_covariance_DN2[0]) < 100 * 5 / np.sqrt(FRAMES * 48 * 64)
+    assert abs(found.kurtosis_excess) < 0.1
+
+
+def test_common_factor_of_each_frame_stays_out_of_the_pixels_noise():
+    rng = np.random.default_rng(2)
+    factor = 1.0 + 0.02 * rng.standard_normal(FRAMES)
+    found = summary_of(flat_frames(rng, factor=factor))
+    assert found.label_variance_DN2[0] == pytest.approx(100.0, rel=0.03)
+    assert np.std(found.frame_mean_DN / 1000.0 - factor) < 1e-3
+
+
+def test_lines_show_in_the_rows_alone():
+    found = summary_of(flat_frames(np.random.default_rng(3), rows=2.0))
+    assert found.row_variance_DN2 == pytest.approx(4.0 + 100.0 / SHAPE[1], rel=0.2)
+    assert found.column_variance_DN2 * SHAPE[0] == pytest.approx(104.0, rel=0.25)
+    along_rows = LAGS.index((0, 1))
+    assert found.label_autocovariance_DN2[0, along_rows] == pytest.approx(4.0, rel=0.2)
+
+
+def test_neighbours_of_blurred_noise_are_correlated_as_its_kernel_says():
+    found = summary_of(flat_frames(np.random.default_rng(4), spread=0.8))
+    expected = np.exp(-1.0 / (4 * 0.8**2))
+    assert found.label_autocovariance_DN2[0, LAGS.index((0, 1))] / found.label_variance_DN2[0] == pytest.approx(
+        expected, abs=0.03
+    )
+
+
+def test_pieces_of_any_length_give_the_same_sums():
+    frames = flat_frames(np.random.default_rng(5))
+    good = np.ones(SHAPE, dtype=bool)
+    labels = np.zeros(SHAPE, dtype=np.int64)
+    whole = summarise_series([frames], good=good, labels=labels)
+    parts = summarise_series([frames[:7], frames[7:8], frames[8:]], good=good, labels=labels)
+    assert parts.mean_DN == pytest.approx(whole.mean_DN, rel=1e-9)
+    assert parts.pair_variance_DN2 == pytest.approx(whole.pair_variance_DN2, rel=1e-4, abs=1e-4)
+    assert parts.stack_variance_DN2 == pytest.approx(whole.stack_variance_DN2, rel=1e-3, abs=1e-3)
+    assert parts.frame_mean_DN == pytest.approx(whole.frame_mean_DN)
+
+
+def test_codes_of_coarse_numbers_are_counted():
+    rng = np.random.default_rng(6)
+    numbers = rng.normal(1000, 40, (FRAMES, *SHAPE))
+    fine = summary_of(np.rint(numbers).astype(np.uint16))
+    coarse = summary_of((8 * np.rint(numbers / 8)).astype(np.uint16))
+    assert fine.code_range / fine.distinct_codes == pytest.approx(1.0, abs=0.02)
+    assert coarse.code_range / coarse.distinct_codes == pytest.approx(8.0, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "message"),
+    [
+        ([], "no frames"),
+        ([np.zeros((3, 5, 5), np.float32)], "frames of"),
+        ([np.full((3, *SHAPE), np.nan, np.float32)], "NaN"),
+    ],
+)
+def test_frames_that_cannot_be_used_are_refused(pieces, message):
+    with pytest.raises(InputError, match=message):
+        summarise_series(pieces, good=np.ones(SHAPE, bool), labels=np.zeros(SHAPE, np.int64))
+
+
+def scene(row_px, column_px):
+    """A corner with two edges, rendered on quarter pixels."""
+    y, x = np.mgrid[: 96 * 4, : 96 * 4] / 4.0
+    edge = np.where((x - column_px) + 0.05 * (y - row_px) > 52, 0.1, 1.0)
+    edge *= np.where((y - row_px) - 0.03 * (x - column_px) > 60, 0.6, 1.0)
+    return 1e4 * gaussian_filter(edge, 4 * 0.55).reshape(96, 4, 96, 4).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize(("row", "column"), [(0.0, 0.0), (0.3, -0.2), (1.4, 0.8), (-2.1, 0.5)])
+def test_displacement_of_a_scene_is_found_within_a_tenth_of_a_pixel(row, column):
+    model = scene(0.0, 0.0)
+    measured = scene(row, column) + 10.0 * np.random.default_rng(7).standard_normal(model.shape)
+    found = register([measured], [model], [np.full(model.shape, 100.0)], np.ones(model.shape, bool))
+    assert found.row_px == pytest.approx(row, abs=0.1)
+    assert found.column_px == pytest.approx(column, abs=0.1)
+    back = resample(measured, found)
+    inner = slice(6, -6)
+    assert np.std((back - model)[inner, inner]) < 0.5 * np.std((measured - model)[inner, inner]) or (row, column) == (
+        0,
+        0,
+    )
+
+
+def test_an_even_field_shows_no_displacement():
+    model = np.full((64, 64), 1000.0)
+    found = register([model + 1.0], [model], [np.full(model.shape, 100.0)], np.ones(model.shape, bool))
+    assert not found.found
+
+
+def test_along_a_single_edge_nothing_is_claimed():
+    x = np.mgrid[:384, :384][1] / 4.0
+
+    def edge(shift):
+        return 1e4 * gaussian_filter(np.where(x - shift > 48, 0.1, 1.0), 2.2).reshape(96, 4, 96, 4).mean(axis=(1, 3))
+
+    found = register([edge(0.4)], [edge(0.0)], [np.full((96, 96), 100.0)], np.ones((96, 96), bool))
+    assert found.column_px == pytest.approx(0.4, abs=0.06)
+    assert found.row_sd_px > 0.3
+    assert found.row_px == pytest.approx(0.0, abs=0.05)
+
+
+def test_resampling_by_nothing_changes_nothing():
+    image = np.random.default_rng(8).standard_normal((20, 30))
+    still = Placement(row_px=0.0, column_px=0.0, row_sd_px=0.1, column_sd_px=0.1)
+    assert resample(image, still) == pytest.approx(image, abs=1e-9)

@@ -636,7 +636,10 @@ def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: di
     for name in own:
         if name == "log_DN_per_keV":
             continue
-        share = float(np.std(samples[:, names.index(name)])) / priors[name].sd
+        width = priors[name].sd
+        if name.startswith(DEPARTURES):
+            width *= DEPARTURE_FACTOR * math.exp(LOG_DEPARTURE_SD**2)  # root mean square over the factor's prior
+        share = float(np.std(samples[:, names.index(name)])) / width
         if share > 0.7:
             result.append(f"{name}: {100 * share:.0f} % of the prior's width is left")
     columns = samples[:, [names.index(name) for name in own]]

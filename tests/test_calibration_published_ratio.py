@@ -10,7 +10,6 @@ from scipy.stats import norm, truncnorm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter
-from raytwin.calibration.priors import LEVEL_DISCREPANCY
 from raytwin.calibration.spectral_fit import fit_spectrum, priors_for
 from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.twin import Estimate, Level
@@ -19,7 +18,8 @@ COPPER = (Filter(material="Cu", thickness_mm=0.05),)
 DECLARED_CSI = (Filter(material="CsI", thickness_mm=0.5),)
 DRAWS = 20_000
 # two levels, each reproducible to this: the printed digits (0.575 and 3.86 DN/W/ms) add 0.16 %
-RATIO_SD = math.sqrt(2) * LEVEL_DISCREPANCY
+LEVEL_SD = 0.003
+RATIO_SD = math.sqrt(2) * LEVEL_SD
 SCALES = {"log_output", "log_DN_per_keV", "log_swank"}  # the same at both voltages, so not in the ratio
 
 
@@ -144,7 +144,7 @@ def test_fit_of_the_published_levels_finds_the_same_filtration_as_weighted_prior
         for kV, (rate, current) in sorted(published().items())
     ]
     instrument = Instrument(scintillator=DECLARED_CSI, pixel_mm=0.15, source_detector_mm=1059.0)
-    posterior = fit_spectrum(levels, instrument, rng=np.random.default_rng(3)).posterior
+    posterior = fit_spectrum(levels, instrument, rng=np.random.default_rng(3), level_discrepancy=LEVEL_SD).posterior
     filtration = posterior.column("inherent_filtration_mm_Al")
     model = model_of()
     mean, sd = filtration_given_ratio(model, prior_draws(model), published_ratio())

@@ -348,6 +348,7 @@ def run_protocol(
     effects: Sequence["EffectRequest"] = (),
     leave_out: Sequence[str] = (),
     only: Sequence[str] | None = None,
+    truth_file: str | os.PathLike[str] | None = None,
     begin: Callable[[int], None] = lambda frames: None,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
@@ -370,6 +371,7 @@ def run_protocol(
         effects: to be planted, in the long sessions; their inner parameters are the seed's in every protocol and session.
         leave_out, only: groups of series that are not taken, or taken alone with the darks, in the long sessions; see
             `session.GROUPS`.
+        truth_file: where the truth is written, instead of beside the acquisition.
         begin, advance: called with the number of frames to come, and after each.
 
     Returns:
@@ -402,6 +404,7 @@ def run_protocol(
             effects=tuple(effects),
             leave_out=leave_out,
             only=only,
+            truth_file=truth_path(path) if truth_file is None else Path(truth_file),
             begin=begin,
             advance=advance,
         )
@@ -458,7 +461,7 @@ def run_protocol(
         ),
         "series": series,
     }
-    with whole_file(truth_path(path)) as temporary:
+    with whole_file(truth_path(path) if truth_file is None else truth_file) as temporary:
         temporary.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     return truth
 
@@ -484,6 +487,7 @@ def _run_session(
     effects: tuple["EffectRequest", ...],
     leave_out: Sequence[str],
     only: Sequence[str] | None,
+    truth_file: Path,
     begin: Callable[[int], None],
     advance: Callable[[], None],
 ) -> dict[str, Any]:
@@ -518,7 +522,7 @@ def _run_session(
         plan=plan,
         planted=planted,
         rng=noise_rng,
-        truth_path=truth_path(path),
+        truth_path=truth_file,
         geometry=geometry,
         begin=begin,
         advance=advance,

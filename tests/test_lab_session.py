@@ -260,5 +260,11 @@ def test_cases_have_the_shares_strengths_and_benches_that_a_blind_check_wants():
 
 def test_a_case_can_be_measured_as_it_is(tmp_path):
     case = draw_case(np.random.default_rng(0), label="pair", names=("row_noise", "image_lag"))
-    truth = run_protocol(tmp_path / "case.h5", seed=6, rows=SIZE, frames=4, products=1, **case.arguments())
+    sealed = tmp_path / "elsewhere" / "label.json"
+    sealed.parent.mkdir()
+    truth = run_protocol(
+        tmp_path / "case.h5", seed=6, rows=SIZE, frames=4, products=1, truth_file=sealed, **case.arguments()
+    )
+    assert json.loads(sealed.read_text(encoding="utf-8")) == json.loads(json.dumps(truth))
+    assert not truth_path(tmp_path / "case.h5").exists()
     assert set(truth["effects"]) == {"row_noise", "image_lag"}

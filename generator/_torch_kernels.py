@@ -7,6 +7,7 @@ normal numbers (one pixel in some ten thousand takes the next whole quantum).
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,12 +86,10 @@ def row_keys(key: int, frames: Any, stage: int, rows: int) -> Any:
     return keys.to(torch.int32)[..., None]  # the low 32 bits
 
 
-def random_words(keys: Any, columns: int) -> Any:
-    """Random words (frame, row, columns) int32 from the keys of the rows."""
-    import torch
-
+def random_words(keys: Any, column: Any) -> Any:
+    """Random words (frame, row, column) int32 from the keys of the rows, for columns given by number (int32)."""
     first, second, third = (_signed(value, 32) for value in MULTIPLIERS)
-    x = torch.arange(columns, dtype=torch.int32, device=keys.device) * _signed(STRIDE, 32) + keys[0]
+    x = column * _signed(STRIDE, 32) + keys[0]
     x = x ^ _shifted(x, 17)
     x = (x * first) ^ keys[1]
     x = x ^ _shifted(x, 11)
@@ -105,14 +104,20 @@ def _unsigned(words: Any, dtype: Any) -> Any:
     return _shifted(words, 16).to(dtype) * 65536.0 + (words & 0xFFFF).to(dtype)
 
 
-def normals(words: Any) -> Any:
-    """Independent normal numbers (..., 2 half) of words (..., 2 half) (Box and Muller)."""
+def normals(keys: Any, columns: int) -> Any:
+    """Independent normal numbers (frame, row, columns) from the keys of the rows (Box and Muller).
+
+    The halves of a row share their words; each pixel makes both of its own, so that no pixel needs another's.
+    """
     import torch
 
-    half = words.shape[-1] // 2
-    radius = torch.sqrt(-2.0 * torch.log((_unsigned(words[..., :half], torch.float32) + 0.5) * 2.0**-32))
-    turn = words[..., half:].to(torch.float32) * (2.0 * math.pi * 2.0**-32)
-    return torch.cat([radius * torch.cos(turn), radius * torch.sin(turn)], dim=-1)
+    half = (columns + 1) // 2
+    column = torch.arange(columns, dtype=torch.int32, device=keys.device)
+    is_second = column >= half
+    place = torch.where(is_second, column - half, column)
+    uniform = (_unsigned(random_words(keys, place), torch.float32) + 0.5) * 2.0**-32
+    turn = random_words(keys, place + half).to(torch.float32) * (2.0 * math.pi * 2.0**-32)
+    return torch.sqrt(-2.0 * torch.log(uniform)) * torch.where(is_second, torch.sin(turn), torch.cos(turn))
 
 
 def many_quanta(quanta: Any, step: Any, w: Any) -> Any:
@@ -171,18 +176,50 @@ def few_quanta(level: Any, slope: Any, step: Any, excess: Any, quanta: Any, word
     return noise.to(torch.float32)
 
 
-def _spread(image: Any, kernel: Any, axis: int, length: int) -> Any:
-    """Convolution along `axis`, in single precision whatever the device's convolutions are set to."""
-    taps = [float(value) for value in kernel]
-    result = image.narrow(axis, 0, length) * taps[0]
-    for j, tap in enumerate(taps[1:], start=1):
-        if tap:
-            result.add_(image.narrow(axis, j, length), alpha=tap)
-    return result
+def _draw_many(keys: Any, quanta: Any, step: Any, wide: int) -> Any:
+    """Noise (frame, row, wide) of rows whose keys are given, for pixels of many quanta."""
+    return many_quanta(quanta, step, normals(keys, wide))
 
 
-def sample(request: "_Frames", *, device: str | None) -> Any:
-    """Frames (frame, row, column) float32 on the device."""
+def _read_out(
+    keys: Any,
+    signal: Any,
+    noise: Any,
+    relative: Any,
+    slope: Any,
+    read_variance: Any,
+    dark: Any,
+    numbers: tuple[float, float, float, float, float],
+) -> Any:
+    """Frames from spread signal and noise; keys None: no electronics; numbers: see `_sample_piece`."""
+    import torch
+
+    white_fraction, signal_share, steps_a_DN, lowest, highest = numbers
+    columns = signal.shape[-1]
+    frame = signal_share * signal + noise * relative
+    if keys is not None:
+        drawn = normals(keys, columns)
+        white = white_fraction * slope * relative * torch.clamp(signal, min=0.0)
+        frame = frame + torch.sqrt(white + read_variance) * drawn
+    frame = frame + dark
+    if steps_a_DN > 0:
+        frame = torch.round(frame * steps_a_DN) * float(np.float32(1.0) / np.float32(steps_a_DN))
+    return torch.clamp(frame, lowest, highest)
+
+
+def _spread_both(image: Any, taps: tuple[float, ...], rows: int, columns: int) -> Any:
+    """Convolution along rows and columns, in single precision whatever the device's convolutions are set to."""
+    for axis, length in ((2, columns), (1, rows)):
+        result = image.narrow(axis, 0, length) * taps[0]
+        for j, tap in enumerate(taps[1:], start=1):
+            if tap:
+                result = result + image.narrow(axis, j, length) * tap
+        image = result
+    return image
+
+
+def sample(request: "_Frames", *, device: str | None, fused: bool = False) -> Any:
+    """Frames (frame, row, column) float32 on the device; `fused` lets torch's compiler join the steps."""
     import torch
 
     where = torch_device(device)
@@ -198,12 +235,15 @@ def sample(request: "_Frames", *, device: str | None) -> Any:
             stop = min(start + together, request.frames)
             maps = {name: values[start:stop] if len(values) > 1 else values for name, values in whole.items()}
             numbers = torch.arange(start, stop, dtype=torch.int64, device=where) + request.first_frame
-            result[start:stop] = _sample_piece(request, maps, numbers)
+            result[start:stop] = _sample_piece(request, maps, numbers, fused=fused)
     return result
 
 
-def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
+def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any, *, fused: bool) -> Any:
     import torch
+
+    def step_of(name: str) -> Any:
+        return _compiled(name) if fused else globals()[name]
 
     rows, columns = request.signal.shape[-2:]
     reach = request.reach
@@ -221,8 +261,7 @@ def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
     mean = widened(maps["signal"]) / relative
     level = torch.clamp(mean, min=0.0)
     quanta = level * slope / (step * step)
-    keys = row_keys(request.key, frames, STAGE_QUANTA, high)
-    noise = many_quanta(quanta, step, normals(random_words(keys, wide + wide % 2))[..., :wide])
+    noise = step_of("_draw_many")(row_keys(request.key, frames, STAGE_QUANTA, high), quanta, step, wide)
     few = quanta < EXPANSION_FROM
     if bool(few.any()):
         shape = noise.shape
@@ -232,28 +271,29 @@ def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any) -> Any:
             return values.expand(shape)[places]
 
         def words(stage: int) -> Any:
-            return random_words(row_keys(request.key, frames, stage, high), wide)[places]
+            column = torch.arange(wide, dtype=torch.int32, device=device)
+            return random_words(row_keys(request.key, frames, stage, high), column)[places]
 
         excess = widened(maps["excess"])
         noise[places] = few_quanta(chosen(level), chosen(slope), chosen(step), chosen(excess), chosen(quanta), words)
     if len(request.kernel) > 1 or reach:
-        kernel = request.kernel[: 2 * reach + 1]
-        noise = _spread(_spread(noise, kernel, 2, columns), kernel, 1, rows)
+        taps = tuple(float(tap) for tap in request.kernel[: 2 * reach + 1])
+        noise = step_of("_spread_both")(noise, taps, rows, columns)
+    signal = maps["signal"]
     if len(request.signal_kernel):
-        kernel = request.signal_kernel[: 2 * reach + 1]
-        signal = _spread(_spread(mean, kernel, 2, columns), kernel, 1, rows) * maps["relative"]
-    else:
-        signal = maps["signal"]
-    frame = request.signal_share * signal + noise * maps["relative"]
-    if request.electronics:
-        keys = row_keys(request.key, frames, STAGE_ELECTRONICS, rows)
-        drawn = normals(random_words(keys, columns + columns % 2))[..., :columns]
-        white = request.white_fraction * maps["slope"] * maps["relative"] * torch.clamp(signal, min=0.0)
-        frame = frame + torch.sqrt(white + maps["read_variance"]) * drawn
-    frame = frame + maps["dark"]
-    if request.steps_a_DN > 0:
-        frame = torch.round(frame * request.steps_a_DN) * float(np.float32(1.0) / np.float32(request.steps_a_DN))
-    return torch.clamp(frame, request.lowest, request.highest)
+        taps = tuple(float(tap) for tap in request.signal_kernel[: 2 * reach + 1])
+        signal = step_of("_spread_both")(mean, taps, rows, columns) * maps["relative"]
+    keys = row_keys(request.key, frames, STAGE_ELECTRONICS, rows) if request.electronics else None
+    numbers = (
+        request.white_fraction,
+        request.signal_share,
+        request.steps_a_DN,
+        request.lowest,
+        request.highest,
+    )
+    return step_of("_read_out")(
+        keys, signal, noise, maps["relative"], maps["slope"], maps["read_variance"], maps["dark"], numbers
+    )
 
 
 @contextmanager
@@ -269,8 +309,32 @@ def _single_precision() -> Iterator[None]:
         torch.set_float32_matmul_precision(before)
 
 
+def _exponential_sums(paths: Any, depths: Any, shares: Any) -> Any:
+    """(pixel, k) of paths (pixel, material), depths (material, energy) and shares (energy, k)."""
+    import torch
+
+    # past 2^126 only negative thicknesses come, and no further than single precision
+    return torch.exp2(torch.clamp(paths @ -depths, max=126.0)) @ shares
+
+
+def _fused_exponential_sums(paths: Any, depths: Any, shares: Any) -> Any:
+    """The same without matrix products, in a form whose (pixel, energy) terms a compiler never writes down."""
+    import torch
+
+    exponent = -(paths[:, 0, None] * depths[0])
+    for material in range(1, depths.shape[0]):
+        exponent = exponent - paths[:, material, None] * depths[material]
+    terms = torch.exp2(torch.clamp(exponent, max=126.0))
+    return torch.stack([(terms * shares[:, k]).sum(dim=1) for k in range(shares.shape[1])], dim=1)
+
+
 def project(
-    thickness: NDArray[np.float32], depth: NDArray[np.float64], share: NDArray[np.float64], *, device: str | None
+    thickness: NDArray[np.float32],
+    depth: NDArray[np.float64],
+    share: NDArray[np.float64],
+    *,
+    device: str | None,
+    fused: bool = False,
 ) -> Any:
     """sum_j share[k, j] 2^(-sum_m depth[m, j] thickness[m, p]) (k, pixel) float32 on the device."""
     import torch
@@ -280,13 +344,21 @@ def project(
     depths = torch.from_numpy(depth.astype(np.float32)).to(where)
     shares = torch.from_numpy(share.astype(np.float32).T.copy()).to(where)
     pixels, energies = thickness.shape[1], depth.shape[1]
+    if fused and len(depths) and energies and pixels:
+        with torch.no_grad():
+            return _compiled("_fused_exponential_sums")(paths.T, depths, shares).T
     result = torch.zeros((share.shape[0], pixels), dtype=torch.float32, device=where)
     together = max(1, _SUMMANDS_AT_ONCE // max(energies, 1))
     with torch.no_grad(), _single_precision():
         for start in range(0, pixels, together):
-            part = paths[:, start : start + together]
-            exponent = torch.zeros((part.shape[1], energies), dtype=torch.float32, device=where)
-            for path, one in zip(part, depths, strict=True):
-                exponent.addr_(path, one, alpha=-1.0)
-            result[:, start : start + together] = (exponent.clamp_(-1e30, 126.0).exp2_() @ shares).T
+            part = paths[:, start : start + together].T
+            result[:, start : start + together] = _exponential_sums(part, depths, shares).T
     return result
+
+
+@lru_cache(maxsize=16)
+def _compiled(name: str) -> Any:
+    """A function of this module as torch's compiler makes it: one pass over memory for what is many otherwise."""
+    import torch
+
+    return torch.compile(globals()[name], dynamic=False)

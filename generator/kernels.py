@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ._noise_constants import LARGEST_INVERTED, TAPS_TOGETHER
 
-BACKENDS = ("cpu", "torch")
+BACKENDS = ("cpu", "torch", "torch_compiled")
 _FloatMap = NDArray[np.float32]
 
 
@@ -265,7 +265,8 @@ def sample_frames(
         bits: ADC range 0 .. 2^bits - 1; None for no upper end.
         quantised: whole DN (steps of 1 / averaged) from 0; otherwise neither rounded nor cut at 0.
         averaged: frames averaged in the detector.
-        backend: `cpu` (compiled, returns numpy float32) or `torch` (returns a float32 tensor on `device`).
+        backend: `cpu` (compiled, returns numpy float32), `torch` (returns a float32 tensor on `device`), or
+            `torch_compiled` (the same with the steps joined by torch's compiler, which takes its time once for a shape).
         device: torch's name of the device; None for `cuda` where there is one, else `cpu`.
 
     Maps broadcast: one number, (row, column), (frame, 1, 1) or (frame, row, column).
@@ -316,10 +317,10 @@ def _sample(
     backend: str,
     device: str | None,
 ) -> Any:
-    if backend == "torch":
+    if backend != "cpu":
         from ._torch_kernels import sample
 
-        result = sample(request, device=device)
+        result = sample(request, device=device, fused=backend == "torch_compiled")
         if stuck is not None:
             places = [result.new_tensor(axis).long() for axis in stuck[0]]
             result[:, places[0], places[1]] = result.new_tensor(stuck[1])

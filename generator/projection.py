@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .kernels import BACKENDS
 
 # single precision holds a transmission down to 1e-38; from here on it is 0 within the stated error
 _LONGEST_MM = 1e30
@@ -118,7 +119,7 @@ def project_polychromatic(
         weights: (k, energy) or (energy,): what a photon spectrum is worth, for example N m1 for the signal, N m2 for
             the variance and N D for the photons absorbed; 0 or more.
         allow_negative: take negative thicknesses as they stand (a solution of noisy measurements has them).
-        backend: `cpu` (compiled) or `torch`.
+        backend: `cpu` (compiled), `torch` or `torch_compiled` (its steps joined by torch's compiler).
         device: torch's name of the device; None for `cuda` where there is one, else `cpu`.
 
     Returns:
@@ -134,13 +135,19 @@ def project_polychromatic(
     mu, weight = _spectrum_arrays(mu_per_mm, weights, materials)
     scale = weight.sum(axis=1)
     pixels = int(np.prod(shape))
-    if backend not in ("cpu", "torch"):
-        raise InputError("backend", received=backend, expected="one of cpu, torch")
-    if backend == "torch":
+    if backend not in BACKENDS:
+        raise InputError("backend", received=backend, expected="one of " + ", ".join(BACKENDS))
+    if backend != "cpu":
         from ._torch_kernels import project
 
         share = weight / np.where(scale > 0, scale, 1.0)[:, None]
-        shares = project(thickness.reshape(materials, pixels), mu * math.log2(math.e), share, device=device)
+        shares = project(
+            thickness.reshape(materials, pixels),
+            mu * math.log2(math.e),
+            share,
+            device=device,
+            fused=backend == "torch_compiled",
+        )
         return (shares * shares.new_tensor(scale)[:, None]).reshape(len(weight), *shape)
     result = np.empty((len(weight), pixels), dtype=np.float32)
     if materials == 0:

@@ -5,6 +5,7 @@ family of checks shares one error rate.
 """
 
 import math
+import shutil
 import subprocess
 import sys
 
@@ -240,7 +241,11 @@ def test_a_frame_has_the_same_bytes_whatever_the_number_of_threads():
     assert len(hashes) == 1
 
 
-def test_torch_draws_the_frames_of_the_compiled_loops_but_for_last_bits():
+@pytest.mark.parametrize("backend", ["torch", pytest.param("torch_compiled", marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore")  # of torch's compiler
+def test_torch_draws_the_frames_of_the_compiled_loops_but_for_last_bits(backend):
+    if backend == "torch_compiled" and shutil.which("g++") is None:
+        pytest.skip("torch's compiler needs g++")
     rng = np.random.default_rng(1)
     signal = np.concatenate([rng.uniform(0, 30, (1, 60, 81)), rng.uniform(90, 2000, (1, 60, 81))])
     settings = {
@@ -256,7 +261,7 @@ def test_torch_draws_the_frames_of_the_compiled_loops_but_for_last_bits():
         "quantised": False,
     }
     compiled = sample_frames(signal, **settings)
-    in_torch = sample_frames(signal, backend="torch", device="cpu", **settings).numpy()
+    in_torch = sample_frames(signal, backend=backend, device="cpu", **settings).numpy()
     # where a last bit moves a count by one quantum, the spread takes it to some of its neighbours
     assert np.mean(np.abs(compiled - in_torch) > 2e-3) < 5e-3
 
@@ -436,7 +441,7 @@ GOOD = {"signal_DN": np.ones((4, 5)), "gain_DN": 1.0, "key": 1}
         ({"frames": -1}, r"frames: got -1"),
         ({"signal_DN": np.ones((3, 4, 5)), "frames": 2}, r"frames: got 2; expected 3, as many as there are signals"),
         ({"stuck_DN": np.ones((4, 4))}, r"stuck_DN: got shape \(4, 4\)"),
-        ({"backend": "gpu"}, r"backend: got gpu; expected one of cpu, torch"),
+        ({"backend": "gpu"}, r"backend: got gpu; expected one of cpu, torch, torch_compiled"),
         ({"backend": "torch", "device": "nowhere"}, r"device: got nowhere; expected a device that torch has here"),
     ],
 )

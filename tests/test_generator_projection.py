@@ -1,5 +1,7 @@
 """Polychromatic projection: the exact sum over energies within 1e-4, at any shape, thickness and number of materials."""
 
+import shutil
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -41,21 +43,27 @@ def test_projection_is_the_sum_over_energies(materials, moments):
     assert np.max(np.abs(result / exact(thickness, mu, weights) - 1.0)) < TOLERANCE
 
 
-@pytest.mark.parametrize("materials", [1, 2, 3])
-def test_torch_projects_the_same(materials):
+@pytest.mark.parametrize(
+    ("materials", "backend"),
+    [(1, "torch"), (2, "torch"), (3, "torch"), pytest.param(2, "torch_compiled", marks=pytest.mark.slow)],
+)
+@pytest.mark.filterwarnings("ignore")  # of torch's compiler
+def test_torch_projects_the_same(materials, backend):
+    if backend == "torch_compiled" and shutil.which("g++") is None:
+        pytest.skip("torch's compiler needs g++")
     rng = np.random.default_rng(materials)
     thickness = rng.uniform(0.0, [[[60.0]], [[6.0]], [[9.0]]][:materials], size=(materials, 37, 53))
     thickness[:, 0] = 0.0
     thickness[0, 1] = 1e30
     mu, weights = coefficients(materials), spectrum()
-    result = project_polychromatic(thickness, mu, weights, backend="torch", device="cpu").numpy()
+    result = project_polychromatic(thickness, mu, weights, backend=backend, device="cpu").numpy()
     expected = exact(thickness, mu, weights)
     assert result.shape == (2, 37, 53)
     assert np.all(np.abs(result - expected) <= TOLERANCE * expected)
 
 
 def test_an_unknown_backend_is_refused():
-    with pytest.raises(InputError, match="backend: got gpu; expected one of cpu, torch"):
+    with pytest.raises(InputError, match="backend: got gpu; expected one of cpu, torch, torch_compiled"):
         project_polychromatic(np.zeros((1, 2, 2)), coefficients(1), spectrum(), backend="gpu")
 
 

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation benchmark check format clean
+.PHONY: demo test test-slow validation validation-prediction benchmark check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -28,6 +28,10 @@ test-slow: $(READY)
 validation: $(READY)
 	$(BIN)/python validation/calibration_coverage.py --seeds 40 --json build/calibration_coverage.json
 	$(BIN)/python validation/generated_against_lab.py --seeds 3 --json build/generated_against_lab.json
+
+# predictions against truth and against the information limit: hours; a stopped run goes on where it was
+validation-prediction: $(READY)
+	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
 
 # speed and memory as this machine has them, each against its reference in the same run
 benchmark: $(READY)

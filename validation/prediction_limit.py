@@ -1,7 +1,7 @@
 """Predictions at settings never measured, against the virtual lab's truth and against what any method could reach.
 
     python validation/prediction_limit.py [--systems 200] [--first 1000] [--kind nominal|departing|coarse]
-        [--processes 1] [--folder build/prediction_limit] [--fresh] [--prepare] [--json FILE]
+        [--processes 1] [--folder build/prediction_limit] [--fresh] [--prepare] [--next N] [--json FILE]
 
 Each system is drawn: tube filtration, scintillator, kV offset, output, gain, Swank factor, spread, read noise. One session a
 system holds darks and flats; a protocol is a part of them:
@@ -43,6 +43,7 @@ from raytwin.acquisition import open_acquisition
 from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text, setting_from_text, text_from_filters
 from raytwin.calibration.calibrate import calibrate_twin
+from raytwin.calibration.next_measurement import rank_measurements
 from raytwin.calibration.priors import ATTENUATION_SCALE, GAIN_DISCREPANCY, LEVEL_DISCREPANCY, PRIORS, TABLE_SHARE
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.twin import Twin
@@ -427,6 +428,41 @@ def run_system(seed: int, *, kind: str, folder: Path) -> dict[str, Any]:
     return {"seed": seed, "kind": kind, "rows": rows}
 
 
+def take_next(seed: int, *, kind: str, folder: Path, protocol: str) -> dict[str, Any]:
+    """Errors and widths of the levels' predictions before and after the measurement that calibration names is taken."""
+    session, lab = prepare(seed, kind, folder)
+    before = calibrated(session, PROTOCOLS[protocol], seed)
+    named = next(item for item in rank_measurements(before) if not item.layers)
+    beam = (named.setting.kV, text_from_filters(named.setting.filters))
+    again = folder / f"{kind}_{seed}_{protocol}_next.h5"
+    measure(again, Line(seed, kind), seed, [*PROTOCOLS[protocol], beam], part=1)
+    after = calibrated(again, None, seed)
+    again.unlink()
+    rows = []
+    for twin in (before, after):
+        found = [predict_flatfield(twin, setting).mean_DN for setting in SETTINGS]
+        truth = np.array([item["mean_DN"] for item in lab["truths"]])
+        rows.append(
+            {
+                "errors": [math.log(item.value / exact) for item, exact in zip(found, truth, strict=True)],
+                "width": float(np.mean([(item.high - item.low) / item.value for item in found])),
+            }
+        )
+    return {"seed": seed, "measurement": str(named.setting), "shrinks_to": named.shrinks_to, "rows": rows}
+
+
+def print_next(protocol: str, taken: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the named measurement promised, and what it did to intervals and errors, over all systems."""
+    promised = float(np.median([item["shrinks_to"] for item in taken]))
+    widths = [item["rows"][1]["width"] / item["rows"][0]["width"] for item in taken]
+    errors = [100 * math.sqrt(float(np.mean(np.square([item["rows"][n]["errors"] for item in taken])))) for n in (0, 1)]
+    print(
+        f"{protocol}, {len(taken)} systems: the named measurement takes the intervals to {100 * promised:.0f} % (promised),"
+        f" {100 * float(np.median(widths)):.0f} % (found; medians); rms error of the level {errors[0]:.2f} % -> {errors[1]:.2f} %"
+    )
+    return {"protocol": protocol, "systems": len(taken), "promised": promised, "widths": widths, "rms_percent": errors}
+
+
 def summarise(results: list[dict[str, Any]], *, draws: int = 1000) -> list[dict[str, Any]]:
     """Per protocol and quantity: errors, limit, their ratio, coverage with a bootstrap over systems."""
     rng = np.random.default_rng(0)
@@ -536,6 +572,7 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, default=Path("build/prediction_limit"), help="sessions and results")
     parser.add_argument("--fresh", action="store_true", help="calibrate again; the lab's sessions are kept")
     parser.add_argument("--prepare", action="store_true", help="only measure the sessions")
+    parser.add_argument("--next", type=int, default=0, help="systems in which the measurement named next is taken")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -551,9 +588,20 @@ def main() -> int:
     table = summarise(results)
     print(f"{len(results)} {arguments.kind} systems, {time.perf_counter() - started:.0f} s")
     print_table(table)
+    taken = [
+        print_next(
+            protocol,
+            [
+                take_next(seed, kind=arguments.kind, folder=arguments.folder, protocol=protocol)
+                for seed in tqdm(seeds[: arguments.next], disable=None, file=sys.stderr)
+            ],
+        )
+        for protocol in ("A", "D")
+        if arguments.next
+    ]
     if arguments.json is not None:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps({"table": table}, indent=1) + "\n", encoding="utf-8")
+        arguments.json.write_text(json.dumps({"table": table, "next": taken}, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -1,13 +1,16 @@
-"""The measurement that calibration names next: what it promises is what it does."""
+"""Intervals of predictions, and the measurement that calibration names next: what it promises is what it does."""
 
+import importlib.util
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from raytwin.acquisition.instrument import Instrument
-from raytwin.acquisition.setting import filters_from_text
+from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.next_measurement import rank_measurements
 from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
 from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for
@@ -172,3 +175,68 @@ def test_learned_discrepancies_of_exact_levels_stay_small(model, truth):
     posterior = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")]).spectral
     assert posterior.level_discrepancy < 4 * LEVEL_DISCREPANCY
     assert posterior.gain_discrepancy < 4 * GAIN_DISCREPANCY
+
+
+def test_a_level_far_beyond_the_flats_is_extrapolated_and_says_so(model, truth):
+    twin = twin_of(model, truth, [(40.0, "Cu:0.05"), (90.0, "Cu:0.05")])
+    signals = [point["signal_DN"] for point in twin.evidence["photon_transfer"]]
+    setting = Setting(kV=60.0, power_W=30.0, exposure_ms=20.0, filters=filters_from_text("Cu:0.05"))
+    inside = predict_flatfield(twin, setting)
+    assert not inside.extrapolated
+    bright = predict_flatfield(twin, replace(setting, exposure_ms=20.0 * 4 * max(signals) / inside.mean_DN.value))
+    dim = predict_flatfield(twin, replace(setting, exposure_ms=20.0 * min(signals) / 20 / inside.mean_DN.value))
+    for found in (bright, dim):
+        assert found.extrapolated
+        assert any("level" in line and "DN calibrated" in line for line in found.warnings)
+        assert found.mean_DN.high / found.mean_DN.low > inside.mean_DN.high / inside.mean_DN.low
+    # a measured beam too: nobody has seen the detector there
+    measured = predict_flatfield(twin, Setting(kV=40.0, power_W=30.0, exposure_ms=800.0, filters=setting.filters))
+    assert measured.measured_level and measured.extrapolated
+
+
+def test_noise_is_known_better_than_level_and_gain_one_by_one(model, truth):
+    # what raises the level at a new kV (a harder beam, a thinner window) lowers the gain or leaves it
+    twin = twin_of(model, truth, [(90.0, "Cu:0.05")])
+    found = predict_flatfield(twin, Setting(kV=50.0, power_W=30.0, exposure_ms=40.0))
+    mean, gain, sd = (math.log(item.high / item.low) for item in (found.mean_DN, found.gain_DN, found.sd_DN))
+    assert sd < 0.5 * math.hypot(mean, gain)
+
+
+def test_the_slope_of_the_levels_carries_over_to_settings_not_measured(model, truth):
+    twin = twin_of(model, truth, [(40.0, "Cu:0.05"), (60.0, ""), (90.0, "Cu:0.05")])
+    setting = Setting(kV=75.0, power_W=30.0, exposure_ms=20.0, filters=filters_from_text("Cu:0.05"))
+    found = predict_flatfield(twin, setting)
+    signal = model.signal(truth[None, :], OpenBeam(kV=75.0, filters=setting.filters))
+    mean = float(signal.rate_DN_per_mAs[0]) * FACTOR * setting.tube_load_mAs
+    # half of the gain shows as slope in every level of `twin_of`; the spread alone would say otherwise
+    exact = math.sqrt(0.5 * float(signal.gain_DN[0]) * mean + 1.0 + 1 / 12)
+    assert found.mean_DN.low < mean < found.mean_DN.high
+    assert found.sd_DN.low < exact < found.sd_DN.high
+    assert found.sd_DN.value == pytest.approx(exact, rel=0.01)
+
+
+def load_validation():
+    """validation/prediction_limit.py as a module."""
+    path = Path(__file__).parents[1] / "validation" / "prediction_limit.py"
+    spec = importlib.util.spec_from_file_location("prediction_limit", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["prediction_limit"] = module  # its processes look it up by name
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_predictions_in_the_lab_stay_near_the_information_limit(tmp_path):
+    validation = load_validation()
+    results = validation.run(range(500, 503), kind="nominal", folder=tmp_path)
+    again = validation.run(range(500, 503), kind="nominal", folder=tmp_path)
+    assert [item["seed"] for item in again] == [500, 501, 502]
+    for row in validation.summarise(results, draws=50):
+        # three systems: the square of a ratio is a mean of 36 strongly correlated squares
+        assert row["failed"] == 0
+        assert row["ratio"] < 2.2, row
+        assert row["coverage_percent"] > 75, row
+        if row["protocol"] == "C":
+            assert row["median_error_percent"] < (0.6 if row["quantity"] == "mean_DN" else 1.0)
+    taken = validation.take_next(500, kind="nominal", folder=tmp_path, protocol="D")
+    assert taken["rows"][1]["width"] < 0.6 * taken["rows"][0]["width"]

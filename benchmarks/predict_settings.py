@@ -26,7 +26,7 @@ from raytwin.generator import (
 )
 from raytwin.generator.predict_many import predict_levels
 from raytwin.materials import transmission
-from raytwin.spectra import detector_response, tube_fluence_interpolated
+from raytwin.spectra import MODELS, detector_response, tube_fluence_interpolated
 
 SCINTILLATOR = filters_from_text("CsI:0.5")
 DRAWS = 400
@@ -96,10 +96,10 @@ def main() -> None:
     kV = np.array([one[0] for one in grid])
     filters = [one[1] for one in grid]
     load_mAs = np.array([one[2] for one in grid]) / 1000.0
-    for voltage in VOLTAGES_KV:  # fills the cache on disk where it is empty
-        tube_fluence_interpolated(float(voltage), energies_keV=model.energies_keV)
-        for error in (-0.06, 0.06):
-            tube_fluence_interpolated(float(voltage) * (1 + error), energies_keV=model.energies_keV)
+    for voltage, name in itertools.product(VOLTAGES_KV, MODELS):  # fills the cache on disk where it is empty
+        tube_fluence_interpolated(float(voltage), energies_keV=model.energies_keV, model=name, for_sums=True)
+    for voltage, error in itertools.product(VOLTAGES_KV, (-0.06, 0.06)):
+        tube_fluence_interpolated(float(voltage) * (1 + error), energies_keV=model.energies_keV)
     for turn in ("first", "again", "again", "again"):
         begin = time.perf_counter()
         levels = predict_levels(twin, kV=kV, filters=filters, load_mAs=load_mAs)

@@ -195,10 +195,10 @@ def _bad_pixels(darks: _Darks, flats: Sequence[tuple[Series, KeptSums]]) -> NDAr
         code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["hot"]
     if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
         # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
-        from scipy.stats import chi2
+        from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
 
-        centre = float(np.median(darks.variance)) * darks.effective / float(chi2.median(darks.effective))
-        limit = centre * float(chi2.isf(_NOISY_CHANCE, darks.effective)) / darks.effective + 1.0
+        centre = float(np.median(darks.variance)) * darks.effective / float(chdtri(darks.effective, 0.5))
+        limit = centre * float(chdtri(darks.effective, _NOISY_CHANCE)) / darks.effective + 1.0
         code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])
@@ -916,7 +916,7 @@ def _session_evidence(
 ) -> list[dict[str, Any]] | None:
     """Per session: its series, dark levels, levels a mAs, and their change since the first session that has the same;
     None for one session."""
-    numbers = sorted({item.session for item, *_ in [*sums, *darks.sums]})
+    numbers = sorted({item.session for item in [*(row[0] for row in sums), *(row[0] for row in darks.sums)]})
     if len(numbers) < 2:
         return None
     dark_first: dict[float | None, float] = {}

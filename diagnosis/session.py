@@ -127,6 +127,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             start_s=start,
             index=item.index,
             thickness_mm=thickness,
+            scene_kind=None if scene is None else scene.kind,
             source_object_mm=item.source_object_mm or instrument.source_object_mm,
             source_detector_mm=item.source_detector_mm or instrument.source_detector_mm,
             belt_speed_mm_s=item.belt_speed_mm_s,

@@ -568,6 +568,10 @@ def test_a_composition_error_is_so_much_more_of_the_material(series_line):
         found = expect(series_line, asked, applied("composition_error", 3.0, options=options))
         # borders of the object are looked for in its thickness, and lie a hair elsewhere
         np.testing.assert_allclose(found.mean_DN, known, rtol=1e-4)
+    wedge = replace(asked, scene_kind="wedge")
+    np.testing.assert_array_equal(
+        expect(series_line, wedge, applied("composition_error", 3.0)).mean_DN, expect(series_line, wedge).mean_DN
+    )
     other = expect(series_line, replace(asked, product_material="Al"), applied("composition_error", 3.0))
     assert np.abs(other.mean_DN / known - 1).max() > 1e-3
 

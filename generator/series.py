@@ -51,8 +51,8 @@ class SeriesRequest:
     after_calibration (later than the series that calibrated the twin); previous: exposures before this one that lag may
     remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
     open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
-    material of the scene that is the product; scene_kind (`wedge`, `slab`, `edge`, `disc`, `product`); displacement_px: how far along rows and columns the scene is known to lie
-    from where its thickness maps have it.
+    material of the scene that is the product; scene_kind (`wedge`, `slab`, `edge`, `disc`, `product`);
+    displacement_px: how far along rows and columns the scene is known to lie from where its thickness maps have it.
     """
 
     kind: str

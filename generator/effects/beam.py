@@ -147,7 +147,8 @@ COMPOSITION_ERROR = Effect(
     change=_scale_attenuation,
     needs=("spectral", "scene"),
     options={
-        "material": "material of the scene that differs; not given: the product's, or the one of longest path in a scene that is no wedge, edge or disc"
+        "material": "of the scene, that differs; not given: the product's, or the one of longest path in a scene that is"
+        " no wedge, edge or disc"
     },
 )
 

@@ -14,7 +14,7 @@ from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
 from ..spectra import Spectrum
 from .next_measurement import rank_measurements
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
-from .spectral_fit import fit_spectrum
+from .spectral_fit import SpectralFit, fit_spectrum
 from .wedges import measure_transmissions, wedge_evidence
 
 
@@ -67,14 +67,20 @@ def calibrate_twin(
         wedges = measure_transmissions(acquisition, transfer.maps)
         evidence["wedges"] = wedge_evidence(wedges)
         warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
+        transmissions = [value for item in wedges for value in item.transmissions]
         try:
             fit = fit_spectrum(
-                transfer.levels,
-                acquisition.instrument,
-                rng=rng,
-                spectra=spectra,
-                transmissions=[value for item in wedges for value in item.transmissions],
+                transfer.levels, acquisition.instrument, rng=rng, spectra=spectra, transmissions=transmissions
             )
+            if transmissions and _contradicts(fit):
+                without = fit_spectrum(transfer.levels, acquisition.instrument, rng=rng, spectra=spectra)
+                if not _contradicts(without):
+                    fit = without
+                    evidence["wedges"] = [{**row, "used": False} for row in evidence["wedges"]]
+                    warnings.append(
+                        "the wedges contradict the flats (scatter behind them, or another thickness than stated) and were"
+                        " left out of the spectral fit; a larger gap behind a wedge lowers its scatter"
+                    )
         except FitError as error:
             warnings.append(f"no spectral part: {error}")
         else:
@@ -87,7 +93,7 @@ def calibrate_twin(
                 "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
                 "prior": dict(spectral.prior),
             }
-            if fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data):
+            if _contradicts(fit):
                 warnings.append(
                     f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
                     " data): check kV, filter and power of the series"
@@ -111,6 +117,11 @@ def calibrate_twin(
         ranked = rank_measurements(twin)
         twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
     return twin
+
+
+def _contradicts(fit: SpectralFit) -> bool:
+    """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
+    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
 
 
 def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:

@@ -62,7 +62,9 @@ PRIORS: dict[str, Prior] = {
         centre=0.0, sd=0.1, reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %"
     ),
     "scintillator_table": Prior(
-        centre=0.67, sd=0.47, reason="0 is xraylib, 1 the mean of Chantler's and PENELOPE's: three equally likely tables"
+        centre=0.67,
+        sd=0.47,
+        reason="0 is xraylib, 1 the mean of Chantler's and PENELOPE's: three equally likely tables",
     ),
 }
 # where measured spectra stand in for the model, windows and housing are in them

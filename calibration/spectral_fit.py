@@ -434,8 +434,8 @@ class _Posterior:
         return value, slope
 
     def chi_square(self, parameters: NDArray[np.float64]) -> float:
-        """Squared misfit over noise and the prior's discrepancy, at one parameter set (parameter,)."""
-        variance = self.variances(np.zeros((1, self.dimensions)))[0]
+        """Squared misfit over noise and the largest plausible discrepancy, at one parameter set (parameter,)."""
+        variance = self.variances(np.full((1, self.dimensions), _Z95))[0]
         misfit = self.value - self.expectation(parameters[None, :])[0][0]
         return float(np.sum(misfit**2 / variance))
 

@@ -239,7 +239,7 @@ def transmissions_of_evidence(twin: Twin) -> tuple[Transmission, ...]:
             series=str(row["series"]),
         )
         for row in twin.evidence.get("wedges") or ()
-        if "transmission" in row
+        if "transmission" in row and row.get("used", True)
     )
 
 

@@ -47,7 +47,18 @@ def steps_map():
     return np.repeat(np.array(STEPS_MM), SHAPE[1] // len(STEPS_MM))[None, :].repeat(SHAPE[0], axis=0).astype(np.float32)
 
 
-def session(path, line, *, load_of_object=1.0, thickness=None, ramp=False, material="Al", kind="wedge", distance=None):
+def session(
+    path,
+    line,
+    *,
+    load_of_object=1.0,
+    thickness=None,
+    ramp=False,
+    material="Al",
+    kind="wedge",
+    distance=None,
+    stated=None,
+):
     """Flats at 50 and 90 kV and a wedge at 50 kV, white quantum noise by the model's own gain."""
     model, truth = line
     rng = np.random.default_rng(3)
@@ -62,6 +73,7 @@ def session(path, line, *, load_of_object=1.0, thickness=None, ramp=False, mater
         noise = np.sqrt(gain * mean + 4.0) * rng.standard_normal((count, *SHAPE))
         return np.clip(np.rint(DARK_DN + mean + noise), 0, 65535).astype(np.uint16)
 
+    stated = plane if stated is None else stated
     with write_acquisition(path, INSTRUMENT) as writer:
         for name in ("dark_0", "dark_1"):
             dark = np.rint(DARK_DN + 2.0 * rng.standard_normal((20, *SHAPE))).astype(np.uint16)
@@ -72,7 +84,7 @@ def session(path, line, *, load_of_object=1.0, thickness=None, ramp=False, mater
             writer.add_series(
                 f"flat_{kV:g}", frames=frames(setting, rate * np.ones(SHAPE)), kind="flat", setting=setting
             )
-        writer.add_scene("steps", kind=kind, thickness_mm={} if material is None else {material: plane})
+        writer.add_scene("steps", kind=kind, thickness_mm={} if material is None else {material: stated})
         setting = Setting(kV=50.0, current_mA=0.2 * load_of_object, exposure_ms=20.0, source_detector_mm=distance)
         rates = np.zeros(SHAPE)
         for step in np.unique(plane):
@@ -195,6 +207,17 @@ def test_a_wedge_that_says_nothing_is_left_out_with_the_reason(tmp_path, line, m
         (found,) = measure_transmissions(acquisition, twin.maps)
     assert found.transmissions == ()
     assert message in found.skipped
+
+
+def test_wedges_with_scatter_are_left_out_with_a_warning(tmp_path, line):
+    # twice the thickness is stated: what scatter does to a thick step, too much signal behind it
+    thickness = np.where(steps_map() > 0, 2.0 * steps_map(), 0.0).astype(np.float32)
+    path = session(tmp_path / "scatter.h5", line, stated=thickness)
+    with open_acquisition(path) as acquisition:
+        twin = calibrate_twin(acquisition, rng=np.random.default_rng(0), advise=False)
+    assert any("wedges contradict the flats" in text for text in twin.warnings)
+    assert transmissions_of_evidence(twin) == ()
+    assert twin.evidence["spectrum"]["data"] == 4
 
 
 def test_products_are_no_wedges(tmp_path, line, measured):

@@ -56,6 +56,13 @@ def torch_device(device: str | None) -> Any:
     return found
 
 
+def on_device(values: Any, device: Any) -> Any:
+    """An array or a tensor as a tensor on the device."""
+    import torch
+
+    return (torch.from_numpy(values) if isinstance(values, np.ndarray) else values).to(device)
+
+
 def _signed(value: int, bits: int) -> int:
     value &= 2**bits - 1
     return value - 2**bits if value >= 2 ** (bits - 1) else value
@@ -229,7 +236,7 @@ def sample(request: "_Frames", *, device: str | None, fused: bool = False) -> An
         return result
     together = max(1, _PIXELS_AT_ONCE // (rows * columns))
     names = ("signal", "relative", "slope", "step", "excess", "read_variance", "dark")
-    whole = {name: torch.from_numpy(getattr(request, name)).to(where) for name in names}
+    whole = {name: on_device(getattr(request, name), where) for name in names}
     with torch.no_grad():
         for start in range(0, request.frames, together):
             stop = min(start + together, request.frames)
@@ -329,7 +336,7 @@ def _fused_exponential_sums(paths: Any, depths: Any, shares: Any) -> Any:
 
 
 def project(
-    thickness: NDArray[np.float32],
+    thickness: Any,
     depth: NDArray[np.float64],
     share: NDArray[np.float64],
     *,
@@ -340,7 +347,7 @@ def project(
     import torch
 
     where = torch_device(device)
-    paths = torch.from_numpy(thickness).to(where)
+    paths = on_device(thickness, where)
     depths = torch.from_numpy(depth.astype(np.float32)).to(where)
     shares = torch.from_numpy(share.astype(np.float32).T.copy()).to(where)
     pixels, energies = thickness.shape[1], depth.shape[1]

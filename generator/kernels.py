@@ -35,15 +35,18 @@ def gamma_step_DN(gain_DN: ArrayLike, deposit_spread: ArrayLike) -> NDArray[np.f
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """What both ways of computing take: checked maps (frame or 1, row or 1, column or 1), float32, and numbers."""
+    """What both ways of computing take: checked maps (frame or 1, row or 1, column or 1), float32, and numbers.
 
-    signal: _FloatMap
-    relative: _FloatMap
-    slope: _FloatMap  # quantum variance per signal
-    step: _FloatMap  # third cumulant over variance
-    excess: _FloatMap  # squared coefficient of variation of the deposits
-    read_variance: _FloatMap
-    dark: _FloatMap
+    The maps are arrays, or all of them torch tensors.
+    """
+
+    signal: Any
+    relative: Any
+    slope: Any  # quantum variance per signal
+    step: Any  # third cumulant over variance
+    excess: Any  # squared coefficient of variation of the deposits
+    read_variance: Any
+    dark: Any
     white_fraction: float
     kernel: _FloatMap
     signal_kernel: _FloatMap  # empty: the signal is not spread
@@ -63,16 +66,27 @@ class _Frames:
         return np.asarray(values[frame if len(values) > 1 else 0])
 
 
-def _map(name: str, values: ArrayLike, shape: tuple[int, int, int], *, low: float, unit: str) -> _FloatMap:
+def is_tensor(values: object) -> bool:
+    """Whether `values` is a torch tensor, told without loading torch."""
+    return hasattr(values, "detach") and hasattr(values, "device")
+
+
+def _single(values: Any) -> Any:
+    """Contiguous single precision, where the values are."""
+    return values.float().contiguous() if is_tensor(values) else np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _map(name: str, values: Any, shape: tuple[int, int, int], *, low: float, unit: str) -> Any:
     """`values` as (frame or 1, row or 1, column or 1) float32, finite and at least `low`."""
-    given = np.asarray(values)
-    if given.dtype.kind not in "fiub":
+    given: Any = values.detach() if is_tensor(values) else np.asarray(values)
+    if not is_tensor(given) and given.dtype.kind not in "fiub":
         raise InputError(name, received=f"{given.dtype}", expected="numbers")
-    if given.size and not (float(given.min()) >= low and float(given.max()) <= 1e30):  # NaN fails both
-        wrong = given[~((given >= low) & (given <= 1e30))]
+    count = math.prod(given.shape)
+    if count and not (float(given.min()) >= low and float(given.max()) <= 1e30):  # NaN fails both
+        wrong = given[~((given >= low) & (given <= 1e30))].reshape(-1)
         raise InputError(
             name,
-            received=f"{float(wrong.flat[0]):g} in {wrong.size} of {given.size} places",
+            received=f"{float(wrong[0]):g} in {len(wrong)} of {count} places",
             expected=f"finite, {low:g} {unit} or more" if low > -1e30 else f"finite {unit}",
         )
     while given.ndim > 3 and given.shape[0] == 1:
@@ -82,12 +96,13 @@ def _map(name: str, values: ArrayLike, shape: tuple[int, int, int], *, low: floa
     if not fits:
         raise InputError(
             name,
-            received=f"shape {given.shape}",
+            received=f"shape {tuple(given.shape)}",
             expected=f"one number, or a map that fits frames, rows and columns {shape}",
         )
-    if full.shape[1:] not in ((1, 1), shape[1:]):
-        full = np.broadcast_to(full, (full.shape[0], *shape[1:]))
-    return np.ascontiguousarray(full, dtype=np.float32)
+    if tuple(full.shape[1:]) not in ((1, 1), shape[1:]):
+        target = (full.shape[0], *shape[1:])
+        full = full.expand(target) if is_tensor(full) else np.broadcast_to(full, target)
+    return _single(full)
 
 
 def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> _FloatMap:
@@ -136,9 +151,11 @@ def _prepare(
     frames: int | None,
     with_signal: bool = True,
 ) -> _Frames:
-    given = np.asarray(signal_DN)
+    given: Any = signal_DN if is_tensor(signal_DN) else np.asarray(signal_DN)
     if given.ndim not in (2, 3):
-        raise InputError("signal_DN", received=f"shape {given.shape}", expected="(row, column) or (frame, row, column)")
+        raise InputError(
+            "signal_DN", received=f"shape {tuple(given.shape)}", expected="(row, column) or (frame, row, column)"
+        )
     if given.ndim == 3 and frames is not None and frames != len(given):
         raise InputError("frames", received=frames, expected=f"{len(given)}, as many as there are signals, or none")
     count = len(given) if given.ndim == 3 else (1 if frames is None else frames)
@@ -154,34 +171,47 @@ def _prepare(
         raise InputError("bits", received=bits, expected="1 to 24 bits, or None for no upper end")
     shape = (count, *given.shape[-2:])
     white = _check_number("white_fraction", white_fraction, low=0.0, high=1e6, unit="of the quantum variance")
-    gain = _map("gain_DN", gain_DN, shape, low=1e-12, unit="DN")
-    excess = _map("deposit_spread", deposit_spread, shape, low=0.0, unit="")
-    slope = gain / np.float32(1.0 + white)
+    maps = {
+        "signal": _map("signal_DN", given, shape, low=-1e30, unit="DN"),
+        "gain": _map("gain_DN", gain_DN, shape, low=1e-12, unit="DN"),
+        "excess": _map("deposit_spread", deposit_spread, shape, low=0.0, unit=""),
+        "relative": _map("gain_relative", gain_relative, shape, low=1e-6, unit=""),
+        "read": _map("read_noise_DN", read_noise_DN, shape, low=0.0, unit="DN"),
+        "dark": _map("dark_DN", dark_DN, shape, low=-1e30, unit="DN"),
+    }
+    if step_DN is not None:
+        maps["step"] = _map("step_DN", step_DN, shape, low=1e-12, unit="DN")
+    places = [values.device for values in maps.values() if is_tensor(values)]
+    if places:
+        from ._torch_kernels import on_device
+
+        maps = {name: on_device(values, places[0]) for name, values in maps.items()}
+    slope, excess = maps["gain"] / float(1.0 + white), maps["excess"]
     if step_DN is None:
-        step = np.ascontiguousarray(gamma_step_DN(slope, excess), dtype=np.float32)
+        step = slope * (1.0 + 2.0 * excess) / (1.0 + excess)  # see gamma_step_DN
     else:
-        step = _map("step_DN", step_DN, shape, low=1e-12, unit="DN")
+        step = maps["step"]
         _check_deposits(slope, step, excess)
     noise_kernel = _kernel("kernel_1d", kernel_1d)
     signal_kernel = None if signal_kernel_1d is None else _kernel("signal_kernel_1d", signal_kernel_1d)
     reach = max(len(noise_kernel), 0 if signal_kernel is None else len(signal_kernel)) // 2
-    read = _map("read_noise_DN", read_noise_DN, shape, low=0.0, unit="DN").astype(np.float64) ** 2 / averaged
+    read = maps["read"].clip(max=1e15) ** 2 / averaged
     if quantised:
         # each of the averaged frames was rounded; rounding their mean to 1 / averaged DN gives 1 / averaged^2 of it
         read = read + (1.0 / averaged - 1.0 / averaged**2) / 12.0
     return _Frames(
-        signal=_map("signal_DN", given, shape, low=-1e30, unit="DN"),
-        relative=_map("gain_relative", gain_relative, shape, low=1e-6, unit=""),
-        slope=np.ascontiguousarray(slope / averaged),
-        step=np.ascontiguousarray(step / averaged),
+        signal=maps["signal"],
+        relative=maps["relative"],
+        slope=_single(slope / averaged),
+        step=_single(step / averaged),
         excess=excess,
-        read_variance=np.ascontiguousarray(np.minimum(read, 1e30), dtype=np.float32),
-        dark=_map("dark_DN", dark_DN, shape, low=-1e30, unit="DN"),
+        read_variance=_single(read),
+        dark=maps["dark"],
         white_fraction=white,
         kernel=noise_kernel if reach == 0 and noise_kernel[0] == 1 else _with_reach(noise_kernel, reach),
         signal_kernel=np.zeros(0, np.float32) if signal_kernel is None else _with_reach(signal_kernel, reach),
         reach=reach,
-        electronics=bool(white > 0 or np.any(read > 0)),
+        electronics=bool(white > 0 or (read > 0).any()),
         steps_a_DN=float(averaged) if quantised else 0.0,
         lowest=0.0 if quantised else -math.inf,
         highest=math.inf if bits is None else float(2**bits - 1),
@@ -192,22 +222,22 @@ def _prepare(
     )
 
 
-def _check_deposits(slope: _FloatMap, step: _FloatMap, excess: _FloatMap) -> None:
+def _check_deposits(slope: Any, step: Any, excess: Any) -> None:
     """Deposits of 0 or more have E q^3 E q >= (E q^2)^2: the step is no smaller than the variance per signal."""
-    if not np.any(excess > 0):
+    if not bool((excess > 0).any()):
         return
     ratio = step / slope
-    if not np.all((ratio >= 1.0 - 1e-6) | (excess <= 0)):
+    if not bool(((ratio >= 1.0 - 1e-6) | (excess <= 0)).all()):
         raise InputError(
             "step_DN",
-            received=f"{float(np.min(ratio)):g} of the quantum variance per signal",
+            received=f"{float(ratio.min()):g} of the quantum variance per signal",
             expected="as much or more, for deposits of 0 or more",
             remedy="leave step_DN out for deposits of a gamma distribution, or set deposit_spread to 0",
         )
-    if not float(np.max(ratio**2 * (1.0 + excess))) * 20.0 < LARGEST_INVERTED:
+    if not float((ratio**2 * (1.0 + excess)).max()) * 20.0 < LARGEST_INVERTED:
         raise InputError(
             "deposit_spread and step_DN",
-            received=f"up to {float(np.max(excess)):g}, and {float(np.max(ratio)):g} of the variance per signal",
+            received=f"up to {float(excess.max()):g}, and {float(ratio.max()):g} of the variance per signal",
             expected="(step / variance per signal)^2 (1 + spread) below 30",
         )
 
@@ -269,7 +299,8 @@ def sample_frames(
             `torch_compiled` (the same with the steps joined by torch's compiler, which takes its time once for a shape).
         device: torch's name of the device; None for `cuda` where there is one, else `cpu`.
 
-    Maps broadcast: one number, (row, column), (frame, 1, 1) or (frame, row, column).
+    Maps broadcast: one number, (row, column), (frame, 1, 1) or (frame, row, column). With torch they may be tensors: on a
+    GPU what `project_polychromatic` gives need not leave it.
 
     Raises:
         InputError: NaN, infinite or impossible values, shapes that do not fit, an unknown backend.
@@ -324,6 +355,13 @@ def _sample(
         if stuck is not None:
             places = [result.new_tensor(axis).long() for axis in stuck[0]]
             result[:, places[0], places[1]] = result.new_tensor(stuck[1])
+    elif is_tensor(request.signal):
+        raise InputError(
+            "backend",
+            received="cpu for torch tensors",
+            expected="torch or torch_compiled",
+            remedy="or give numpy arrays",
+        )
     else:
         result = _sample_compiled(request)
         if stuck is not None:

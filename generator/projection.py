@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .kernels import BACKENDS
+from .kernels import BACKENDS, is_tensor
 
 # single precision holds a transmission down to 1e-38; from here on it is 0 within the stated error
 _LONGEST_MM = 1e30
@@ -40,37 +40,37 @@ def _worst(values: NDArray[np.floating]) -> str:
     return f"{float(wrong.flat[0]):g} in {wrong.size} of {values.size} places"
 
 
-def checked_thickness(thickness_mm: ArrayLike, *, allow_negative: bool) -> NDArray[np.float32]:
+def checked_thickness(thickness_mm: ArrayLike, *, allow_negative: bool) -> Any:
     """Thicknesses (material, ...) as float32, finite and, unless allowed otherwise, not negative; mm.
 
     Raises:
         InputError: NaN, infinity, a negative thickness, or no axis of materials.
     """
-    given = np.asarray(thickness_mm)
-    if given.ndim < 1 or given.dtype.kind not in "fiub":
+    given: Any = thickness_mm.detach() if is_tensor(thickness_mm) else np.asarray(thickness_mm)  # type: ignore[union-attr]
+    if given.ndim < 1 or not (is_tensor(given) or given.dtype.kind in "fiub"):
         raise InputError(
             "thickness_mm",
-            received=f"{given.dtype} of shape {given.shape}",
+            received=f"{given.dtype} of shape {tuple(given.shape)}",
             expected="numbers of shape (material, row, column), mm",
         )
-    if given.size:
+    if math.prod(given.shape):
         lowest, highest = float(given.min()), float(given.max())  # NaN in any place makes both NaN
         if not (math.isfinite(lowest) and math.isfinite(highest)):
             raise InputError(
                 "thickness_mm",
-                received=f"{np.count_nonzero(~np.isfinite(given))} NaN or infinite",
+                received=f"{int((~(abs(given) < math.inf)).sum())} NaN or infinite",
                 expected="finite mm",
             )
         if lowest < 0 and not allow_negative:
             raise InputError(
                 "thickness_mm",
-                received=f"{lowest:g} mm in {np.count_nonzero(given < 0)} places",
+                received=f"{lowest:g} mm in {int((given < 0).sum())} places",
                 expected="0 mm or more",
                 remedy="cut at 0, or allow negative thicknesses where they come from noisy measurements",
             )
         if max(-lowest, highest) > _LONGEST_MM:
-            given = np.clip(given, -_LONGEST_MM, _LONGEST_MM)
-    return np.ascontiguousarray(given, dtype=np.float32)
+            given = given.clip(-_LONGEST_MM, _LONGEST_MM)
+    return given.float().contiguous() if is_tensor(given) else np.ascontiguousarray(given, dtype=np.float32)
 
 
 @overload
@@ -114,7 +114,8 @@ def project_polychromatic(
     ends there, and a much thicker object gives 0. Zero thickness gives the sum of the weights, rounded once.
 
     Args:
-        thickness_mm: path lengths (material, row, column), or (material, ...) of any shape behind it, mm.
+        thickness_mm: path lengths (material, row, column), or (material, ...) of any shape behind it, mm; with torch also a
+            tensor, which need not leave its device.
         mu_per_mm: linear attenuation (material, energy), 1/mm.
         weights: (k, energy) or (energy,): what a photon spectrum is worth, for example N m1 for the signal, N m2 for
             the variance and N D for the photons absorbed; 0 or more.
@@ -149,6 +150,13 @@ def project_polychromatic(
             fused=backend == "torch_compiled",
         )
         return (shares * shares.new_tensor(scale)[:, None]).reshape(len(weight), *shape)
+    if is_tensor(thickness):
+        raise InputError(
+            "backend",
+            received="cpu for torch tensors",
+            expected="torch or torch_compiled",
+            remedy="or give numpy arrays",
+        )
     result = np.empty((len(weight), pixels), dtype=np.float32)
     if materials == 0:
         result[:] = scale[:, None]

@@ -17,6 +17,7 @@ from scipy import stats
 
 from raytwin.errors import InputError
 from raytwin.generator.kernels import draw_key, gamma_step_DN, sample_frames, sample_quanta
+from raytwin.generator.projection import project_polychromatic
 from raytwin.generator.psf import noise_autocovariance, noise_kernel_1d, optical_kernel_1d
 
 LEVELS = (0.1, 1.0, 5.0, 19.9, 20.1, 100.0, 1e3, 1e5)
@@ -264,6 +265,27 @@ def test_torch_draws_the_frames_of_the_compiled_loops_but_for_last_bits(backend)
     in_torch = sample_frames(signal, backend=backend, device="cpu", **settings).numpy()
     # where a last bit moves a count by one quantum, the spread takes it to some of its neighbours
     assert np.mean(np.abs(compiled - in_torch) > 2e-3) < 5e-3
+
+
+def test_tensors_stay_where_they_are_from_thickness_to_frames():
+    import torch
+
+    thickness = torch.linspace(0.0, 20.0, 3 * 20 * 30).reshape(1, 3, 20, 30)
+    mu, weights = np.array([[0.1, 0.05]]), np.array([[40.0, 60.0], [70.0, 120.0]])
+    signal, variance = project_polychromatic(thickness, mu, weights, backend="torch", device="cpu")
+    assert isinstance(signal, torch.Tensor)
+    settings = {"key": 3, "read_noise_DN": 1.0, "dark_DN": np.full((20, 30), 10.0), "white_fraction": 0.01}
+    frames = sample_frames(signal, gain_DN=variance / signal, backend="torch", device="cpu", **settings)
+    again = sample_frames(
+        signal.numpy(), gain_DN=(variance / signal).numpy(), backend="torch", device="cpu", **settings
+    )
+    assert torch.equal(frames, again)
+    with pytest.raises(InputError, match="backend: got cpu for torch tensors; expected torch or torch_compiled"):
+        sample_frames(signal, gain_DN=1.0, key=1)
+    with pytest.raises(InputError, match="backend: got cpu for torch tensors"):
+        project_polychromatic(thickness, mu, weights)
+    with pytest.raises(InputError, match="signal_DN: got nan in 1 of 1 places"):
+        sample_frames(torch.full((1, 1), math.nan), gain_DN=1.0, key=1, backend="torch", device="cpu")
 
 
 def test_random_words_are_even_in_every_bit_and_independent_of_their_neighbours():

@@ -503,6 +503,9 @@ def test_dark_drift_reaches_its_strength_at_the_session_s_end_and_longest_exposu
             for time in (0.0, 100.0)
         ]
         np.testing.assert_allclose(ends[1].mean_DN - ends[0].mean_DN, expected, rtol=1e-9)
+    later = applied("dark_drift", 20.0, session_s=100.0, longest_exposure_ms=200.0, warm_up=0.5, calibrated_s=30.0)
+    dark = request("dark", setting=None, frames=1, exposure_ms=200.0, start_s=30.0)
+    np.testing.assert_allclose(expect(series_line, dark, later).mean_DN, expect(series_line, dark).mean_DN, atol=1e-9)
     lit = request(start_s=100.0, frames=1)
     shift = expect(series_line, lit, effect).mean_DN - expect(series_line, lit).mean_DN
     np.testing.assert_allclose(shift, 2.0, rtol=1e-6)

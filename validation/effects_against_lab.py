@@ -158,9 +158,13 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
     effect = EFFECTS[name]
     good = twin.maps.bad_pixels == 0
     cache = ModelCache()
+    requests = [item.request for item in measured]
     stated = {
-        "session_s": max(item.request.start_s for item in measured),
-        "longest_exposure_ms": max(item.request.exposure_ms for item in measured if item.request.kind == "dark"),
+        "session_s": max(item.start_s for item in requests),
+        "longest_exposure_ms": max(item.exposure_ms for item in requests if item.kind == "dark"),
+        "calibrated_s": float(
+            np.mean([item.start_s for item in requests if item.kind == "dark" and not item.after_calibration])
+        ),
         "after_s": 1.0,
     }
     fixed = {item.name: stated[item.name] for item in effect.parameters if item.name in stated}

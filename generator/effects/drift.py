@@ -1,6 +1,7 @@
 """What changes with time: the dark level, and the output of the tube.
 
-dark drift    + s (t_exposure / t_longest) g(time),  g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w)), g(T) = 1
+dark drift    + s (t_exposure / t_longest) (g(time) - g(time of calibration)),
+              g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w)), T the session's length
 output drift  x (1 + e_n), e_n of standard deviation s with correlation exp(-|dt| / tau), the same for all pixels
 """
 
@@ -18,10 +19,12 @@ def _drift_dark(state: LineState, parameters: Mapping[str, float], context: Line
     if parameters["strength"] == 0:
         return state
     session_s, warm_up = parameters["session_s"], parameters["warm_up"]
+    calibrated = math.expm1(-parameters["calibrated_s"] / (warm_up * session_s))
     height = parameters["strength"] * context.request.exposure_ms / parameters["longest_exposure_ms"]
 
     def profile(time_s: FloatArray) -> FloatArray:
-        return np.asarray(np.expm1(-time_s / (warm_up * session_s)) / math.expm1(-1.0 / warm_up))
+        moved = np.expm1(-time_s / (warm_up * session_s)) - calibrated
+        return np.asarray(moved / math.expm1(-1.0 / warm_up))
 
     return replace(state, offsets=(*state.offsets, (height, profile)))
 
@@ -57,6 +60,16 @@ DARK_DRIFT = Effect(
             default=600.0,
             source="length of the session that `strength` refers to",
             log=True,
+            fitted=False,
+        ),
+        Parameter(
+            name="calibrated_s",
+            unit="s",
+            low=0.0,
+            high=1e6,
+            default=0.0,
+            source="time in the session at which the twin's darks were taken: what had drifted by then is in them",
+            log=False,
             fitted=False,
         ),
         Parameter(

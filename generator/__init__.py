@@ -90,6 +90,8 @@ if TYPE_CHECKING:
         SeriesRequest,
         expected_series,
         sample_series,
+        session_conditions,
+        with_conditions,
     )
     from .shipped import (
         shipped_calibration,
@@ -201,6 +203,7 @@ _LAZY = {
     "sample_quanta": "kernels",
     "sample_scene": "describe",
     "sample_series": "series",
+    "session_conditions": "series",
     "shift_image": "registration",
     "shipped_calibration": "shipped",
     "shipped_calibrations": "shipped",
@@ -209,6 +212,7 @@ _LAZY = {
     "spectral_model_of": "predict",
     "tabulate_two_materials": "two_material",
     "transfer_pair": "transfer",
+    "with_conditions": "series",
     "write_twin": "twin_io",
 }
 
@@ -282,6 +286,7 @@ __all__ = [
     "sample_quanta",
     "sample_scene",
     "sample_series",
+    "session_conditions",
     "shift_image",
     "shipped_calibration",
     "shipped_calibrations",
@@ -290,6 +295,7 @@ __all__ = [
     "spectral_model_of",
     "tabulate_two_materials",
     "transfer_pair",
+    "with_conditions",
     "write_twin",
 ]
 

@@ -20,7 +20,7 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
-from .effects import AppliedEffect, Effect, in_order
+from .effects import AppliedEffect, Effect, effect_of, in_order
 from .line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineState
 from .twin import Twin
 
@@ -32,6 +32,8 @@ __all__ = [
     "expected_series",
     "final_state",
     "sample_series",
+    "session_conditions",
+    "with_conditions",
 ]
 
 KINDS = ("dark", "flat", "object", "afterglow")
@@ -103,6 +105,44 @@ class SeriesRequest:
         if self.frame_interval_ms is not None and self.frame_interval_ms > 0:
             return self.frame_interval_ms / 1000.0 / self.exposures_per_frame
         return max(self.exposure_ms + (readout_ms or 0.0), 1e-6) / 1000.0
+
+
+def session_conditions(requests: Sequence[SeriesRequest], *, readout_ms: float | None = None) -> dict[str, float]:
+    """What a session states of the effects' parameters that are not fitted: name -> value, units in the names.
+
+    session_s: from the first exposure to the last. longest_exposure_ms: of the darks, or of all series. calibrated_s: when
+    the darks that calibrate were taken, on average. after_s: length of the exposure before the first `afterglow` series;
+    left out where there is none.
+
+    Args:
+        requests: the series of the session in order of time.
+        readout_ms: of the detector, for series that do not state their frame interval.
+    """
+    if not requests:
+        return {}
+    ends = [item.start_s + item.frames * item.exposures_per_frame * item.interval_s(readout_ms) for item in requests]
+    darks = [item for item in requests if item.kind == "dark"]
+    longest = max(item.exposure_ms for item in darks or requests)
+    found = {"session_s": max(1.0, *ends), "longest_exposure_ms": max(longest, 0.01)}
+    calibrating = [
+        0.5 * (item.start_s + end)
+        for item, end in zip(requests, ends, strict=True)
+        if item.kind == "dark" and not item.after_calibration
+    ]
+    if calibrating:
+        found["calibrated_s"] = max(sum(calibrating) / len(calibrating), 0.0)
+    for number, item in enumerate(requests):
+        if number and item.kind == "afterglow" and requests[number - 1].beam_on:
+            found["after_s"] = max(ends[number - 1] - requests[number - 1].start_s, 1e-3)
+            break
+    return found
+
+
+def with_conditions(effect: AppliedEffect, conditions: Mapping[str, float]) -> AppliedEffect:
+    """The effect with those of `conditions` that are parameters of it, where it does not state them itself."""
+    names = {item.name for item in effect_of(effect).parameters}
+    known = {name: value for name, value in conditions.items() if name in names}
+    return replace(effect, parameters={**known, **effect.parameters})
 
 
 @dataclass(slots=True, kw_only=True)

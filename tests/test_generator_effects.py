@@ -16,7 +16,15 @@ from raytwin.generator.effects.registration import displacement_px
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
+from raytwin.generator.series import (
+    LineMemory,
+    ModelCache,
+    SeriesRequest,
+    expected_series,
+    sample_series,
+    session_conditions,
+    with_conditions,
+)
 from raytwin.generator.spectral_signal import OpenBeam
 
 SHAPE = (40, 40)
@@ -749,6 +757,30 @@ def test_beam_effects_need_a_spectrum(series_line):
     for name in ("kv_error", "filtration_error", "heel"):
         with pytest.raises(InputError, match="twin without spectral part"):
             expect(bare, request(), applied(name))
+
+
+# ------------------------------------------------------------------------------------------------ conditions
+
+
+def test_what_a_session_states_goes_into_the_parameters_that_are_not_fitted():
+    session = [
+        request("dark", setting=None, exposure_ms=100.0, frames=50, start_s=10.0, after_calibration=False),
+        request(frames=50, start_s=20.0, after_calibration=False),
+        request("dark", setting=None, exposure_ms=50.0, frames=50, start_s=30.0, after_calibration=False),
+        request(frames=100, start_s=100.0),
+        request("afterglow", setting=None, frames=50, start_s=102.2),
+    ]
+    found = session_conditions(session)
+    assert found == pytest.approx(
+        {"session_s": 103.3, "longest_exposure_ms": 100.0, "calibrated_s": 20.55, "after_s": 2.2}
+    )
+    drift = with_conditions(AppliedEffect(id="dark_drift", parameters={"strength": 5.0, "session_s": 7.0}), found)
+    assert drift.parameters == pytest.approx(
+        {"strength": 5.0, "session_s": 7.0, "longest_exposure_ms": 100.0, "calibrated_s": 20.55}
+    )
+    assert with_conditions(AppliedEffect(id="heel", parameters={}), found).parameters == {}
+    assert session_conditions([]) == {}
+    assert "after_s" not in session_conditions(session[:4])
 
 
 # ------------------------------------------------------------------------------------------------ texture

@@ -28,7 +28,14 @@ from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.diagnosis.session import read_session
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series
+from raytwin.generator.series import (
+    ExpectedSeries,
+    ModelCache,
+    SeriesRequest,
+    expected_series,
+    session_conditions,
+    with_conditions,
+)
 from raytwin.generator.twin import Estimate, Twin
 from raytwin.lab import EffectRequest, run_protocol
 
@@ -158,16 +165,7 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
     effect = EFFECTS[name]
     good = twin.maps.bad_pixels == 0
     cache = ModelCache()
-    requests = [item.request for item in measured]
-    stated = {
-        "session_s": max(item.start_s for item in requests),
-        "longest_exposure_ms": max(item.exposure_ms for item in requests if item.kind == "dark"),
-        "calibrated_s": float(
-            np.mean([item.start_s for item in requests if item.kind == "dark" and not item.after_calibration])
-        ),
-        "after_s": 1.0,
-    }
-    fixed = {item.name: stated[item.name] for item in effect.parameters if item.name in stated}
+    conditions = session_conditions([item.request for item in measured])
     fitted = [item for item in effect.parameters if item.fitted]
     assert twin.spectral is not None
     names = twin.spectral.names
@@ -179,6 +177,9 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
             for item, value in zip(fitted, values, strict=False)
         }
 
+    def applied(own: Array) -> AppliedEffect:
+        return with_conditions(AppliedEffect(id=name, parameters=inner(own), since=since), conditions)
+
     def misfit(values: Array, *, present: bool) -> Array:
         own = values[: len(fitted)] if present else values[:0]
         rest = values[len(own) :]
@@ -187,7 +188,7 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
             parameters[names.index(nuisance)] += sd * value
         sigma = twin.noise.psf_sigma_px.value * (1.0 + SPREAD_SD * float(rest[-1]))
         changed = replace(twin, noise=replace(twin.noise, psf_sigma_px=Estimate(value=sigma, low=0.0, high=9.0)))
-        effects = (AppliedEffect(id=name, parameters={**fixed, **inner(own)}, since=since),) if present else ()
+        effects = (applied(own),) if present else ()
         parts = [
             residuals(
                 item,

@@ -683,8 +683,15 @@ def _gain_map(
         effective = total.frames - 1.0 if stack else effective_frames(total.frames)
         weight = effective * (slope * typical / variance) ** 2 / 2.0
         own = total.stack_variance_DN2 if stack else total.pair_variance_DN2
-        ratio = (own * item.averaged - read_map) / (slope * np.where(signal > 0, signal, np.nan))
-        numerator += weight * np.where(np.isfinite(ratio), ratio, 1.0)
+        # in place: at full size every array that need not be made counts
+        lit = signal > 0
+        signal *= slope
+        ratio = own * item.averaged
+        ratio -= read_map
+        np.divide(ratio, signal, out=ratio, where=lit)
+        ratio[~lit] = 1.0
+        ratio *= weight
+        numerator += ratio
         weight_sum += weight
     if weight_sum <= 0:
         return np.ones(good.shape), None

@@ -102,11 +102,19 @@ def light_of_many_photons(  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True)
 def light_quanta(cell, rates, factor, light_variance, key, stage, frame, keep, alias, out):  # type: ignore[no-untyped-def]
     """Photons of a rate (cell,) times `factor`, each with its light's spread: mean n, variance n (1 + light_variance)."""
+    second_of = 1.0 + light_variance
     for row in prange(cell.shape[0]):
         state = np.empty(4, dtype=np.uint64)
         seed_stream(state, key, stage, frame, row)
         for column in range(cell.shape[1]):
             mean = rates[cell[row, column]] * factor
+            if mean >= _ONE_BY_ONE:
+                z = fast_normal(state)
+                spread = math.sqrt(mean * second_of)
+                out[row, column] = max(
+                    mean + spread * z + (1.0 + 2.0 * light_variance) * (z * z - 1.0) * (1.0 / 6.0), 0.0
+                )
+                continue
             count = poisson(state, mean, keep, alias) if mean > 0.0 else 0.0
             if count > 0.0 and light_variance > 0.0:
                 count = max(count + math.sqrt(light_variance * count) * fast_normal(state), 0.0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting
 from .bench import Frame
-from .chain import BASE_STAGES, SUBPIXELS, FrameContext, Stage, run_chain, spread_taps
+from .chain import BASE_STAGES, SUBPIXELS, FrameContext, Stage, run_chain
 from .objects import fine_shape
 from .phantoms import Posed
 from .response import Incidence, compute_incidence, tube_load_mAs
@@ -138,14 +138,6 @@ def light_of_arrivals(arrivals: FineRates, context: FrameContext) -> NDArray[np.
     return light
 
 
-def _spread(light: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
-    from ._loops import spread_light
-
-    collected = np.zeros((context.system.rows, context.system.columns), dtype=np.float32)
-    spread_light(light, spread_taps(context.system.psf_sigma_px), SUBPIXELS, collected)
-    return collected
-
-
 def _electrons(light_keV: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
     from ._loops import poisson_tables
     from ._session_loops import electrons_of_much_light
@@ -179,12 +171,13 @@ def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[n
     return level_DN
 
 
+# Photons, spread, electrons, readout, digitise: spread and ADC as in every chain.
 SESSION_STAGES: tuple[Stage, ...] = (
     Stage(name="photons", apply=light_of_arrivals),
-    Stage(name="spread", apply=_spread),
+    BASE_STAGES[1],
     Stage(name="electrons", apply=_electrons),
     Stage(name="readout", apply=_readout),
-    BASE_STAGES[-1],
+    BASE_STAGES[4],
 )
 
 

@@ -148,7 +148,7 @@ def test_strength_0_and_no_effect_give_the_same_bytes(full, tmp_path):
 def test_all_effects_together_still_make_a_session(tmp_path):
     requests = [EffectRequest(id=name, strength=law.low) for name, law in EFFECTS.items()]
     # Scatter takes a second an object: few of them.
-    fewer = ["wedge", "edge", "near"]
+    fewer = ["wedge", "edge", "near", "low_kV"]
     truth = taken(tmp_path / "all.h5", effects=requests, geometry="fine", leave_out=fewer, products=1)
     assert set(truth["effects"]) == set(EFFECTS)
     for name, told in truth["effects"].items():

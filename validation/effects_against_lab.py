@@ -205,36 +205,36 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
         loss="soft_l1",
         diff_step=1e-2,
         bounds=(-6.0, 6.0),
-        max_nfev=12,
+        max_nfev=8,
     )
     low = [math.log(item.low / 4) if item.log else -2 * item.high if item.signed else item.low for item in fitted]
     high = [math.log(item.high * 2) if item.log else 2 * item.high for item in fitted]
     low[0] = low[0] if fitted[0].log or fitted[0].signed else 0.0
     scale = [0.3 if item.log else 0.2 * (item.high - item.low) for item in fitted]
-    best = None
-    directions = (20.0, 110.0, 200.0, 290.0) if any(item.name == "direction_deg" for item in fitted) else (None,)
+    ends = np.array([*low, *[-8.0] * nothing.x.size]), np.array([*high, *[8.0] * nothing.x.size])
+    directions = (20.0, 110.0, 200.0, 290.0) if any(item.name == "direction_deg" for item in fitted) else (0.0,)
+    starts = []
     for direction in directions:
         start = [
             0.5 * (math.log(item.low) + math.log(item.high))
             if item.log
             else direction
-            if item.name == "direction_deg" and direction is not None
+            if item.name == "direction_deg"
             else 0.3 * item.high
             for item in fitted
         ]
-        ends = np.array([*low, *[-8.0] * nothing.x.size]), np.array([*high, *[8.0] * nothing.x.size])
-        found = least_squares(
-            lambda values: misfit(values, present=True),
-            np.clip([*start, *(0.5 * nothing.x)], ends[0] + 1e-6, ends[1] - 1e-6),
-            loss="soft_l1",
-            diff_step=5e-3,
-            bounds=ends,
-            x_scale=[*scale, *[1.0] * nothing.x.size],
-            max_nfev=25,
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-    assert best is not None
+        starts.append(np.clip([*start, *(0.5 * nothing.x)], ends[0] + 1e-6, ends[1] - 1e-6))
+    # a direction is looked for from the quarter that starts best
+    starts.sort(key=lambda values: float(np.sum(np.log1p(misfit(values, present=True) ** 2))))
+    best = least_squares(
+        lambda values: misfit(values, present=True),
+        starts[0],
+        loss="soft_l1",
+        diff_step=5e-3,
+        bounds=ends,
+        x_scale=[*scale, *[1.0] * nothing.x.size],
+        max_nfev=20,
+    )
     return {
         "found": inner(best.x),
         "misfit_without": 2.0 * float(nothing.cost),

@@ -229,6 +229,17 @@ def test_prediction_refuses_what_the_line_cannot_do(twin):
         predict_flatfield(limited, setting(frame_interval_ms=21.0))
 
 
+def test_a_counting_line_is_refused_a_rate_beyond_its_limit(twin):
+    counting = replace(twin.instrument, counting=True)
+    one = setting(filters=filters_from_text("Cu:0.05"))
+    counts = predict_flatfield(replace(twin, instrument=counting), one).photons_absorbed.value
+    rate = counts / 0.02
+    limits = {scale: replace(counting, maximum_counts_per_s=scale * rate) for scale in (0.9, 1.1)}
+    assert predict_flatfield(replace(twin, instrument=limits[1.1]), one).photons_absorbed.value == counts
+    with pytest.raises(InputError, match="counts pile up"):
+        predict_flatfield(replace(twin, instrument=limits[0.9]), one)
+
+
 DUAL = {"interlayer": filters_from_text("Cu:1"), "back_scintillator": filters_from_text("Gd2O2S@7.32:0.3")}
 
 

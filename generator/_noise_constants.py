@@ -37,6 +37,7 @@ COSINE = (
 # At 20 and 1e7 draws the expansion adds 1.3 to a chi-square and shifts mean, variance and skewness by less than 0.15
 # standard errors; it gets better as 1 / mean^3.
 EXPANSION_FROM = 20.0
+MOST_QUANTA = 1e30  # so that extreme settings end in noise, not in NaN
 LARGEST_INVERTED = 600.0  # beyond, exp(-mean) would end
 
 TAPS_TOGETHER = 8

@@ -15,6 +15,7 @@ from ._noise_constants import (
     EXPANSION_FROM,
     LOGARITHM,
     MIX_64,
+    MOST_QUANTA,
     MULTIPLIERS,
     SINE,
     STAGE_ELECTRONICS,
@@ -36,6 +37,7 @@ _L0, _L1, _L2, _L3, _L4, _L5, _L6, _L7, _L8 = (np.float32(value) for value in LO
 _S0, _S1, _S2, _S3, _S4, _S5 = (np.float32(value) for value in SINE)
 _C0, _C1, _C2, _C3, _C4, _C5, _C6 = (np.float32(value) for value in COSINE)
 _FROM = np.float32(EXPANSION_FROM)
+_MOST = np.float32(MOST_QUANTA)
 
 
 @njit  # type: ignore[untyped-decorator]
@@ -311,7 +313,7 @@ def fill_quanta(
             for c in range(wide):
                 mean[c] = level[c] / gains[c]
                 level[c] = max(mean[c], np.float32(0.0))
-                quanta[c] = level[c] * slopes[c] / (steps[c] * steps[c])
+                quanta[c] = min(level[c] * slopes[c] / (steps[c] * steps[c]), _MOST)
             few = np.int32(0)
             for c in range(wide):
                 few = np.int32(few + np.int32(quanta[c] < _FROM))

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ._noise_constants import (
     EXPANSION_FROM,
     MIX_64,
+    MOST_QUANTA,
     MULTIPLIERS,
     STAGE_ELECTRONICS,
     STAGE_FIRST_DEPOSIT,
@@ -267,7 +268,7 @@ def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any, *, fuse
     relative, slope, step = (widened(maps[name]) for name in ("relative", "slope", "step"))
     mean = widened(maps["signal"]) / relative
     level = torch.clamp(mean, min=0.0)
-    quanta = level * slope / (step * step)
+    quanta = torch.clamp(level * slope / (step * step), max=MOST_QUANTA)
     noise = step_of("_draw_many")(row_keys(request.key, frames, STAGE_QUANTA, high), quanta, step, wide)
     few = quanta < EXPANSION_FROM
     if bool(few.any()):

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ._noise_constants import LARGEST_INVERTED, TAPS_TOGETHER
 
 BACKENDS = ("cpu", "torch", "torch_compiled")
+_HIGHEST = 1e15  # DN: products of two of them still fit single precision
 _FloatMap = NDArray[np.float32]
 
 
@@ -76,18 +77,18 @@ def _single(values: Any) -> Any:
     return values.float().contiguous() if is_tensor(values) else np.ascontiguousarray(values, dtype=np.float32)
 
 
-def _map(name: str, values: Any, shape: tuple[int, int, int], *, low: float, unit: str) -> Any:
+def _map(name: str, values: Any, shape: tuple[int, int, int], *, low: float, unit: str, high: float = _HIGHEST) -> Any:
     """`values` as (frame or 1, row or 1, column or 1) float32, finite and at least `low`."""
     given: Any = values.detach() if is_tensor(values) else np.asarray(values)
     if not is_tensor(given) and given.dtype.kind not in "fiub":
         raise InputError(name, received=f"{given.dtype}", expected="numbers")
     count = math.prod(given.shape)
-    if count and not (float(given.min()) >= low and float(given.max()) <= 1e30):  # NaN fails both
-        wrong = given[~((given >= low) & (given <= 1e30))].reshape(-1)
+    if count and not (float(given.min()) >= low and float(given.max()) <= high):  # NaN fails both
+        wrong = given[~((given >= low) & (given <= high))].reshape(-1)
         raise InputError(
             name,
             received=f"{float(wrong[0]):g} in {len(wrong)} of {count} places",
-            expected=f"finite, {low:g} {unit} or more" if low > -1e30 else f"finite {unit}",
+            expected=f"finite, {low:g} to {high:g} {unit}".rstrip(),
         )
     while given.ndim > 3 and given.shape[0] == 1:
         given = given[0]
@@ -172,12 +173,12 @@ def _prepare(
     shape = (count, *given.shape[-2:])
     white = _check_number("white_fraction", white_fraction, low=0.0, high=1e6, unit="of the quantum variance")
     maps = {
-        "signal": _map("signal_DN", given, shape, low=-1e30, unit="DN"),
+        "signal": _map("signal_DN", given, shape, low=-_HIGHEST, unit="DN"),
         "gain": _map("gain_DN", gain_DN, shape, low=1e-12, unit="DN"),
         "excess": _map("deposit_spread", deposit_spread, shape, low=0.0, unit=""),
-        "relative": _map("gain_relative", gain_relative, shape, low=1e-6, unit=""),
+        "relative": _map("gain_relative", gain_relative, shape, low=1e-6, high=1e6, unit=""),
         "read": _map("read_noise_DN", read_noise_DN, shape, low=0.0, unit="DN"),
-        "dark": _map("dark_DN", dark_DN, shape, low=-1e30, unit="DN"),
+        "dark": _map("dark_DN", dark_DN, shape, low=-_HIGHEST, unit="DN"),
     }
     if step_DN is not None:
         maps["step"] = _map("step_DN", step_DN, shape, low=1e-12, unit="DN")
@@ -195,7 +196,7 @@ def _prepare(
     noise_kernel = _kernel("kernel_1d", kernel_1d)
     signal_kernel = None if signal_kernel_1d is None else _kernel("signal_kernel_1d", signal_kernel_1d)
     reach = max(len(noise_kernel), 0 if signal_kernel is None else len(signal_kernel)) // 2
-    read = maps["read"].clip(max=1e15) ** 2 / averaged
+    read = maps["read"] ** 2 / averaged
     if quantised:
         # each of the averaged frames was rounded; rounding their mean to 1 / averaged DN gives 1 / averaged^2 of it
         read = read + (1.0 / averaged - 1.0 / averaged**2) / 12.0

@@ -146,6 +146,24 @@ def test_layers_multiply_and_more_material_lets_less_through(seed, shape, dtype,
         assert np.allclose(single, weights[0, 40] * alone, rtol=TOLERANCE)
 
 
+@given(
+    hnp.arrays(
+        np.float32, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=7), elements=st.floats(width=32)
+    ),
+    hnp.arrays(np.float64, (2, 5), elements=st.floats() | st.sampled_from([0.0, 0.1, 3.0])),
+    hnp.arrays(np.float64, (2, 5), elements=st.floats() | st.sampled_from([0.0, 1.0, 1e4])),
+    st.booleans(),
+)
+def test_whatever_numbers_come_the_answer_is_a_projection_or_an_error_in_lab_words(thickness, mu, weights, negative):
+    try:
+        result = project_polychromatic(thickness, mu[: len(thickness)], weights, allow_negative=negative)
+    except InputError as error:
+        assert "expected" in str(error)
+        return
+    assert result.shape == (2, *thickness.shape[1:])
+    assert np.all(result >= 0)
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3000))
 def test_a_pixel_does_not_depend_on_its_neighbours(seed, pixels):
     rng = np.random.default_rng(seed)

@@ -6,6 +6,7 @@ from numba import njit
 from scipy import stats
 
 from raytwin.lab._loops import gamma, normal, poisson, poisson_tables, seed_stream, uniform
+from raytwin.lab._session_loops import fast_normal, light_quanta
 
 DRAWS = 200_000
 # A test statistic this improbable is a fault, not bad luck; seeds are fixed, so a pass stays a pass.
@@ -82,3 +83,38 @@ def test_the_tables_hold_the_poisson_law_to_single_precision():
         law = share.copy()
         np.add.at(law, alias[row], 1.0 - share)
         assert np.abs(law / 256 - stats.poisson.pmf(np.arange(256), mean)).max() < 1e-7
+
+
+@njit
+def _draw_fast(count, key):
+    state = np.empty(4, dtype=np.uint64)
+    seed_stream(state, key, 1, 0, 0)
+    out = np.empty(count)
+    for i in range(count):
+        out[i] = fast_normal(state)
+    return out
+
+
+def test_normal_numbers_of_the_ziggurat_follow_their_law_into_the_tails():
+    drawn = _draw_fast(2_000_000, np.uint64(3))
+    assert stats.kstest(drawn[:DRAWS], stats.norm.cdf).pvalue > P_FLOOR
+    edges = np.array([-np.inf, -4.0, -3.65, -3.0, -1.0, 0.0, 1.0, 3.0, 3.65, 4.0, np.inf])
+    observed = np.histogram(drawn, bins=edges)[0]
+    expected = drawn.size * np.diff(stats.norm.cdf(edges))
+    assert stats.chi2.sf(((observed - expected) ** 2 / expected).sum(), expected.size - 1) > P_FLOOR
+
+
+@pytest.mark.parametrize("mean", [0.4, 7.9, 8.1, 60.0])
+def test_light_of_a_number_of_photons_has_mean_variance_and_skewness_of_the_compound_law(mean):
+    variance = 0.1
+    cell, out = np.zeros((400, 500), dtype=np.int32), np.empty((400, 500), dtype=np.float32)
+    light_quanta(cell, np.array([mean], dtype=np.float32), 1.0, variance, np.uint64(8), 20, 0, *poisson_tables(), out)
+    light = out.ravel().astype(float)
+    spread = mean * (1.0 + variance)
+    assert abs(light.mean() - mean) < 5 * np.sqrt(spread / light.size)
+    kurtosis = 3.0 + 1.5 / mean
+    assert abs(light.var() / spread - 1) < 5 * np.sqrt((kurtosis - 1) / light.size)
+    # Below eight photons the light's own spread is normal, above the skewness is that of a gamma law of the light.
+    third = 1.0 + 3.0 * variance if mean < 8 else (1.0 + variance) * (1.0 + 2.0 * variance)
+    expected = third * mean / spread**1.5
+    assert stats.skew(light) == pytest.approx(expected, abs=5 * np.sqrt(6 * kurtosis / light.size) + 0.01 * expected)

@@ -193,7 +193,7 @@ def covariance(frames, row, column):
 
 
 @pytest.mark.parametrize("averaged", [1, 4])
-@pytest.mark.parametrize(("kV", "share"), [(40.0, 1.0), (90.0, 1.0), (90.0, 0.004)])
+@pytest.mark.parametrize(("kV", "share"), [(40.0, 1.0), (90.0, 1.0), (90.0, 0.03), (90.0, 0.004)])
 def test_bright_and_dim_flats_have_the_moments_of_the_closed_form(kV, share, averaged):
     geometry = GEOMETRIES["coarse"]
     quiet = {"gain_spread_percent": 0.0, "dark_spread_DN": 0.0, "dead_pixels": 0, "hot_pixels": 0}

@@ -309,7 +309,8 @@ class PairTransfer:
 
     def _tables_for(self, references: tuple[Setting, Setting], highest_log: float) -> TwoMaterialTables:
         beams = tuple(OpenBeam(kV=one.kV, filters=one.filters) for one in (*references, *self.targets))
-        top = 2.0 ** math.ceil(math.log2(max(highest_log, 1.0)) + 0.25)
+        # no detector of 16 bits shows more than ln 65535 = 11; beyond a table its functions go on straight
+        top = min(2.0 ** math.ceil(math.log2(max(highest_log, 1.0)) + 0.25), 12.0)
         key = (beams[0], beams[1], top)
         if key not in self._tables:
             model = spectral_model_of(self.twin, highest_kV=max(beam.kV for beam in beams))

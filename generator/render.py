@@ -284,7 +284,7 @@ def _blurred_pixel_means(fine: NDArray[np.float32], sigma: float, supersampling:
         if kernel is not None:
             image = correlate1d(image, kernel, axis=axis, mode="nearest")
         parts = [image[(slice(None),) * axis + (slice(k, None, supersampling),)] for k in range(supersampling)]
-        image = np.sum(parts, axis=0, dtype=np.float32) / np.float32(supersampling)
+        image = np.asarray(np.sum(parts, axis=0, dtype=np.float32) / np.float32(supersampling))
     return image.astype(np.float64)
 
 

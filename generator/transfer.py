@@ -24,6 +24,10 @@ Array = NDArray[np.float64]
 
 _SMOOTHING_PX = 2.5  # the solution is linear about the image smoothed by this
 _DETAIL_SD = 5.0  # detail that stands out of the noise by more is part of what the solution is linear about
+_BRIGHTEST_LOG = (
+    -2.0
+)  # nothing is brighter than seven open fields: where no material fits, lengths may be far below zero
+_DARKEST_LOG = 80.0
 _REFUSED_EXCESS = 0.03  # of the noise's variance, mean over the product
 _TELL_EXCESS = 0.003
 
@@ -113,7 +117,8 @@ def transfer_pair(
     logs = np.asarray(log_images, dtype=np.float64)
     solution = solve_two_materials(tables, _quiet_image(logs, references, detector))
     mixing = solution.transfer()[2:]
-    own, at_target = solution.log_signal[:2], solution.log_signal[2:]
+    own = solution.log_signal[:2]
+    at_target = np.clip(solution.log_signal[2:], _BRIGHTEST_LOG, _DARKEST_LOG)
     read_DN2 = np.asarray(detector.read_variance_DN2, dtype=np.float64)
     relative = np.asarray(detector.gain_relative, dtype=np.float64)
 
@@ -136,7 +141,7 @@ def transfer_pair(
     inside = np.ones(logs.shape[1:], dtype=bool) if product is None or not product.any() else product
     excess, strongest = _excess(held, held_read, root**2 * relative, targets, detector, inside)
     return TransferredPair(
-        transmission=np.exp(unbiased - logs_target),
+        transmission=np.exp(-np.clip(logs_target - unbiased, _BRIGHTEST_LOG, _DARKEST_LOG)),
         gain_DN=gain_target,
         held=held,
         held_third=third,

@@ -5,6 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from raytwin.acquisition import Setting, read_dataset
@@ -93,7 +96,7 @@ def test_frames_at_another_setting_have_its_mean_variance_covariance_and_indepen
     targets = TARGETS[name]
     transfer = PairTransfer(twin, low=targets[0], high=targets[1])
     rng = np.random.default_rng(5)
-    frames, thickness_mm = 160, slab()
+    frames, thickness_mm = 100, slab()
     counts = np.empty((frames, 2, *SHAPE))
     for number in range(frames):
         pair, warnings = transfer.transfer(reference_pair(twin, thickness_mm, rng), REFERENCE)
@@ -145,7 +148,7 @@ def test_the_transferred_skewness_is_the_target_s(twin):
     transmission, gain = (value.mean() for value in behind(twin, targets[0], thickness_mm))
     signal = transmission * predict_flatfield(twin, targets[0]).mean_DN.value
     values = []
-    for _ in range(300):
+    for _ in range(150):
         pair, _ = transfer.transfer(reference_pair(twin, thickness_mm, rng), REFERENCE)
         # the mean over the frame carries the sum of all that the spread correlates: quanta, skewed as before the spread
         values.append(transfer.draw(pair, rng)[0][4:-4, 4:-4].reshape(-1))
@@ -374,3 +377,34 @@ def test_the_flat_at_an_unmeasured_kV_has_the_shape_of_the_nearest_one(twin):
     leaning = replace(twin, levels=(twin.levels[0], replace(twin.levels[1], flat_shape=shape)))
     model = ChannelModel(leaning, TARGETS["other kV"][1], "chicken_breast")
     np.testing.assert_allclose(model.open_signal_DN / np.median(model.open_signal_DN), shape, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def transfers(twin):
+    return {name: PairTransfer(twin, low=low, high=high) for name, (low, high) in TARGETS.items()}
+
+
+@hypothesis_settings(max_examples=12)
+@example(seed=0, low=11.0, high=9.0, scatter=0.5, name="other kV")
+@given(
+    seed=st.integers(0, 1000),
+    low=st.floats(-2.0, 3.0),
+    high=st.floats(-2.0, 3.0),
+    scatter=st.floats(0.0, 2.0),
+    name=st.sampled_from(sorted(TARGETS)),
+)
+def test_whatever_the_reference_holds_counts_are_finite_or_the_reason_is_said(
+    transfers, seed, low, high, scatter, name
+):
+    rng = np.random.default_rng(seed)
+    logs = np.array([low, high])[:, None, None] + scatter * rng.standard_normal((2, *SHAPE))
+    transfer = transfers[name]
+    try:
+        pair, _ = transfer.transfer(logs, REFERENCE)
+    except InputError as error:
+        assert "target setting" in str(error)
+        return
+    counts = transfer.draw(pair, rng)
+    assert np.isfinite(counts).all()
+    assert counts.min() >= 0
+    assert counts.max() <= 65535

@@ -44,8 +44,12 @@ class FrameSums:
         """Variance over the stack, ddof = 1 (row, column), DN^2; NaN for a single frame."""
         if self.frames < 2:
             return np.full(self.reference.shape, np.nan)
-        spread = self.square_sum - self.deviation_sum**2 / self.frames
-        return np.asarray(np.clip(spread, 0.0, None) / (self.frames - 1))
+        spread = self.deviation_sum * self.deviation_sum
+        spread *= -1.0 / self.frames
+        spread += self.square_sum
+        np.maximum(spread, 0.0, out=spread)
+        spread /= self.frames - 1
+        return spread
 
     @property
     def pair_variance_DN2(self) -> NDArray[np.float64]:

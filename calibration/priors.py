@@ -59,7 +59,11 @@ PRIORS: dict[str, Prior] = {
         reason="hardness beyond the models' own difference: 1.4 % from 30 to 60 keV",
     ),
     "escape_scale": Prior(
-        centre=0.0, sd=0.1, reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %"
+        centre=0.0,
+        sd=0.1,
+        low=-1.0,
+        high=0.5,
+        reason="K photons that leave the scintillator: yields to 3 %, columns and covers to 10 %",
     ),
     "scintillator_table": Prior(
         centre=0.67,

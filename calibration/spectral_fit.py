@@ -476,10 +476,12 @@ class _Posterior:
             normal = rng.standard_normal(z.shape)
             z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
         full[:, self.linear] += self.linear_sd(u) * z
+        escape = list(self.model.names).index("escape_scale")
+        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
+        full[:, escape] = np.clip(full[:, escape], bounds[0][escape], bounds[1][escape])
         # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
         names = list(self.model.names)
         swank, gain, output = (names.index(name) for name in ("log_swank", "log_DN_per_keV", "log_output"))
-        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
         beyond = full[:, swank] - np.clip(full[:, swank], bounds[0][swank], bounds[1][swank])
         full[:, swank] -= beyond
         full[:, gain] -= beyond

@@ -284,7 +284,7 @@ class PairTransfer:
         check_geometry(references, self.targets)
         pair = transfer_pair(
             log_images,
-            self._tables_for(references, float(np.max(log_images[0]))),
+            self._tables_for(references, _highest_log(log_images[0])),
             references=[self._reference(one) for one in references],
             targets=self._good,
             detector=self._detector,
@@ -583,6 +583,14 @@ def generate_dataset(
         warnings=tuple(warnings),
         transferred=drawn.transfers,
     )
+
+
+def _highest_log(image: NDArray[np.floating]) -> float:
+    """Largest value of a log image (row, column) that is more than a noisy pixel: of its means over 3 x 3 pixels."""
+    from scipy.ndimage import uniform_filter
+
+    highest = float(uniform_filter(np.asarray(image, dtype=np.float64), 3).max())
+    return highest if math.isfinite(highest) else 1.0
 
 
 def _registered(

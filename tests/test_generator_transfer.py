@@ -390,7 +390,7 @@ def transfers(twin):
     seed=st.integers(0, 1000),
     low=st.floats(-2.0, 3.0),
     high=st.floats(-2.0, 3.0),
-    scatter=st.floats(0.0, 2.0),
+    scatter=st.floats(0.0, 1.0),
     name=st.sampled_from(sorted(TARGETS)),
 )
 def test_whatever_the_reference_holds_counts_are_finite_or_the_reason_is_said(

@@ -141,7 +141,8 @@ class ChannelModel:
             )
         bits = self.twin.instrument.bits
         if bits is not None:
-            brightest = self.open_signal_DN + 4.0 * np.sqrt(self.gain_DN * self.open_signal_DN) + self.dark_DN
+            noise_DN = np.sqrt(self.gain_DN * np.maximum(self.open_signal_DN, 0.0))
+            brightest = self.open_signal_DN + 4.0 * noise_DN + self.dark_DN
             cut = 100.0 * float(np.mean(brightest > 2.0**bits - 1))
             if cut > 1.0:
                 found.append(f"{self.target} drives {cut:.2g} % of the pixels in the open field to the end of the ADC")

@@ -222,11 +222,12 @@ def check_transfer(
     worst = max(pair.excess)
     if worst > _REFUSED_EXCESS:
         raise InputError(
-            "target setting",
-            received=f"{targets[0]};{targets[1]} from {name}, whose noise, carried over, is {pair.strongest:.2g} times the"
-            " target's in its strongest direction",
+            f"target setting {targets[0]};{targets[1]}",
+            received=f"{name}, whose noise, carried over, is {pair.strongest:.2g} times the target's in its strongest"
+            " direction",
             expected=f"a target of at most {1 / pair.strongest:.2g} times this exposure",
-            remedy=f"use references longer than {references[0].exposure_ms * references[0].averaged:g} ms, or average them",
+            remedy=f"the reference is too noisy for it: use references longer than"
+            f" {references[0].exposure_ms * references[0].averaged:g} ms",
         )
     if worst > _TELL_EXCESS:
         return (

@@ -108,13 +108,18 @@ def _fill_normals(key: Any, frame: Any, stage: Any, row: Any, words: Any, normal
 @njit  # type: ignore[untyped-decorator]
 def _row_of(values: Any, row: Any, out: Any, reach: Any) -> None:
     """A row of a map (rows or 1, columns or 1) repeated at both ends by `reach`."""
-    one = values[row if values.shape[0] > 1 else 0]
-    if len(one) == 1:
-        out[:] = one[0]
+    from_row = row if values.shape[0] > 1 else 0
+    size = values.shape[1]
+    if size == 1:
+        for c in range(len(out)):
+            out[c] = values[from_row, 0]
         return
-    out[:reach] = one[0]
-    out[reach : reach + len(one)] = one
-    out[reach + len(one) :] = one[-1]
+    for c in range(reach):
+        out[c] = values[from_row, 0]
+    for c in range(size):
+        out[reach + c] = values[from_row, c]
+    for c in range(reach + size, len(out)):
+        out[c] = values[from_row, size - 1]
 
 
 @njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
@@ -129,7 +134,8 @@ def _add_taps(k: Any, r_0: Any, r_1: Any, r_2: Any, r_3: Any, r_4: Any, r_5: Any
 @njit  # type: ignore[untyped-decorator]
 def _convolve(wide: Any, kernel: Any, out: Any) -> None:
     """out[c] = sum_j kernel[j] wide[c + j]; the kernel's length a multiple of TAPS_TOGETHER, zeros at its end."""
-    out[:] = 0.0
+    for c in range(len(out)):
+        out[c] = 0.0
     for j in range(0, len(kernel), TAPS_TOGETHER):
         p = wide[j:]
         _add_taps(kernel[j : j + TAPS_TOGETHER], p, p[1:], p[2:], p[3:], p[4:], p[5:], p[6:], p[7:], out)
@@ -139,7 +145,8 @@ def _convolve(wide: Any, kernel: Any, out: Any) -> None:
 def _convolve_down(rows: Any, first: Any, kernel: Any, out: Any) -> None:
     """out[c] = sum_j kernel[j] rows[first + j, c]; rows beyond the last stand for zeros of the kernel."""
     end = len(rows) - 1
-    out[:] = 0.0
+    for c in range(len(out)):
+        out[c] = 0.0
     for j in range(0, len(kernel), TAPS_TOGETHER):
         at = first + j
         _add_taps(
@@ -269,7 +276,66 @@ def _draw_many(quanta: Any, step: Any, noise: Any) -> None:
         noise[c] = step[c] * (np.floor(rest + away) - rest)
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+def _quanta_band(
+    band: Any,
+    key: Any,
+    frame: Any,
+    signal: Any,
+    relative: Any,
+    slope: Any,
+    step: Any,
+    excess: Any,
+    kernel: Any,
+    signal_kernel: Any,
+    reach: Any,
+    noise_out: Any,
+    signal_out: Any,
+) -> None:
+    rows, columns = signal.shape
+    total = len(noise_out)
+    wide = columns + 2 * reach
+    words = np.empty(wide + 1, np.uint32)
+    level = np.empty(wide, np.float32)
+    gains = np.empty(wide, np.float32)
+    slopes = np.empty(wide, np.float32)
+    steps = np.empty(wide, np.float32)
+    excesses = np.empty(wide, np.float32)
+    quanta = np.empty(wide, np.float32)
+    # the kernel is padded to a multiple of taps; zeros stand beyond the row
+    noise = np.zeros(wide + TAPS_TOGETHER, np.float32)
+    mean = np.zeros(wide + TAPS_TOGETHER, np.float32)
+    for i in range(band * _BAND, min(band * _BAND + _BAND, total)):
+        row = min(max(i - reach, 0), rows - 1)
+        _row_of(signal, row, level, reach)
+        _row_of(relative, row, gains, reach)
+        _row_of(slope, row, slopes, reach)
+        _row_of(step, row, steps, reach)
+        # short loops: the compiler tells at most eight pairs of buffers apart before it gives up vectors
+        for c in range(wide):
+            mean[c] = level[c] / gains[c]
+        for c in range(wide):
+            level[c] = max(mean[c], np.float32(0.0))
+        for c in range(wide):
+            quanta[c] = min(level[c] * slopes[c] / (steps[c] * steps[c]), _MOST)
+        few = np.int32(0)
+        for c in range(wide):
+            few = np.int32(few + np.int32(quanta[c] < _FROM))
+        _fill_normals(key, frame, STAGE_QUANTA, i, words, noise[: wide + wide % 2])
+        _draw_many(quanta, steps, noise[:wide])
+        if few > 0:
+            _row_of(excess, row, excesses, reach)
+            _draw_few(key, frame, i, quanta, level, slopes, steps, excesses, words, noise[:wide])
+        if len(kernel) > 1:
+            _convolve(noise, kernel, noise_out[i])
+        else:
+            for c in range(columns):
+                noise_out[i, c] = noise[c]
+        if len(signal_kernel) > 0:
+            _convolve(mean, signal_kernel, signal_out[i])
+
+
+@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
 def fill_quanta(
     key: Any,
     frame: Any,
@@ -289,50 +355,88 @@ def fill_quanta(
     With a signal_kernel also the signal over the relative gain, spread along the rows: signal_out of the same shape. Maps
     are (rows or 1, columns or 1); outside the image the edge's values stand.
     """
-    rows, columns = signal.shape
-    total = len(noise_out)
-    wide = columns + 2 * reach
-    for band in prange((total + _BAND - 1) // _BAND):
-        words = np.empty(wide + 1, np.uint32)
-        level = np.empty(wide, np.float32)
-        gains = np.empty(wide, np.float32)
-        slopes = np.empty(wide, np.float32)
-        steps = np.empty(wide, np.float32)
-        excesses = np.empty(wide, np.float32)
-        quanta = np.empty(wide, np.float32)
-        sums = np.empty(columns, np.float32)
-        # the kernel is padded to a multiple of taps; zeros stand beyond the row
-        noise = np.zeros(wide + TAPS_TOGETHER, np.float32)
-        mean = np.zeros(wide + TAPS_TOGETHER, np.float32)
-        for i in range(band * _BAND, min(band * _BAND + _BAND, total)):
-            row = min(max(i - reach, 0), rows - 1)
-            _row_of(signal, row, level, reach)
-            _row_of(relative, row, gains, reach)
-            _row_of(slope, row, slopes, reach)
-            _row_of(step, row, steps, reach)
-            for c in range(wide):
-                mean[c] = level[c] / gains[c]
-                level[c] = max(mean[c], np.float32(0.0))
-                quanta[c] = min(level[c] * slopes[c] / (steps[c] * steps[c]), _MOST)
-            few = np.int32(0)
-            for c in range(wide):
-                few = np.int32(few + np.int32(quanta[c] < _FROM))
-            _fill_normals(key, frame, STAGE_QUANTA, i, words, noise[: wide + wide % 2])
-            _draw_many(quanta, steps, noise[:wide])
-            if few > 0:
-                _row_of(excess, row, excesses, reach)
-                _draw_few(key, frame, i, quanta, level, slopes, steps, excesses, words, noise[:wide])
-            if len(kernel) > 1:
-                _convolve(noise, kernel, sums)
-                noise_out[i] = sums
-            else:
-                noise_out[i] = noise[:columns]
-            if len(signal_kernel) > 0:
-                _convolve(mean, signal_kernel, sums)
-                signal_out[i] = sums
+    for band in prange((len(noise_out) + _BAND - 1) // _BAND):
+        _quanta_band(
+            band,
+            key,
+            frame,
+            signal,
+            relative,
+            slope,
+            step,
+            excess,
+            kernel,
+            signal_kernel,
+            reach,
+            noise_out,
+            signal_out,
+        )
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+def _frame_band(
+    band: Any,
+    key: Any,
+    frame: Any,
+    signal: Any,
+    relative: Any,
+    slope: Any,
+    white_fraction: Any,
+    read_variance: Any,
+    dark: Any,
+    kernel: Any,
+    signal_kernel: Any,
+    noise_rows: Any,
+    signal_rows: Any,
+    electronics: Any,
+    signal_share: Any,
+    steps_a_DN: Any,
+    lowest: Any,
+    highest: Any,
+    out: Any,
+) -> None:
+    rows, columns = out.shape
+    words = np.empty(columns + 1, np.uint32)
+    normals = np.zeros(columns + 1, np.float32)
+    noise = np.empty(columns, np.float32)
+    mean = np.empty(columns, np.float32)
+    gains = np.empty(columns, np.float32)
+    slopes = np.empty(columns, np.float32)
+    reads = np.empty(columns, np.float32)
+    darks = np.empty(columns, np.float32)
+    for row in range(band * _BAND, min(band * _BAND + _BAND, rows)):
+        _row_of(relative, row, gains, 0)
+        _row_of(slope, row, slopes, 0)
+        _row_of(read_variance, row, reads, 0)
+        _row_of(dark, row, darks, 0)
+        if len(kernel) > 1:
+            _convolve_down(noise_rows, row, kernel, noise)
+        else:
+            for c in range(columns):
+                noise[c] = noise_rows[row, c]
+        if len(signal_kernel) > 0:
+            _convolve_down(signal_rows, row, signal_kernel, mean)
+            for c in range(columns):
+                mean[c] *= gains[c]
+        else:
+            _row_of(signal, row, mean, 0)
+        if electronics:
+            _fill_normals(key, frame, STAGE_ELECTRONICS, row, words, normals[: columns + columns % 2])
+        one = out[row]
+        for c in range(columns):
+            white = white_fraction * slopes[c] * gains[c] * max(mean[c], np.float32(0.0)) + reads[c]
+            normals[c] *= np.sqrt(white)
+        for c in range(columns):
+            one[c] = (signal_share * mean[c] + noise[c] * gains[c]) + (normals[c] + darks[c])
+        if steps_a_DN > 0:
+            step = np.float32(1.0) / steps_a_DN
+            for c in range(columns):
+                one[c] = np.rint(one[c] * steps_a_DN) * step
+        for c in range(columns):
+            one[c] = min(max(one[c], lowest), highest)
+
+
+@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
 def fill_frame(
     key: Any,
     frame: Any,
@@ -357,40 +461,25 @@ def fill_frame(
 
     steps_a_DN 0 leaves the result unrounded; noise_rows and signal_rows come from fill_quanta.
     """
-    rows, columns = out.shape
-    for band in prange((rows + _BAND - 1) // _BAND):
-        words = np.empty(columns + 1, np.uint32)
-        normals = np.zeros(columns + 1, np.float32)
-        noise = np.empty(columns, np.float32)
-        mean = np.empty(columns, np.float32)
-        gains = np.empty(columns, np.float32)
-        slopes = np.empty(columns, np.float32)
-        reads = np.empty(columns, np.float32)
-        darks = np.empty(columns, np.float32)
-        for row in range(band * _BAND, min(band * _BAND + _BAND, rows)):
-            _row_of(relative, row, gains, 0)
-            _row_of(slope, row, slopes, 0)
-            _row_of(read_variance, row, reads, 0)
-            _row_of(dark, row, darks, 0)
-            if len(kernel) > 1:
-                _convolve_down(noise_rows, row, kernel, noise)
-            else:
-                noise[:] = noise_rows[row]
-            if len(signal_kernel) > 0:
-                _convolve_down(signal_rows, row, signal_kernel, mean)
-                for c in range(columns):
-                    mean[c] *= gains[c]
-            else:
-                _row_of(signal, row, mean, 0)
-            if electronics:
-                _fill_normals(key, frame, STAGE_ELECTRONICS, row, words, normals[: columns + columns % 2])
-            one = out[row]
-            for c in range(columns):
-                white = white_fraction * slopes[c] * gains[c] * max(mean[c], np.float32(0.0)) + reads[c]
-                one[c] = (signal_share * mean[c] + noise[c] * gains[c]) + (np.sqrt(white) * normals[c] + darks[c])
-            if steps_a_DN > 0:
-                step = np.float32(1.0) / steps_a_DN
-                for c in range(columns):
-                    one[c] = np.rint(one[c] * steps_a_DN) * step
-            for c in range(columns):
-                one[c] = min(max(one[c], lowest), highest)
+    for band in prange((len(out) + _BAND - 1) // _BAND):
+        _frame_band(
+            band,
+            key,
+            frame,
+            signal,
+            relative,
+            slope,
+            white_fraction,
+            read_variance,
+            dark,
+            kernel,
+            signal_kernel,
+            noise_rows,
+            signal_rows,
+            electronics,
+            signal_share,
+            steps_a_DN,
+            lowest,
+            highest,
+            out,
+        )

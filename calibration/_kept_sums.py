@@ -38,7 +38,9 @@ class KeptSums:
 
     def _read(self, name: str) -> NDArray[np.float64]:
         kept = self._maps[name]
-        return np.asarray(np.load(kept, allow_pickle=False) if isinstance(kept, Path) else kept, dtype=np.float64)
+        if isinstance(kept, Path):
+            kept = np.load(kept, mmap_mode="r", allow_pickle=False)
+        return np.asarray(kept, dtype=np.float64)
 
     @property
     def mean_DN(self) -> NDArray[np.float64]:

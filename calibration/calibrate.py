@@ -85,6 +85,12 @@ def calibrate_twin(
             warnings.append(f"no spectral part: {error}")
         else:
             spectral = fit.posterior
+            if spectral.correction is not None:
+                voltages_kV = ", ".join(f"{kV:g}" for kV in spectral.correction.kV)
+                warnings.append(
+                    f"spectra were measured at {voltages_kV} kV; at other voltages the tube model is corrected as between or"
+                    " nearest to these"
+                )
             evidence["spectrum"] = {
                 "chi_square": fit.chi_square,
                 "data": fit.data,

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         generate_from_description,
     )
     from .kernels import (
+        deposit_spread_from_photons,
         draw_key,
         gamma_step_DN,
         sample_frames,
@@ -172,6 +173,7 @@ _LAZY = {
     "apply_top_up": "topup",
     "blur_variance_share": "psf",
     "compute_contrast_map": "contrast",
+    "deposit_spread_from_photons": "kernels",
     "digitise": "noise",
     "draw_key": "kernels",
     "estimate_from_sd": "twin",
@@ -255,6 +257,7 @@ __all__ = [
     "apply_top_up",
     "blur_variance_share",
     "compute_contrast_map",
+    "deposit_spread_from_photons",
     "digitise",
     "draw_key",
     "estimate_from_sd",

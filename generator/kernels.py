@@ -34,6 +34,22 @@ def gamma_step_DN(gain_DN: ArrayLike, deposit_spread: ArrayLike) -> NDArray[np.f
     return np.asarray(np.asarray(gain_DN, dtype=np.float64) * (1.0 + 2.0 * spread) / (1.0 + spread))
 
 
+def deposit_spread_from_photons(
+    photons: ArrayLike, *, signal_DN: ArrayLike, gain_DN: ArrayLike, white_fraction: float = 0.0
+) -> NDArray[np.float64]:
+    """Squared coefficient of variation of what a photon deposits, for `sample_frames`; no unit.
+
+    photons x gain / (1 + white_fraction) / signal - 1, never below 0; 0 where there is no signal.
+
+    Args:
+        photons: absorbed in the pixel, mean.
+        signal_DN, gain_DN, white_fraction: of the same pixel, as in `sample_frames`; shapes broadcast.
+    """
+    number, signal, gain = (np.asarray(one, dtype=np.float64) for one in (photons, signal_DN, gain_DN))
+    second = number * gain / (1.0 + white_fraction) / np.where(signal > 0, signal, np.inf)
+    return np.asarray(np.clip(second - 1.0, 0.0, None))
+
+
 @dataclass(frozen=True, slots=True)
 class _Frames:
     """What both ways of computing take: checked maps (frame or 1, row or 1, column or 1), float32, and numbers.

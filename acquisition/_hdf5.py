@@ -12,7 +12,6 @@ import numpy as np
 
 from ..errors import FileFormatError, InputError
 
-
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
 

@@ -56,7 +56,7 @@ def main() -> None:
             f" | {peer[0] / own[0]:5.0f} {peer[1] / own[1]:5.0f} | {apart:.1e}"
         )
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors, medians of {turns} turns (numpy: 2)")
-    print("gVirtualXRay takes 2.5 s on a processor for the like by its own account, its mesh tracing included")
+    print("gVirtualXRay is quoted at 2.5 s on a processor for the like, its mesh tracing included; not measured here")
 
 
 if __name__ == "__main__":

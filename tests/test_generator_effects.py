@@ -451,7 +451,7 @@ def test_what_is_released_in_a_pause_is_found_in_the_next_frame_as_far_as_the_pa
     decay = math.exp(-0.022 / 0.2)
     np.testing.assert_allclose(first, left * (1 - decay) + share * (held - left), rtol=1e-9)
     np.testing.assert_allclose(second, left * decay * (1 - decay), rtol=1e-9)
-    memory = LineMemory(trapped_DN=np.stack([held] * 3) / 3, time_s=400 * 0.022)
+    memory = LineMemory(trapped_DN=np.stack([held] * 4) / 4, time_s=400 * 0.022)
     sampled = next(sample_series(series_line, after, rng=np.random.default_rng(0), effects=effect, memory=memory))
     assert (sampled - 1200.0).mean() == pytest.approx(first.mean(), abs=4 * 12 / 40)
 

@@ -345,7 +345,7 @@ def test_memory_is_handed_from_series_to_series(series_line):
     exposed = request(frames=60)
     list(sample_series(series_line, exposed, rng=rng, effects=lag, memory=memory))
     assert memory.time_s == pytest.approx(60 * 0.022)
-    assert memory.trapped_DN.shape == (3, *SHAPE)
+    assert memory.trapped_DN.shape == (4, *SHAPE)
     after = request("afterglow", setting=None, frames=20, start_s=60 * 0.022, previous=(exposed,))
     seen = np.stack(list(sample_series(series_line, after, rng=rng, effects=lag, memory=memory)))
     expected = expected_series(series_line, after, effects=lag)

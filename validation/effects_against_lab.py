@@ -208,7 +208,8 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
         max_nfev=8,
     )
     low = [math.log(item.low / 4) if item.log else -2 * item.high if item.signed else item.low for item in fitted]
-    high = [math.log(item.high * 2) if item.log else 2 * item.high for item in fitted]
+    high = [math.log(item.high * 2) if item.log else item.high for item in fitted]
+    high[0] = high[0] if fitted[0].log else 2 * fitted[0].high
     low[0] = low[0] if fitted[0].log or fitted[0].signed else 0.0
     scale = [0.3 if item.log else 0.2 * (item.high - item.low) for item in fitted]
     ends = np.array([*low, *[-8.0] * nothing.x.size]), np.array([*high, *[8.0] * nothing.x.size])

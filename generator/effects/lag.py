@@ -3,9 +3,9 @@
     y_n = (1 - phi) x_n + sum_i (1 - a_i) R_i,n       R_i,n+1 = a_i R_i,n + phi_i x_n       a_i = exp(-interval / tau_i)
 
 Charge is conserved: a steady exposure reads x in the end. After an exposure of length T the first beam-off frame reads
-x sum_i phi_i (1 - exp(-T / tau_i)), which is the strength. Three traps at tau / s, tau and tau s hold 4, 2 and 1 parts of
-the charge. What is released while nothing is exposed is thrown away by a panel that keeps being read, and found in the
-next frame by one that is not.
+x sum_i phi_i (1 - exp(-T / tau_i)), which is the strength. Four traps, each s times as slow as the one before and with
+half of its charge, have tau as their middle. What is released while nothing is exposed is thrown away by a panel that
+keeps being read, and found in the next frame by one that is not.
 """
 
 import math
@@ -15,14 +15,15 @@ from dataclasses import replace
 from ..line_state import LagLaw, LineContext, LineState
 from .effect import Effect, Parameter
 
-_PARTS = (4.0 / 7.0, 2.0 / 7.0, 1.0 / 7.0)
+_PARTS = (8.0 / 15.0, 4.0 / 15.0, 2.0 / 15.0, 1.0 / 15.0)
+_STEPS = (-1.5, -0.5, 0.5, 1.5)
 
 
 def _trap_charge(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if parameters["strength"] == 0:
         return state
     middle, spread = parameters["release_s"], parameters["spread"]
-    times = (middle / spread, middle, middle * spread)
+    times = tuple(middle * spread**step for step in _STEPS)
     filled = sum(part * -math.expm1(-parameters["after_s"] / time) for part, time in zip(_PARTS, times, strict=True))
     trapped = parameters["strength"] / 100.0 / filled
     law = LagLaw(
@@ -49,10 +50,10 @@ IMAGE_LAG = Effect(
         Parameter(
             name="release_s",
             unit="s",
-            low=0.02,
-            high=20.0,
-            default=0.3,
-            source="traps of amorphous silicon empty within frames to minutes",
+            low=0.1,
+            high=10.0,
+            default=1.0,
+            source="middle of the traps' release times; those of amorphous silicon empty within frames to minutes",
             log=True,
         ),
         Parameter(
@@ -69,8 +70,8 @@ IMAGE_LAG = Effect(
             unit="",
             low=1.0,
             high=10.0,
-            default=7.0,
-            source="ratio of neighbouring release times; 7.6 and twice the charge a step in Starman et al. (2012)",
+            default=7.6,
+            source="ratio of neighbouring release times; Starman et al. (2012) find four of ratio 7.6, half the charge each",
             log=True,
             fitted=False,
         ),

@@ -27,6 +27,7 @@ from ._noise_constants import (
     TAPS_TOGETHER,
 )
 
+# error_model="numpy" everywhere: the check for a zero divisor would keep divisions out of vectors; divisors are checked before
 _FAST = {"contract", "nsz", "arcp"}
 _BAND = 8  # rows a thread takes at a time
 _A, _B, _C = (np.uint32(value) for value in MULTIPLIERS)
@@ -40,7 +41,7 @@ _FROM = np.float32(EXPANSION_FROM)
 _MOST = np.float32(MOST_QUANTA)
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _mixed(word: Any) -> Any:
     """A 64-bit word well mixed (the finalizer of splitmix64)."""
     word = (word ^ (word >> np.uint64(30))) * _MIX_1
@@ -48,7 +49,7 @@ def _mixed(word: Any) -> Any:
     return word ^ (word >> np.uint64(31))
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _fill_words(key: Any, frame: Any, stage: Any, row: Any, words: Any) -> None:
     """Random 32-bit words of a row, one a column: three keyed rounds of multiply and shift on the column's number."""
     stream = _mixed(_mixed(_mixed(key + _STEP) + frame) + (np.uint64(row) * np.uint64(8) + np.uint64(stage)))
@@ -68,7 +69,7 @@ def _fill_words(key: Any, frame: Any, stage: Any, row: Any, words: Any) -> None:
         words[c] = np.uint32(x ^ (x >> np.uint32(14)))
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _fill_polar(words: Any, turns: Any, first: Any, second: Any) -> None:
     """Two independent normal numbers of each pair of words (Box and Muller), each factor to 1e-6."""
     for c in range(len(second)):
@@ -97,7 +98,7 @@ def _fill_polar(words: Any, turns: Any, first: Any, second: Any) -> None:
         second[c] = radius * sine
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _fill_normals(key: Any, frame: Any, stage: Any, row: Any, words: Any, normals: Any) -> None:
     """Independent normal numbers of a row (columns,); words and normals hold room for an even number."""
     half = len(normals) // 2
@@ -105,7 +106,7 @@ def _fill_normals(key: Any, frame: Any, stage: Any, row: Any, words: Any, normal
     _fill_polar(words[:half], words[half : 2 * half], normals[:half], normals[half : 2 * half])
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _row_of(values: Any, row: Any, out: Any, reach: Any) -> None:
     """A row of a map (rows or 1, columns or 1) repeated at both ends by `reach`."""
     from_row = row if values.shape[0] > 1 else 0
@@ -122,7 +123,7 @@ def _row_of(values: Any, row: Any, out: Any, reach: Any) -> None:
         out[c] = values[from_row, size - 1]
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _add_taps(k: Any, r_0: Any, r_1: Any, r_2: Any, r_3: Any, r_4: Any, r_5: Any, r_6: Any, r_7: Any, out: Any) -> None:
     """Add eight rows of at least the length of `out`, weighted with `k` (8,)."""
     k_0, k_1, k_2, k_3, k_4, k_5, k_6, k_7 = k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]
@@ -131,7 +132,7 @@ def _add_taps(k: Any, r_0: Any, r_1: Any, r_2: Any, r_3: Any, r_4: Any, r_5: Any
         out[c] += total + ((k_4 * r_4[c] + k_5 * r_5[c]) + (k_6 * r_6[c] + k_7 * r_7[c]))
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _convolve(wide: Any, kernel: Any, out: Any) -> None:
     """out[c] = sum_j kernel[j] wide[c + j]; the kernel's length a multiple of TAPS_TOGETHER, zeros at its end."""
     for c in range(len(out)):
@@ -141,7 +142,7 @@ def _convolve(wide: Any, kernel: Any, out: Any) -> None:
         _add_taps(kernel[j : j + TAPS_TOGETHER], p, p[1:], p[2:], p[3:], p[4:], p[5:], p[6:], p[7:], out)
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _convolve_down(rows: Any, first: Any, kernel: Any, out: Any) -> None:
     """out[c] = sum_j kernel[j] rows[first + j, c]; rows beyond the last stand for zeros of the kernel."""
     end = len(rows) - 1
@@ -163,7 +164,7 @@ def _convolve_down(rows: Any, first: Any, kernel: Any, out: Any) -> None:
         )
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _invert(words: Any, mean: Any, count: Any, number: Any) -> None:
     """Poisson counts (number,) of `mean` by inversion of the cumulative probability; one word each."""
     piece = 64
@@ -193,7 +194,7 @@ def _invert(words: Any, mean: Any, count: Any, number: Any) -> None:
             count[start + i] = found[i]
 
 
-@njit  # type: ignore[untyped-decorator]
+@njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def _draw_few(
     key: Any, frame: Any, row: Any, quanta: Any, signal: Any, slope: Any, step: Any, excess: Any, words: Any, noise: Any
 ) -> None:
@@ -252,7 +253,7 @@ def _draw_few(
         noise[at[i]] = total_worth[i] - expected[i]
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _draw_many(quanta: Any, step: Any, noise: Any) -> None:
     """Normal numbers in `noise` become step x (Poisson count - mean), for means of EXPANSION_FROM or more.
 
@@ -276,7 +277,36 @@ def _draw_many(quanta: Any, step: Any, noise: Any) -> None:
         noise[c] = step[c] * (np.floor(rest + away) - rest)
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _divide(first: Any, second: Any, out: Any) -> None:
+    for c in range(len(out)):
+        out[c] = first[c] / second[c]
+
+
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _count_quanta(mean: Any, slope: Any, step: Any, level: Any, quanta: Any) -> None:
+    """Mean number of effective quanta, variance over squared step, and the level of 0 or more that makes them."""
+    for c in range(len(quanta)):
+        level[c] = max(mean[c], np.float32(0.0))
+    for c in range(len(quanta)):
+        quanta[c] = min(level[c] * slope[c] / (step[c] * step[c]), _MOST)
+
+
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _scale_normals(white_fraction: Any, slope: Any, gains: Any, mean: Any, read: Any, normals: Any) -> None:
+    """Normal numbers times the standard deviation of white quanta and electronics."""
+    for c in range(len(mean)):
+        white = white_fraction * slope[c] * gains[c] * max(mean[c], np.float32(0.0)) + read[c]
+        normals[c] *= np.sqrt(white)
+
+
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _add_up(signal_share: Any, mean: Any, noise: Any, gains: Any, normals: Any, dark: Any, out: Any) -> None:
+    for c in range(len(out)):
+        out[c] = (signal_share * mean[c] + noise[c] * gains[c]) + (normals[c] + dark[c])
+
+
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _quanta_band(
     band: Any,
     key: Any,
@@ -311,13 +341,8 @@ def _quanta_band(
         _row_of(relative, row, gains, reach)
         _row_of(slope, row, slopes, reach)
         _row_of(step, row, steps, reach)
-        # short loops: the compiler tells at most eight pairs of buffers apart before it gives up vectors
-        for c in range(wide):
-            mean[c] = level[c] / gains[c]
-        for c in range(wide):
-            level[c] = max(mean[c], np.float32(0.0))
-        for c in range(wide):
-            quanta[c] = min(level[c] * slopes[c] / (steps[c] * steps[c]), _MOST)
+        _divide(level, gains, mean[:wide])
+        _count_quanta(mean, slopes, steps, level, quanta)
         few = np.int32(0)
         for c in range(wide):
             few = np.int32(few + np.int32(quanta[c] < _FROM))
@@ -335,7 +360,7 @@ def _quanta_band(
             _convolve(mean, signal_kernel, signal_out[i])
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def fill_quanta(
     key: Any,
     frame: Any,
@@ -373,7 +398,7 @@ def fill_quanta(
         )
 
 
-@njit(fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _frame_band(
     band: Any,
     key: Any,
@@ -423,11 +448,8 @@ def _frame_band(
         if electronics:
             _fill_normals(key, frame, STAGE_ELECTRONICS, row, words, normals[: columns + columns % 2])
         one = out[row]
-        for c in range(columns):
-            white = white_fraction * slopes[c] * gains[c] * max(mean[c], np.float32(0.0)) + reads[c]
-            normals[c] *= np.sqrt(white)
-        for c in range(columns):
-            one[c] = (signal_share * mean[c] + noise[c] * gains[c]) + (normals[c] + darks[c])
+        _scale_normals(white_fraction, slopes, gains, mean, reads, normals)
+        _add_up(signal_share, mean, noise, gains, normals, darks, one)
         if steps_a_DN > 0:
             step = np.float32(1.0) / steps_a_DN
             for c in range(columns):
@@ -436,7 +458,7 @@ def _frame_band(
             one[c] = min(max(one[c], lowest), highest)
 
 
-@njit(parallel=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(parallel=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def fill_frame(
     key: Any,
     frame: Any,

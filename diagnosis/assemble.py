@@ -307,7 +307,7 @@ def build_problem(
     # gain map: what the calibrating flats show over what the smooth model expects
     shares: dict[str, float] = {}
     gain = np.zeros(shape)
-    gain_variance = 0.0
+    gain_quantum = gain_white = 0.0  # relative variance of the gain map: correlated like quanta, and white
     if flats:
         for item in flats:
             model = expected[item.name]
@@ -317,9 +317,13 @@ def build_problem(
             )
             shares[item.name] = level**2 / max(variance, 1e-12) * item.series.n_frames
         total = sum(shares.values())
-        gain_variance = 1.0 / total
         shares = {name: value / total for name, value in shares.items()}
         for item in flats:
+            model = expected[item.name]
+            weight = (shares[item.name] / float(np.mean(np.broadcast_to(model.signal_DN, shape)[good]))) ** 2
+            weight /= item.series.n_frames
+            gain_quantum += weight * float(np.mean(np.broadcast_to(model.quantum_variance_DN2, shape)[good]))
+            gain_white += weight * float(np.mean(np.broadcast_to(model.white_variance_DN2, shape)[good]))
             signal_map = np.maximum(np.broadcast_to(expected[item.name].signal_DN, shape), 1e-9)
             gain += shares[item.name] * (summaries[item.name].mean_DN - dark_map(item)) / signal_map
     else:
@@ -377,8 +381,9 @@ def build_problem(
             None,
         )
         frames = item.series.n_frames
+        lit = mean_signal[item.name] ** 2 if item.series.kind in ("flat", "object") else 0.0
         pattern_noise, block_noise = _pattern_noise(
-            model, clean, frames, gain_variance * mean_signal[item.name] ** 2 + dark_noise_of(item)
+            model, clean, frames, gain_quantum * lit, gain_white * lit + dark_noise_of(item)
         )
         contexts[item.name] = ScalarContext(
             kind=item.series.kind,
@@ -479,9 +484,10 @@ def build_problem(
         mask = clean if lies is None else _inside(clean, lies)
         frames = item.series.n_frames
         quantum = np.broadcast_to(np.asarray(model.quantum_variance_DN2, dtype=np.float64), shape) / frames
+        quantum = quantum + signal**2 * gain_quantum
         white = (
             np.broadcast_to(np.asarray(model.white_variance_DN2, dtype=np.float64), shape) / frames
-            + signal**2 * gain_variance
+            + signal**2 * gain_white
             + dark_noise_of(item)
         )
         if kind == "object":
@@ -734,12 +740,17 @@ def _ghost_templates(
     return [Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=image)]
 
 
-def _pattern_noise(model: ExpectedSeries, mask: NDArray[np.bool_], frames: int, maps_DN2: float) -> tuple[float, float]:
-    """Noise of the corrected mean frame from pixel to pixel and of block means, DN^2; maps_DN2: that of dark and gain."""
+def _pattern_noise(
+    model: ExpectedSeries, mask: NDArray[np.bool_], frames: int, map_quantum_DN2: float, map_white_DN2: float
+) -> tuple[float, float]:
+    """Noise of the corrected mean frame from pixel to pixel and of block means, DN^2.
+
+    map_quantum_DN2, map_white_DN2: noise that dark and gain map bring in, correlated as quanta are, and white.
+    """
     from .probes import autocovariance, correlation_sum
 
-    q = float(np.mean(np.broadcast_to(model.quantum_variance_DN2, mask.shape)[mask])) / frames
-    w = float(np.mean(np.broadcast_to(model.white_variance_DN2, mask.shape)[mask])) / frames + maps_DN2
+    q = float(np.mean(np.broadcast_to(model.quantum_variance_DN2, mask.shape)[mask])) / frames + map_quantum_DN2
+    w = float(np.mean(np.broadcast_to(model.white_variance_DN2, mask.shape)[mask])) / frames + map_white_DN2
     pixel = q * (1.0 - autocovariance(model, 0, 1)) + w
     block = (q * correlation_sum(model, BLOCK_PX, BLOCK_PX) + w) / BLOCK_PX**2
     return max(pixel, 1e-12), max(block, 1e-12)

@@ -8,7 +8,9 @@ plausible range, a twin calibrated from its calibration series, then a least-squ
 simple statistics of all series (means of 8 x 8 pixels, variance, neighbour and frame correlations, first frame, common
 factor, row noise, fixed pattern, outliers, step), with tube voltage, filtration, hardness, level, Swank factor and
 optical spread free beside them. The column `misfit` is the sum of squares (robust) without the effect, with it, and the
-number of statistics. This checks the forward model; naming effects is the diagnosis' work.
+number of statistics. This checks the forward model; naming effects is the diagnosis' work. Least squares does not follow
+the random course of `output_drift` nor weigh its correlation, and few outliers make `bad_pixels` coarse: their strengths
+are rough here.
 """
 
 import argparse

@@ -29,11 +29,12 @@ from .probes import (
     smooth_templates,
     transmission_templates,
 )
-from .registration import Placement, fill, gradient, register, render_variance, resample
+from .registration import Placement, gradient, register, render_variance
 from .session import SessionSeries, read_session
 from .summaries import BLOCK_PX, SeriesSummary, summarise_series
 
 Map = NDArray[np.float32]
+_PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _LABEL_PIXELS = 150  # that a noise label needs
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _AXIS_OF_EFFECT = {
@@ -355,10 +356,29 @@ def build_problem(
         placement = register([corrected[item.name] for item in members], models, noises, clean)
         if not placement.found:
             continue
+        # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
+        for _ in range(_PLACEMENTS):
+            moved_requests = {
+                item.name: replace(item.request, displacement_px=(placement.row_px, placement.column_px))
+                for item in members
+            }
+            models = [
+                np.broadcast_to(
+                    np.asarray(expect(moved_requests[item.name], nothing).signal_DN, dtype=np.float64), shape
+                )
+                for item in members
+            ]
+            rest = register([corrected[item.name] for item in members], models, noises, clean)
+            placement = replace(
+                rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
+            )
         first_of_place.add(members[0].name)
         for item in members:
             placements[item.name] = placement
-            corrected[item.name] = resample(fill(corrected[item.name], clean), placement)
+            request = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
+            position = kept.index(item)
+            kept[position] = replace(item, request=request)
+            expected[item.name] = expect(request, nothing)
 
     # every change: effects at their strengths, then what calibration fitted
     all_changes: list[_Change] = []
@@ -381,9 +401,9 @@ def build_problem(
             None,
         )
         frames = item.series.n_frames
-        lit = mean_signal[item.name] ** 2 if item.series.kind in ("flat", "object") else 0.0
+        squared = mean_signal[item.name] ** 2 if item.series.kind in ("flat", "object") else 0.0
         pattern_noise, block_noise = _pattern_noise(
-            model, clean, frames, gain_quantum * lit, gain_white * lit + dark_noise_of(item)
+            model, clean, frames, gain_quantum * squared, gain_white * squared + dark_noise_of(item)
         )
         contexts[item.name] = ScalarContext(
             kind=item.series.kind,

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LAW_ERROR = 0.10
+LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
 _UNKNOWN_TAU = np.geomspace(1.0, 300.0, 14)
@@ -262,10 +263,11 @@ def fit_curve(
         extra = _law_factors(curve, best, response, groups, law_error)
         if extra.shape[1] == 0:
             break
-        wide = nuisances.widened(extra)
         # evidence over none: the residual's own terms change with the covariance
-        shift = _shift(residual, nuisances, wide)
-        wide_terms = terms(wide)
+        moved, moved_nodes, wide, shift = _with_law(
+            residual, nodes, nuisances, extra, [response], LAW_PROBE_SHARE * law_error
+        )
+        wide_terms = (wide.inner(moved_nodes, moved[None, :])[:, 0], wide.inner(moved_nodes, moved_nodes))
         value, quadratic = likelihood(coarse, wide_terms)
         # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
         width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
@@ -301,12 +303,34 @@ def _law_factors(
     return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
 
 
-def _shift(residual: NDArray[np.float64], base: Nuisances, wide: Nuisances) -> float:
-    """Log likelihood of the bare residual under `wide` less that under `base`."""
-    row = residual[None, :]
-    return -0.5 * (wide.log_determinant - base.log_determinant) + 0.5 * float(
-        np.sum(wide.project(row) ** 2) - np.sum(base.project(row) ** 2)
+def _with_law(
+    residual: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    base: Nuisances,
+    factors: NDArray[np.float64],
+    responses: Sequence[NDArray[np.float64]],
+    probe_error: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Nuisances, float]:
+    """Residual, nodes and nuisances once an effect's law may be off, and the bare residual's change of log likelihood.
+
+    Args:
+        residual, nodes, base: as they were.
+        factors: what is random in groups (probe, factor).
+        responses: of the effects at their strengths; each probe's own part may be off by `probe_error`.
+        probe_error: relative.
+    """
+    scale = np.ones(len(residual))
+    for response in responses:
+        scale = scale + (probe_error * response) ** 2
+    root = np.sqrt(scale)
+    moved, moved_nodes = residual / root, nodes / root
+    wide = Nuisances(np.concatenate([base.factors, factors], axis=1) / root[:, None])
+    before, after = residual[None, :], moved[None, :]
+    quadratic = float(moved @ moved - np.sum(wide.project(after) ** 2)) - float(
+        residual @ residual - np.sum(base.project(before) ** 2)
     )
+    determinant = float(np.sum(np.log(scale))) + wide.log_determinant - base.log_determinant
+    return moved, moved_nodes, wide, -0.5 * (determinant + quadratic)
 
 
 def _unknown_fits(
@@ -451,7 +475,7 @@ def weigh_hypotheses(
                 location=unknown_best[1],
             )
         )
-    return tuple(sorted(merged, key=lambda item: -item.probability))
+    return tuple(sorted(merged, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
 def _fit_pair(
@@ -517,8 +541,10 @@ def _fit_pair(
         axis=1,
     )
     if extra.shape[1]:
-        wide = nuisances.widened(extra)
-        again = integral(terms(wide), _shift(residual, nuisances, wide))
+        moved, moved_nodes, wide, shift = _with_law(
+            residual, nodes, nuisances, extra, [response_a, response_b], LAW_PROBE_SHARE * law_error
+        )
+        again = integral((wide.inner(moved_nodes, moved[None, :])[:, 0], wide.inner(moved_nodes, moved_nodes)), shift)
         if again[0] > value:
             value, sa, sb, grid = again
     top = grid.max()

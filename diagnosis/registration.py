@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
-_CAUTION = (0.5, 0.3, 0.15, 0.12, 0.12, 0.12)
+_CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
 _LARGEST_PX = 6.0
 _WEAK = 0.05
-RENDER_SHARE = 0.12  # of the local range: how well a pixel that an edge cuts is rendered
+RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,6 +28,9 @@ test-slow: $(READY)
 validation: $(READY)
 	$(BIN)/python validation/calibration_coverage.py --seeds 40 --json build/calibration_coverage.json
 	$(BIN)/python validation/generated_against_lab.py --seeds 3 --json build/generated_against_lab.json
+	$(BIN)/python validation/gvxr_transmission.py
+	$(BIN)/python validation/reference_transfer.py --json build/reference_transfer.json
+	$(BIN)/python validation/effects_against_lab.py --json build/effects_against_lab.json
 
 # predictions against truth and against the information limit: hours; a stopped run goes on where it was
 validation-prediction: $(READY)
@@ -37,6 +40,9 @@ validation-prediction: $(READY)
 benchmark: $(READY)
 	$(BIN)/python benchmarks/predict_settings.py
 	$(BIN)/python benchmarks/frame_sums.py
+	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/generate_pair.py
+	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/project_polychromatic.py
+	$(BIN)/python benchmarks/cost_table.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/pod_bootstrap.py
 
 # mypy sees the rooms as raytwin.<room> through a folder of links, without an install

@@ -202,7 +202,7 @@ def test_a_prediction_that_makes_no_sense(files, tmp_path, capsys, case):
 
 GENERATIONS = {
     "no image": (["-n", "0"], "number of images"),
-    "kV of another tube": (["--low", "kv=50,power_w=40,exposure_ms=20"], "calibrated at"),
+    "kV beyond any tube": (["--low", "kv=500,power_w=40,exposure_ms=20"], "kV"),
     "negative exposure": (["--low", "kv=40,power_w=40,exposure_ms=-5"], "exposure_ms"),
     "not a setting": (["--low", "forty"], "forty"),
     "no load": (["--low", "kv=40,exposure_ms=20"], "tube load"),

@@ -405,9 +405,7 @@ def test_a_line_s_description_and_binning_come_back_from_the_file(tmp_path):
         back_scintillator=(Filter(material="Gd2O2S@7.32", thickness_mm=0.3),),
         binning_adds="charge",
     )
-    setting = Setting(
-        kV=60, current_mA=1, exposure_ms=128, binning=2, belt_speed_mm_s=100.0, frame_interval_ms=2.0
-    )
+    setting = Setting(kV=60, current_mA=1, exposure_ms=128, binning=2, belt_speed_mm_s=100.0, frame_interval_ms=2.0)
     with write_acquisition(tmp_path / "a.h5", described) as writer:
         writer.add_series("flat", kind="flat", frames=np.zeros((2, 4, 5), np.uint16), setting=setting)
     with open_acquisition(tmp_path / "a.h5") as acquisition:

@@ -7,6 +7,7 @@ spread or read noise, another thickness. Its response is what the probes would d
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,19 @@ from ..generator.twin import Estimate, Twin
 
 STRENGTH_SHARES = (0.15, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 _MOST_VARIANTS = 4
+_BOTH_ONSETS = frozenset(
+    (
+        "mtf_tail",
+        "k_fluorescence",
+        "image_lag",
+        "nonlinearity",
+        "dark_drift",
+        "output_drift",
+        "row_noise",
+        "quantisation",
+        "heel",
+    )
+)
 
 # scales of the session that any repeat shows; relative standard deviations unless the name says otherwise
 THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
@@ -74,8 +88,8 @@ class Variant:
 def variants_of(effect: Effect) -> list[Variant]:
     """The variants of an effect that compete: ends and middle of each inner parameter, both signs, both onsets.
 
-    An effect that usually sets in after calibration is tried as such only; one that usually was always there, also so
-    only: a constant kV offset or filtration is absorbed by calibration and is no gap.
+    What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
+    after it; what acts on objects alone is the same either way; the rest is tried both ways.
     """
     strength = effect.strength
     inner = [item for item in effect.parameters[1:] if item.fitted]
@@ -102,25 +116,27 @@ def variants_of(effect: Effect) -> list[Variant]:
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
     nodes = tuple(low * (high / low) ** share for share in STRENGTH_SHARES)
-    since = "calibration" if effect.after_calibration else "always"
+    usual = "calibration" if effect.after_calibration else "always"
+    onsets = ("always", "calibration") if effect.id in _BOTH_ONSETS else (usual,)
     result = []
-    for choice in choices:
-        for sign in signs:
-            label = ", ".join(f"{name} {value:.3g}" for name, value in choice.items())
-            if sign < 0:
-                label = f"{label}, negative".strip(", ")
-            result.append(
-                Variant(
-                    effect=effect.id,
-                    name=label,
-                    parameters=choice,
-                    sign=sign,
-                    since=since,
-                    low=low,
-                    high=high,
-                    strengths=nodes,
-                )
+    for choice, sign, since in product(choices, signs, onsets):
+        label = ", ".join(f"{name} {value:.3g}" for name, value in choice.items())
+        if sign < 0:
+            label = f"{label}, negative".strip(", ")
+        if since != usual:
+            label = f"{label}, {'always' if since == 'always' else 'since the calibration'}".strip(", ")
+        result.append(
+            Variant(
+                effect=effect.id,
+                name=label,
+                parameters=choice,
+                sign=sign,
+                since=since,
+                low=low,
+                high=high,
+                strengths=nodes,
             )
+        )
     return result
 
 

@@ -419,6 +419,7 @@ def build_problem(
             and summaries[item.name].code_range < 0.02 * clean.sum() * min(frames, 16),
             pattern_noise_DN2=pattern_noise,
             block_noise_DN2=block_noise,
+            quantum_DN2=float(np.mean(np.broadcast_to(model.quantum_variance_DN2, shape)[clean])),
         )
         base_scalars[item.name] = expected_scalars(model, contexts[item.name])
 

@@ -16,7 +16,7 @@ from ..calibration.priors import ATTENUATION_SCALE, PRIORS, UNDECLARED_SCINTILLA
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.twin import Estimate, Twin
 
-STRENGTH_SHARES = (0.15, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
+STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 _MOST_VARIANTS = 4
 _BOTH_ONSETS = frozenset(
     (

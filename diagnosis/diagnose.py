@@ -19,7 +19,7 @@ from .session import calibrating_names
 from .whitening import whiten
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
-EXPLAINED_FROM = 0.6  # probability of the leading named hypothesis from which the answer is `explained`
+EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
 POWER = 1.0
 _WORST_PLACES = 30
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
@@ -64,7 +64,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
-    """The answer; `twin` is the twin with the effects of the leading hypothesis added (unchanged where none is named)."""
+    """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added."""
 
     verdict: str
     hypotheses: tuple[Hypothesis, ...]
@@ -80,6 +80,7 @@ class Diagnosis:
     next_measurement: Mapping[str, Any] | None
     twin: Twin
     added: tuple[AppliedEffect, ...]
+    named: tuple[str, ...]
     problem: Problem = field(repr=False)
     warnings: tuple[str, ...] = ()
 
@@ -165,13 +166,15 @@ def judge(
             marginal[effect] = marginal.get(effect, 0.0) + hypothesis.probability
     none = next((item.probability for item in hypotheses if not item.effects), 0.0)
     unknown = marginal.pop(UNKNOWN, 0.0)
-    leading = hypotheses[0]
+    # an effect that nearly every likely hypothesis holds is named, whatever companions it is offered with
+    core = {effect for effect, probability in marginal.items() if probability >= EXPLAINED_FROM}
+    leading = next((item for item in hypotheses if core and set(item.effects) == core), hypotheses[0])
     tied: list[Hypothesis] = []
     if not leading.effects:
         verdict = "no_gap"
     elif leading.effects == (UNKNOWN,):
         verdict = "unknown_effect"
-    elif leading.probability >= EXPLAINED_FROM:
+    elif core == set(leading.effects):
         verdict = "explained"
     else:
         verdict = "ambiguous"
@@ -250,6 +253,7 @@ def judge(
         next_measurement=None,
         twin=improved,
         added=added,
+        named=tuple(named),
         problem=problem,
         warnings=tuple(problem.skipped),
     )

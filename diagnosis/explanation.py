@@ -69,7 +69,7 @@ def paragraph(diagnosis: Diagnosis) -> str:
         if diagnosis.next_measurement:
             text += f" To tell them apart: {diagnosis.next_measurement['text']}."
         return text
-    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.hypotheses[0].effects]
+    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
     named = " and ".join(
         f"{title_of(cause.effect)} of {strength_text(cause)} (probability {cause.probability:.2f})" for cause in leading
     )

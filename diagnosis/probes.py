@@ -108,8 +108,9 @@ class ScalarContext:
     """What scalar probes of a series refer to; the same for measured frames and forward model.
 
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
-    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; integer: whole-number
-    frames.
+    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise_DN2,
+    block_noise_DN2: of the corrected mean frame from pixel to pixel and of block means; quantum_DN2: the base model's quantum
+    variance of one frame.
     """
 
     kind: str
@@ -123,6 +124,7 @@ class ScalarContext:
     codes_usable: bool
     pattern_noise_DN2: float
     block_noise_DN2: float
+    quantum_DN2: float
 
 
 def time_templates(frames: int) -> list[tuple[str, NDArray[np.float64]]]:
@@ -216,8 +218,14 @@ def expected_scalars(
     if not context.calibrates and context.kind in ("flat", "dark"):
         signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
         pattern = expected.fixed_pattern_rms**2 * signal2
-        values["fixed_pattern"] = math.log(1.0 + pattern / context.pattern_noise_DN2)
-        values["fixed_pattern blocks"] = math.log(1.0 + pattern / BLOCK_PX**2 / context.block_noise_DN2)
+        # more quanta's noise in the frames is more of it in their mean
+        added = (mean_q - context.quantum_DN2) / context.frames
+        neighbours = 1.0 - autocovariance(expected, 0, 1)
+        lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
+        values["fixed_pattern"] = math.log(max(1.0 + (pattern + added * neighbours) / context.pattern_noise_DN2, 1e-3))
+        values["fixed_pattern blocks"] = math.log(
+            max(1.0 + (pattern + lasting) / BLOCK_PX**2 / context.block_noise_DN2, 1e-3)
+        )
         values["outliers"] = math.sqrt(0.7 * expected.bad_pixel_share * n_good + 0.375)
     return values
 

@@ -1,0 +1,77 @@
+"""`raytwin diagnose` from a session file to its answer: one planted fault, one null case, bad input."""
+
+import json
+
+import pytest
+
+from raytwin.cli import main
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """A short session with much excess noise since the calibration, and one without any effect."""
+    folder = tmp_path_factory.mktemp("diagnose")
+    common = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "16", "--products", "1"]
+    assert main(["lab", "-o", str(folder / "null.h5"), *common]) == 0
+    assert main(["lab", "-o", str(folder / "noisy.h5"), *common, "--effect", "excess_noise=60@calibration"]) == 0
+    return folder
+
+
+def diagnose(sessions, capsys, name):
+    capsys.readouterr()
+    assert main(["diagnose", str(sessions / f"{name}.h5"), "-o", str(sessions / name), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert json.loads((sessions / name / "diagnosis.json").read_text(encoding="utf-8")) == printed
+    return printed
+
+
+def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sessions, capsys):
+    found = diagnose(sessions, capsys, "noisy")
+    assert found["verdict"] == "explained"
+    leading = found["causes"][0]
+    assert leading["effect"] == "excess_noise"
+    assert leading["probability"] > 0.9
+    assert leading["strength"]["value"] == pytest.approx(60.0, rel=0.15)
+    assert found["gap"]["after"] < 0.7 * found["gap"]["before"]
+    assert {place["axis"] for place in found["where"]} >= {"noise"}
+    assert sum(item["probability"] for item in found["hypotheses"]) == pytest.approx(1.0, abs=1e-6)
+    from raytwin.generator.twin_io import read_twin
+
+    assert "excess_noise" in [effect.id for effect in read_twin(sessions / "noisy" / "twin.h5").effects]
+    page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")
+    assert "excess_noise" in page
+    assert page.count("data:image/png;base64,") == 5
+
+
+def test_session_without_effect_is_not_explained_by_one(sessions, capsys):
+    found = diagnose(sessions, capsys, "null")
+    assert found["verdict"] in ("no_gap", "ambiguous")
+    assert found["probability_unknown"] < 0.5
+    assert found["gap"]["before"] < 1.3
+    assert found["format"] == "raytwin-diagnosis"
+
+
+def test_an_effect_left_out_is_not_named(sessions, capsys):
+    capsys.readouterr()
+    folder = sessions / "without"
+    words = ["diagnose", str(sessions / "noisy.h5"), "-o", str(folder), "--json", "--without", "excess_noise"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert "excess_noise" not in [cause["effect"] for cause in found["causes"]]
+
+
+@pytest.mark.parametrize(
+    ("words", "mention"),
+    [
+        (["--without", "warp_drive"], "--without"),
+        (["--twin", "missing.h5"], "missing.h5"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing_behind(sessions, capsys, words, mention):
+    capsys.readouterr()
+    folder = sessions / "bad"
+    assert main(["diagnose", str(sessions / "null.h5"), "-o", str(folder), *words]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert mention in lines[0]
+    assert not folder.exists()

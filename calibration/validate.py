@@ -14,7 +14,9 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..files import sha256_of_file
+from ..generator.effects import effect_of
 from ..generator.predict import predict_flatfield
+from ..generator.present_line import present_line
 from ..generator.psf import noise_autocovariance_1d
 from ..generator.twin import Estimate, Twin
 from .frame_sums import effective_frames, sum_frames
@@ -190,6 +192,8 @@ def validate_twin(
     for item in chosen:
         tell(item.name)
         setting = item.setting
+        # an effect that came after calibration is not in the flats that calibrated
+        seen = same_session and item.name in calibrated
         if setting is None or setting.tube_load_mAs is None:
             skipped.append(f"{item.name}: kV, exposure or tube load unknown")
             continue
@@ -212,10 +216,11 @@ def validate_twin(
         mean = float(np.median(signal[good]))
         variance = float(np.mean(total.pair_variance_DN2[good]))
         try:
-            predicted = predict_flatfield(twin, setting)
+            predicted = predict_flatfield(twin, setting, after_calibration=not seen)
         except InputError as error:
             skipped.append(f"{item.name}: {error}")
             continue
+        skipped += [line for line in predicted.warnings if line.startswith("effect ") and line not in skipped]
         pixels = int(good.sum())
         # quantum noise is correlated: the mean over pixels carries gain, not slope
         spread = predicted.gain_DN.value * mean / item.averaged + twin.noise.read_variance_DN2 / item.averaged
@@ -231,7 +236,7 @@ def validate_twin(
                 series=item.name,
                 setting=setting,
                 role=item.role or "",
-                used_in_calibration=same_session and item.name in calibrated,
+                used_in_calibration=seen,
                 measured_mean_DN=mean,
                 measured_sd_DN=math.sqrt(variance),
                 predicted_mean_DN=_widened(predicted.mean_DN, mean_sd),
@@ -255,12 +260,20 @@ def _wedge_rows(
     if twin.spectral is None:
         return ()
     rows = []
-    for entry in measure_transmissions(acquisition, twin.maps, evaluation=True):
+    entries = measure_transmissions(acquisition, twin.maps, evaluation=True)
+    left_out = [
+        item.id for item in present_line(twin).effects if effect_of(item).stage in ("beam", "arrivals", "optics")
+    ]
+    if entries and left_out:
+        skipped.append(f"wedges are predicted without the effects {', '.join(left_out)}")
+    for entry in entries:
         if entry.skipped:
             skipped.append(entry.skipped)
         role = next(item.role for item in acquisition.series if item.name == entry.series)
         for item in entry.transmissions:
-            predicted = predict_transmission(twin, kV=item.kV, filters=item.filters, layers=item.layers)
+            seen = same_session and role != "evaluation"
+            line = present_line(twin, after_calibration=not seen).twin
+            predicted = predict_transmission(line, kV=item.kV, filters=item.filters, layers=item.layers)
             rows.append(
                 WedgeRow(
                     series=item.series,
@@ -269,7 +282,7 @@ def _wedge_rows(
                     layers=text_from_filters(item.layers),
                     measured=item.value,
                     predicted=_widened(predicted, item.relative_sd * item.value),
-                    used_in_calibration=same_session and role != "evaluation",
+                    used_in_calibration=seen,
                 )
             )
     return tuple(rows)
@@ -330,6 +343,7 @@ def leave_one_out(
         )
         without = replace(
             twin,
+            effects=(),
             levels=others,
             spectral=fit.posterior,
             instrument=replace(twin.instrument, maximum_power_w=None),

@@ -35,10 +35,12 @@ from ..spectra import (
     tube_fluence_interpolated,
 )
 from .binning import refuse_binning
-from .predict import predict_flatfield, spectral_model_of
+from .predict import predict_flatfield
+from .present_line import present_line
 from .psf import PSF_MODELS, blur_variance_share, noise_autocovariance_1d
 from .spectral_signal import OpenBeam
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
+from .twin_spectrum import spectral_model_of
 
 FloatArray = NDArray[np.float64]
 
@@ -199,6 +201,11 @@ class _Slabs:
 
 
 def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
+    line = present_line(twin)
+    twin = line.twin
+    told = line.warnings
+    if line.effects:
+        told += ("left out of the contrast: effects " + ", ".join(item.id for item in line.effects),)
     model = spectral_model_of(twin, highest_kV=setting.kV)  # refuses a twin without spectral part
     posterior = cast(SpectralPosterior, twin.spectral)
     samples = posterior.best[None, :]
@@ -217,7 +224,7 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
         energies_keV=model.energies_keV,
         open_signal_DN=predicted.mean_DN.value,
         open_gain_DN=predicted.gain_DN.value,
-        warnings=predicted.warnings,
+        warnings=(*predicted.warnings, *told),
     )
 
 

@@ -9,9 +9,11 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from ..materials import transmission
 from ..spectra import BIN_WIDTH_KEV, detector_response
-from .predict import estimate_from_log_draws, spectral_model_of
+from .predict import estimate_from_log_draws
+from .present_line import present_line
 from .spectral_signal import OpenBeam
 from .twin import Estimate, Twin
+from .twin_spectrum import spectral_model_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,11 +52,13 @@ def predict_back_layer(twin: Twin, setting: Setting) -> BackLayer:
     Raises:
         InputError: no back scintillator declared, no spectral part, no tube load, or no photon that reaches the back.
     """
-    instrument, posterior = twin.instrument, twin.spectral
+    instrument = twin.instrument
     if not instrument.back_scintillator:
         raise InputError(
             "twin", received="an instrument with one sensitive layer", expected="a declared back_scintillator"
         )
+    twin = present_line(twin).twin  # effects on the beam reach the back layer too
+    posterior = twin.spectral
     model = spectral_model_of(twin, highest_kV=setting.kV)  # raises where there is no spectral part
     load = setting.tube_load_mAs
     if load is None or posterior is None:

@@ -20,7 +20,7 @@ from ..errors import InputError
 from ..files import sha256_of_file
 from .as_published import published_parameters, sample_as_published
 from .binning import refuse_binning
-from .predict import predict_flatfield, slope_share, spectral_model_of
+from .predict import predict_flatfield
 from .registration import estimate_shift_px, shift_image
 from .spectral_signal import OpenBeam, gain_behind_object
 from .topup import apply_top_up, plan_top_up, same_layers
@@ -34,6 +34,7 @@ from .transfer import (
     transfer_pair,
 )
 from .twin import Level, Twin
+from .twin_spectrum import slope_share, spectral_model_of
 from .two_material import TwoMaterialTables, tabulate_two_materials
 
 RECIPES = ("raytwin", "as_published")

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,21 @@ from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
 from .binning import binned_pixel, binned_variance_share
 from .line_limits import check_count_rate, check_limits
+from .present_line import PresentLine, present_line
 from .psf import blur_variance_share
-from .spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name
+from .spectral_signal import OpenBeam
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
+from .twin_spectrum import slope_share, spectral_model_of
+
+__all__ = [
+    "Prediction",
+    "binned_over_single",
+    "estimate_from_log_draws",
+    "predict_flatfield",
+    "predict_flatfields",
+    "slope_share",
+    "spectral_model_of",
+]
 
 _MEASURED_REPRODUCIBILITY = 0.002  # of a level measured at this kV and filter: what a repeat would show
 _FAR_ABOVE = 3.0  # times the brightest flat: beyond, nobody has seen whether the detector is linear
@@ -59,72 +70,6 @@ class Prediction:
             "measured_level": self.measured_level,
             "warnings": list(self.warnings),
         }
-
-
-@lru_cache(maxsize=8)
-def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
-    anode, angle, model, inherent, scintillator, alternative, cover, counting, names, correction = key
-    prefix = attenuation_scale_name("")
-    return SpectralModel(
-        anode=anode,
-        anode_angle_deg=angle,
-        model=model,
-        inherent=inherent,
-        scintillator=scintillator,
-        alternative=alternative,
-        cover=cover,
-        counting=counting,
-        filter_materials=[name.removeprefix(prefix) for name in names if name.startswith(prefix)],
-        highest_kV=highest_kV,
-        names=names,
-        correction=correction,
-    )
-
-
-def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel:
-    """The twin's spectral model; its tables are kept for the next call.
-
-    Raises:
-        InputError: the twin has no spectral part.
-    """
-    posterior = twin.spectral
-    if posterior is None:
-        raise InputError(
-            "twin",
-            received="a twin without spectral part",
-            expected="a twin calibrated from flats that state kV and tube load",
-            remedy="calibrate from series with kV, current_mA or power_W, and exposure_ms",
-        )
-    key = (
-        posterior.anode,
-        posterior.anode_angle_deg,
-        posterior.model,
-        posterior.inherent,
-        posterior.scintillator,
-        posterior.alternative,
-        posterior.cover,
-        posterior.counting,
-        posterior.names,
-        posterior.correction,
-    )
-    return _cached_model(key, max(160.0, 20.0 * math.ceil(highest_kV / 20.0)))
-
-
-def slope_share(twin: Twin) -> float:
-    """Photon-transfer slope over gain: the share of the noise that the spread leaves in one pixel; no unit.
-
-    As the levels have it, geometric mean, where there are any: it is the same for all of them.
-    """
-    known = [
-        math.log(level.photon_transfer_slope_DN.value / level.gain_DN.value)
-        for level in twin.levels
-        if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0
-    ]
-    if known:
-        return math.exp(sum(known) / len(known))
-    share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
-    white = twin.noise.white_fraction
-    return (share + white) / (1.0 + white)
 
 
 def binned_over_single(twin: Twin, binning: int) -> float:
@@ -190,7 +135,7 @@ def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
     return False
 
 
-def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
+def predict_flatfield(twin: Twin, setting: Setting, *, after_calibration: bool = True) -> Prediction:
     """Flatfield at a setting, with 95 % intervals.
 
     At a kV and filter that was measured the measured level is scaled to the load; elsewhere the posterior of the
@@ -199,10 +144,43 @@ def predict_flatfield(twin: Twin, setting: Setting) -> Prediction:
 
     With binning, mean, noise and photons are those of a binned pixel, gain and slope remain those of one pixel.
 
+    The twin's effects are in it: those on beam and noise in its numbers (`present_line`), others by what they change in
+    `expected_series`, long after the beam was switched on. Their strengths count as known.
+
+    Args:
+        twin: the calibrated line.
+        setting: with a tube load.
+        after_calibration: whether effects that came after calibration are there.
+
     Raises:
         InputError: no tube load given, a setting beyond the line's limits (`line_limits`), or a twin that has neither this
             level nor a spectrum.
     """
+    if not twin.effects:
+        return _without_effects(twin, setting)
+    line = present_line(twin, after_calibration=after_calibration)
+    found = _without_effects(line.twin, setting)
+    if line.effects:
+        found = _changed_by_effects(found, line)
+    return replace(found, warnings=(*found.warnings, *line.warnings))
+
+
+def _changed_by_effects(found: Prediction, line: PresentLine) -> Prediction:
+    # the series model stands on this module
+    from .flat_change import flat_change
+
+    change = flat_change(line.twin, line.effects, found.setting)
+    return replace(
+        found,
+        mean_DN=found.mean_DN.times(change.mean),
+        sd_DN=found.sd_DN.times(change.sd),
+        gain_DN=found.gain_DN.times(change.gain),
+        photons_absorbed=None if found.photons_absorbed is None else found.photons_absorbed.times(change.photons),
+        warnings=(*found.warnings, *change.warnings),
+    )
+
+
+def _without_effects(twin: Twin, setting: Setting) -> Prediction:
     warnings = list(check_limits(twin.instrument, setting))
     load = setting.tube_load_mAs
     if load is None:

@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from .predict import slope_share, spectral_model_of
+from .present_line import present_line
 from .twin import Twin
+from .twin_spectrum import slope_share, spectral_model_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +41,8 @@ def predict_levels(
         mean = rate(kV, filters) load (1000 / d)^2 a^2        sd^2 = (gain share mean + read^2) / averaged
 
     Each kV is taken from the spectra's cache and each filter stack is one exponential; exposure and current cost nothing
-    more. Power limits and saturation are `predict_flatfield`'s to check.
+    more. Power limits and saturation are `predict_flatfield`'s to check, and of the twin's effects only those on beam and
+    noise are in (`present_line`).
 
     Args:
         twin: a calibrated line.
@@ -60,6 +62,7 @@ def predict_levels(
     Checked against: `predict_flatfield` (tests/test_generator_predict_many.py), SpekPy called for each setting
         (benchmarks/predict_settings.py).
     """
+    twin = present_line(twin).twin
     volts = np.asarray(kV, dtype=float)
     if volts.ndim != 1 or len(filters) != volts.size:
         raise InputError(

@@ -16,13 +16,13 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from .describe import Scene
 from .kernels import draw_key, sample_frames
-from .predict import spectral_model_of
 from .projection import project_polychromatic
 from .psf import noise_kernel_1d, sampled_gaussian_1d
 from .shapes import Rays
 from .spectral_signal import OpenBeam
 from .transfer import Channel, DetectorNoise
 from .twin import Twin
+from .twin_spectrum import spectral_model_of
 
 Array = NDArray[np.float64]
 

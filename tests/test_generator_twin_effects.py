@@ -1,0 +1,138 @@
+"""A twin that carries effects: predictions, validation and images hold what the effects do."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition.setting import setting_from_text
+from raytwin.cli import main
+from raytwin.generator.effects import EFFECTS, AppliedEffect
+from raytwin.generator.predict import predict_flatfield
+from raytwin.generator.predict_many import predict_levels
+from raytwin.generator.present_line import WORKED_IN, present_line
+from raytwin.generator.series import SeriesRequest, expected_series
+from raytwin.generator.twin_io import write_twin
+
+MEASURED = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
+UNMEASURED = setting_from_text("kv=60,power_w=45,exposure_ms=50,filter=Cu:0.1")
+
+
+def with_effect(twin, effect, since="calibration", **parameters):
+    return replace(twin, effects=(AppliedEffect(id=effect, parameters=parameters, since=since),))
+
+
+def thicker(twin, thickness_mm):
+    spectral = twin.spectral
+    column = spectral.names.index("inherent_filtration_mm_Al")
+    samples, best = spectral.samples.copy(), spectral.best.copy()
+    samples[:, column] += thickness_mm
+    best[column] += thickness_mm
+    return replace(twin, spectral=replace(spectral, samples=samples, best=best))
+
+
+# ------------------------------------------------------------------------------------------------ predict
+
+
+def test_a_twin_with_a_filtration_error_predicts_as_one_whose_filtration_is_thicker(make_model_twin):
+    twin = make_model_twin((24, 32))
+    changed = with_effect(twin, "filtration_error", strength=0.4)
+    wanted = thicker(twin, 0.4)
+    for setting in (MEASURED, UNMEASURED):
+        found = predict_flatfield(changed, setting)
+        # the levels of this twin are its own model's, so that the thicker line has the model's levels
+        expected = predict_flatfield(replace(wanted, levels=()), setting)
+        assert found.mean_DN.value == pytest.approx(expected.mean_DN.value, rel=1e-9)
+        assert found.gain_DN.value == pytest.approx(expected.gain_DN.value, rel=1e-9)
+        assert found.sd_DN.value == pytest.approx(expected.sd_DN.value, rel=1e-3)
+        assert found.photons_absorbed.value == pytest.approx(expected.photons_absorbed.value, rel=1e-9)
+        assert found.air_kerma_uGy.value == pytest.approx(expected.air_kerma_uGy.value, rel=1e-9)
+        assert found.mean_DN.value < 0.99 * predict_flatfield(twin, setting).mean_DN.value
+
+
+@pytest.mark.parametrize("setting", [MEASURED, UNMEASURED], ids=["measured", "unmeasured"])
+def test_excess_noise_raises_the_quantum_variance_by_its_strength_and_leaves_the_mean_alone(series_line, setting):
+    before = predict_flatfield(series_line, setting)
+    after = predict_flatfield(with_effect(series_line, "excess_noise", strength=50.0), setting)
+    read = series_line.noise.read_variance_DN2
+    assert after.mean_DN == before.mean_DN
+    assert after.gain_DN.value == pytest.approx(1.5 * before.gain_DN.value, rel=1e-12)
+    assert after.sd_DN.value == pytest.approx(math.sqrt(1.5 * (before.sd_DN.value**2 - read) + read), rel=1e-9)
+    assert after.photons_absorbed == before.photons_absorbed
+
+
+@pytest.mark.parametrize("effect", sorted(EFFECTS))
+@pytest.mark.parametrize("setting", [MEASURED, UNMEASURED], ids=["measured", "unmeasured"])
+def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(series_line, effect, setting):
+    applied = AppliedEffect(id=effect, parameters={}, since="calibration")
+    found = predict_flatfield(replace(series_line, effects=(applied,)), setting)
+    plain = predict_flatfield(series_line, setting)
+    asked = SeriesRequest(kind="flat", setting=setting, frames=1, exposure_ms=setting.exposure_ms)
+    # lag has filled after an hour of beam
+    interval = asked.interval_s(series_line.instrument.readout_ms)
+    exposed = math.ceil(3600.0 / interval)
+    asked = replace(asked, start_s=exposed * interval, previous=(replace(asked, frames=exposed),))
+    with_it = expected_series(series_line, asked, effects=(applied,))
+    without = expected_series(series_line, asked, effects=())
+
+    def noise(flat):
+        common = flat.row_variance_DN2 + flat.column_variance_DN2
+        common += (flat.frame_factor_rms * np.median(flat.signal_DN)) ** 2
+        return math.sqrt(common + np.median(flat.quantum_variance_DN2 + flat.white_variance_DN2))
+
+    level = np.median(with_it.signal_DN) / np.median(without.signal_DN)
+    assert found.mean_DN.value / plain.mean_DN.value == pytest.approx(level, rel=1e-4)
+    assert found.sd_DN.value / plain.sd_DN.value == pytest.approx(noise(with_it) / noise(without), rel=2e-3)
+    assert found.mean_DN.low < found.mean_DN.value < found.mean_DN.high
+
+
+def test_before_calibration_only_effects_that_were_always_there_are_predicted(series_line):
+    plain = predict_flatfield(series_line, UNMEASURED)
+    late = with_effect(series_line, "kv_error", strength=3.0)
+    assert predict_flatfield(late, UNMEASURED, after_calibration=False) == plain
+    always = with_effect(series_line, "kv_error", since="always", strength=3.0)
+    assert predict_flatfield(always, UNMEASURED, after_calibration=False).mean_DN.value > 1.02 * plain.mean_DN.value
+
+
+def test_levels_of_many_settings_hold_the_effects_on_the_beam(series_line):
+    late = with_effect(series_line, "filtration_error", strength=0.3)
+    for setting in (MEASURED, UNMEASURED):
+        one = predict_levels(late, kV=[setting.kV], filters=[setting.filters], load_mAs=setting.tube_load_mAs)
+        assert one.mean_DN[0] == pytest.approx(predict_flatfield(late, setting).mean_DN.value, rel=1e-4)
+
+
+def test_an_effect_that_cannot_be_predicted_is_named_in_one_warning(series_line):
+    dim = replace(series_line, instrument=replace(series_line.instrument, pixel_mm=None))
+    found = predict_flatfield(with_effect(dim, "veiling_glare"), MEASURED)
+    told = [line for line in found.warnings if "effect veiling_glare is left out" in line]
+    assert len(told) == 1
+    unknown = replace(series_line, spectral=None)
+    found = predict_flatfield(with_effect(unknown, "kv_error"), MEASURED)
+    assert "effect kv_error is left out: the twin has no spectral part" in found.warnings
+
+
+def test_a_voltage_beyond_the_tables_is_said(series_line):
+    line = present_line(with_effect(series_line, "kv_error", strength=8.0))
+    assert line.warnings == ("effect kv_error: 8 % off in all is taken as 6 %, where the tables of spectra end",)
+
+
+def test_worked_in_effects_are_off_the_twin_and_others_stay(series_line):
+    effects = tuple(AppliedEffect(id=name, parameters={}) for name in (*WORKED_IN, "heel", "row_noise"))
+    line = present_line(replace(series_line, effects=effects))
+    assert [item.id for item in line.effects] == ["heel", "row_noise"]
+    assert line.twin.effects == ()
+
+
+def test_the_predict_command_applies_the_effects_of_the_twin_file(series_line, tmp_path, capsys):
+    import json
+
+    write_twin(tmp_path / "plain.h5", series_line)
+    write_twin(tmp_path / "changed.h5", with_effect(series_line, "excess_noise", strength=60.0))
+    found = {}
+    for name in ("plain", "changed"):
+        options = ["--kv", "60", "--filter", "Cu:0.1", "--power-w", "45", "--exposure-ms", "50", "--json"]
+        assert main(["predict", str(tmp_path / f"{name}.h5"), *options]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    assert found["changed"]["mean_DN"] == found["plain"]["mean_DN"]
+    assert found["changed"]["gain_DN"]["value"] == pytest.approx(1.6 * found["plain"]["gain_DN"]["value"])

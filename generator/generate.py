@@ -6,7 +6,7 @@ At the kV and filter of the references that is a top-up (generator.topup); at an
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,24 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.dataset_io import Dataset, DatasetRow, write_dataset
+from ..acquisition.instrument import Instrument
 from ..acquisition.pairs import flat_corrected_log, replace_bad_pixels
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import InputError
 from ..files import sha256_of_file
 from .as_published import published_parameters, sample_as_published
 from .binning import refuse_binning
+from .effects import AppliedEffect
+from .image_effects import ImageEffects
 from .predict import predict_flatfield
+from .present_line import present_line
+from .projection import project_polychromatic
 from .registration import estimate_shift_px, shift_image
 from .spectral_signal import OpenBeam, gain_behind_object
-from .topup import apply_top_up, plan_top_up, same_layers
+from .topup import apply_top_up, plan_top_up, same_layers, topped_up_charge
 from .transfer import (
     Channel,
     DetectorNoise,
     TransferredPair,
     check_geometry,
     check_transfer,
+    quiet_image,
     sample_transferred,
     transfer_pair,
+    transferred_charge,
 )
 from .twin import Level, Twin
 from .twin_spectrum import slope_share, spectral_model_of
@@ -80,13 +87,18 @@ class GenerationSummary:
 class ChannelModel:
     """One tube voltage of a pair at the target: open signal, dark, and gain as a function of the transmission.
 
-    `bad_pixels` is `repaired`, where they are as their neighbours, or `measured`, where they are as the twin knows them.
+    `twin` is without effects (`present_line` takes them off), `effects` are those that images go through. `bad_pixels` is
+    `repaired`, where they are as their neighbours, or `measured`, where they are as the twin knows them. `instrument`
+    states distances and pitch where they differ from the twin's.
     """
 
     twin: Twin
     target: Setting
     product_material: str
     bad_pixels: str = "repaired"
+    effects: tuple[AppliedEffect, ...] = ()
+    instrument: Instrument | None = None
+    image_effects: ImageEffects | None = field(init=False)
     level: Level | None = field(init=False)
     open_signal_DN: NDArray[np.float64] = field(init=False)
     dark_DN: NDArray[np.float32] = field(init=False)
@@ -121,6 +133,20 @@ class ChannelModel:
         self.read_variance_DN2 = variance
         self.gain_DN = predicted.gain_DN.value
         self.warnings = self._warnings(predicted.extrapolated)
+        self.image_effects = None
+        if self.effects:
+            self.image_effects = ImageEffects(
+                twin=twin,
+                effects=self.effects,
+                setting=self.target,
+                open_signal_DN=self.open_signal_DN,
+                open_level_DN=predicted.mean_DN.value,
+                gain_DN=self.gain_DN,
+                dark_DN=self.dark_DN,
+                read_variance_DN2=self.read_variance_DN2,
+                product_material=self.product_material,
+                instrument=self.instrument,
+            )
         if twin.spectral is None:
             self._transmission, self._gain_ratio = np.array([0.0, 1.0]), np.ones(2)
         else:
@@ -149,6 +175,11 @@ class ChannelModel:
                 found.append(f"{self.target} drives {cut:.2g} % of the pixels in the open field to the end of the ADC")
         return tuple(found)
 
+    @property
+    def flat_DN(self) -> NDArray[np.float64]:
+        """Open field (row, column) above dark that corrections divide by, DN."""
+        return self.open_signal_DN if self.image_effects is None else self.image_effects.flat_DN
+
     def channel(self) -> Channel:
         """The same as a transfer needs it."""
         return Channel(
@@ -159,14 +190,60 @@ class ChannelModel:
         """Gain (row, column) of the spectrum behind as much product as the transmission says, DN."""
         return np.asarray(self.gain_DN * np.interp(transmission, self._transmission, self._gain_ratio))
 
+    def thickness_behind(self, transmission: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Product (row, column) that transmits as much, mm; 0 where the twin has no spectral part."""
+        if self.twin.spectral is None:
+            return np.zeros(np.shape(transmission))
+        # the logarithm is nearly straight over thickness
+        depth = -np.log(np.maximum(self._transmission, 1e-30))
+        wanted = -np.log(np.clip(transmission, 1e-30, 1.0))
+        return np.asarray(np.interp(wanted, depth[::-1], _GAIN_THICKNESSES_MM))
+
     def sample_counts(
-        self, transmission: NDArray[np.floating], reference: Setting, rng: np.random.Generator
+        self,
+        transmission: NDArray[np.floating],
+        reference: Setting,
+        rng: np.random.Generator,
+        *,
+        reference_gain: float = 1.0,
+        reference_open_DN: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float32]:
-        """Counts with dark (row, column) at the target by top-up of a reference's transmission, DN."""
+        """Counts with dark (row, column) at the target by top-up of a reference's transmission, DN.
+
+        Args:
+            transmission: the reference's I / I0.
+            reference: its setting.
+            rng: source of randomness.
+            reference_gain: quantum variance per signal when the reference was taken over that of now.
+            reference_open_DN: (row, column) open signal of one of its frames; None: this channel's scaled to its load.
+        """
         noise = self.twin.noise
+        plan = plan_top_up(reference=reference, target=self.target, reference_gain=reference_gain)
+        effects = self.image_effects
+        if effects is not None:
+            opened = self.open_signal_DN / plan.scale if reference_open_DN is None else reference_open_DN
+            straight = effects.straightened(transmission, open_signal_DN=opened)
+            if effects.changes_picture():
+                quiet = self._quiet(straight, reference)
+                straight = straight + effects.picture_change(quiet, self.thickness_behind(quiet))
+            charge = topped_up_charge(
+                straight,
+                plan,
+                open_signal_DN=self.open_signal_DN,
+                gain_DN=self.gain_behind(straight),
+                gain_relative=self.twin.maps.gain_relative,
+                white_fraction=noise.white_fraction,
+                read_variance_DN2=self.read_variance_DN2,
+                psf_model=noise.psf_model,
+                psf_sigma_px=noise.psf_sigma_px.value,
+                quantised=noise.quantised,
+                rng=rng,
+                kernel=effects.pattern.kernel,
+            )
+            return effects.read_out(charge, rng)
         return apply_top_up(
             transmission,
-            plan_top_up(reference=reference, target=self.target),
+            plan,
             open_signal_DN=self.open_signal_DN,
             gain_DN=self.gain_behind(transmission),
             gain_relative=self.twin.maps.gain_relative,
@@ -180,6 +257,12 @@ class ChannelModel:
             rng=rng,
         )
 
+    def _quiet(self, transmission: NDArray[np.float64], reference: Setting) -> NDArray[np.float64]:
+        """The transmission without its noise, detail that stands out of the noise kept (row, column)."""
+        logs = -np.log(np.maximum(transmission, 1e-6))[None]
+        taken = replace(self.channel(), setting=reference)
+        return np.asarray(np.exp(-quiet_image(logs, [taken], detector_noise(self.twin))[0]))
+
     def sample_as_published(self, transmission: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (row, column) at the target by the paper's recipe, DN."""
         return sample_as_published(
@@ -188,7 +271,7 @@ class ChannelModel:
 
     def log_image(self, counts: NDArray[np.floating]) -> NDArray[np.float32]:
         """-log(I / I0) of counts (row, column); bad pixels that were put in are replaced by their neighbours."""
-        image = flat_corrected_log(counts, dark_DN=self.dark_DN, flat_DN=self.open_signal_DN + self.dark_DN)
+        image = flat_corrected_log(counts, dark_DN=self.dark_DN, flat_DN=self.flat_DN + self.dark_DN)
         if self.bad_pixels == "repaired":
             return image
         return np.asarray(replace_bad_pixels(image, self.twin.maps.bad_pixels > 0), dtype=np.float32)
@@ -248,6 +331,8 @@ class PairTransfer:
         product_material: str = DEFAULT_PRODUCT,
         foreign_material: str = DEFAULT_FOREIGN,
         bad_pixels: str = "repaired",
+        effects: tuple[AppliedEffect, ...] = (),
+        reference_twin: Twin | None = None,
     ) -> None:
         if twin.spectral is None:
             raise InputError(
@@ -259,7 +344,8 @@ class PairTransfer:
         self.twin = twin
         self.targets = (low, high)
         self.materials = (product_material, foreign_material)
-        self.models = tuple(ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high))
+        self._reference_twin = twin if reference_twin is None else reference_twin
+        self.models = tuple(ChannelModel(twin, one, product_material, bad_pixels, effects) for one in (low, high))
         self._drawn = tuple(model.channel() for model in self.models)
         repaired = self.models
         if bad_pixels != "repaired":
@@ -267,6 +353,9 @@ class PairTransfer:
         self._good = tuple(model.channel() for model in repaired)
         self._detector = detector_noise(twin)
         self._detector_drawn = detector_noise(twin, bad_pixels=bad_pixels)
+        changed = self.models[0].image_effects
+        if changed is not None:
+            self._detector_drawn = replace(self._detector_drawn, kernel=changed.pattern.kernel)
         self._references: dict[Setting, Channel] = {}
         self._tables: dict[tuple[OpenBeam, OpenBeam, float], TwoMaterialTables] = {}
 
@@ -284,6 +373,14 @@ class PairTransfer:
             InputError: the reference is too noisy for the target, or was taken at another distance.
         """
         check_geometry(references, self.targets)
+        log_images = np.asarray(log_images, dtype=np.float64)
+        effects = self.models[0].image_effects
+        if effects is not None:
+            straight = [
+                effects.straightened(np.exp(-plane), open_signal_DN=self._reference(one).open_signal_DN)
+                for plane, one in zip(log_images, references, strict=True)
+            ]
+            log_images = -np.log(np.maximum(np.stack(straight), 1e-6))
         pair = transfer_pair(
             log_images,
             self._tables_for(references, _highest_log(log_images[0])),
@@ -298,15 +395,41 @@ class PairTransfer:
                 f"{pair.unsolved_percent:.2g} % of the pixels fit no mixture of {self.materials[0]} and"
                 f" {self.materials[1]}; name a foreign material that does",
             )
-        return pair, warnings
+        return self._changed(pair), warnings
+
+    def _changed(self, pair: TransferredPair) -> TransferredPair:
+        """The pair with what came after calibration in its picture."""
+        transmission = pair.transmission
+        for plane, model in enumerate(self.models):
+            effects = model.image_effects
+            if effects is not None and effects.changes_picture():
+                transmission = transmission.copy()
+                # a solution's path lengths belong to the smoothed pair, and so does its transmission
+                quiet = np.exp(-self._log_of(pair.thickness_mm, plane))
+                transmission[plane] += effects.picture_change(quiet, model.thickness_behind(quiet))
+        return pair if transmission is pair.transmission else replace(pair, transmission=transmission)
+
+    def _log_of(self, thickness_mm: NDArray[np.float64], plane: int) -> NDArray[np.float64]:
+        spectral = self.twin.spectral
+        target = self.targets[plane]
+        model = spectral_model_of(self.twin, highest_kV=target.kV)
+        best = model.default_parameters() if spectral is None else spectral.best
+        weights = model.moment_weights(best, OpenBeam(kV=target.kV, filters=target.filters))[:1]
+        mu = np.stack([model.mu(name)[: weights.shape[1]] for name in self.materials])
+        behind = project_polychromatic(thickness_mm, mu, weights / weights.sum(), allow_negative=True)
+        return np.asarray(-np.log(np.maximum(behind[0].astype(np.float64), 1e-12)))
 
     def draw(self, pair: TransferredPair, rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (2, row, column) of a transferred pair, DN; each call draws its own noise."""
+        effects = [model.image_effects for model in self.models]
+        if effects[0] is not None and effects[1] is not None:
+            charge = transferred_charge(pair, targets=self._drawn, detector=self._detector_drawn, rng=rng)
+            return np.stack([one.read_out(plane, rng) for one, plane in zip(effects, charge, strict=True) if one])
         return sample_transferred(pair, targets=self._drawn, detector=self._detector_drawn, rng=rng)
 
     def _reference(self, setting: Setting) -> Channel:
         if setting not in self._references:
-            self._references[setting] = ChannelModel(self.twin, setting, self.materials[0]).channel()
+            self._references[setting] = ChannelModel(self._reference_twin, setting, self.materials[0]).channel()
         return self._references[setting]
 
     def _tables_for(self, references: tuple[Setting, Setting], highest_log: float) -> TwoMaterialTables:
@@ -316,9 +439,12 @@ class PairTransfer:
         key = (beams[0], beams[1], top)
         if key not in self._tables:
             model = spectral_model_of(self.twin, highest_kV=max(beam.kV for beam in beams))
-            best = self.twin.spectral.best if self.twin.spectral is not None else model.default_parameters()
+            now, then = (
+                model.default_parameters() if one.spectral is None else one.spectral.best
+                for one in (self.twin, self._reference_twin)
+            )
             self._tables[key] = tabulate_two_materials(
-                model, best, beams=beams, materials=self.materials, highest_log=top
+                model, np.stack([then, then, now, now]), beams=beams, materials=self.materials, highest_log=top
             )
         return self._tables[key]
 
@@ -389,12 +515,26 @@ class ReferenceImages:
             raise InputError(
                 "reference", received=f"no image of split {split}", expected="at least one reference image"
             )
+        line = present_line(twin)
+        now, effects, told = line.twin, line.effects, line.warnings
+        then = present_line(twin, after_calibration=False).twin
+        if recipe == "as_published" and twin.effects:
+            now, effects, told = then, (), ("the published recipe knows no effects: those of the twin are left out",)
+        self._reference_gain = [1.0, 1.0]
+        if now is not then:
+            gains = [[predict_flatfield(one, at).gain_DN.value for at in (low, high)] for one in (then, now)]
+            self._reference_gain = [before / after for before, after in zip(*gains, strict=True)]
         self._reference = reference
         self._recipe = recipe
         self._registration_px = registration_px
         self._settings = [reference_settings(reference.rows[number], reference_setting) for number in self.numbers]
+        # a beam that is another one since calibration is reached as another setting is
+        other_beam = now.spectral is not None and any(
+            item.since == "calibration" and item.id in ("kv_error", "filtration_error") for item in twin.effects
+        )
         self._needs_transfer = {
-            pair: not all(same_beam(own, target) for own, target in zip(pair, (low, high), strict=True))
+            pair: (other_beam and recipe == "raytwin")
+            or not all(same_beam(own, target) for own, target in zip(pair, (low, high), strict=True))
             for pair in sorted(set(self._settings), key=str)
         }
         self.transfers = any(self._needs_transfer.values())
@@ -408,17 +548,19 @@ class ReferenceImages:
         self._transfer: PairTransfer | None = None
         if self.transfers:
             self._transfer = PairTransfer(
-                twin,
+                now,
                 low=low,
                 high=high,
                 product_material=product_material,
                 foreign_material=foreign_material,
                 bad_pixels=bad_pixels,
+                effects=effects,
+                reference_twin=then,
             )
             self.channels = self._transfer.models
         else:
-            self.channels = tuple(ChannelModel(twin, one, product_material, bad_pixels) for one in (low, high))
-        self.warnings = tuple(self._plan_warnings(twin, (low, high)))
+            self.channels = tuple(ChannelModel(now, one, product_material, bad_pixels, effects) for one in (low, high))
+        self.warnings = (*told, *self._plan_warnings(twin, (low, high)))
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -443,7 +585,9 @@ class ReferenceImages:
         for plane, channel in enumerate(self.channels):
             transmission = np.exp(-images[plane].astype(np.float64))
             if self._recipe == "raytwin":
-                counts[plane] = channel.sample_counts(transmission, settings[plane], rng)
+                counts[plane] = channel.sample_counts(
+                    transmission, settings[plane], rng, reference_gain=self._reference_gain[plane]
+                )
             else:
                 counts[plane] = channel.sample_as_published(transmission, rng)
         return counts, ()
@@ -468,6 +612,19 @@ class ReferenceImages:
             yield "the twin has no spectral part: the gain behind the product is that of the open beam"
         for channel in self.channels:
             yield from channel.warnings
+        yield from effect_warnings(self.channels, references=True)
+
+
+def effect_warnings(channels: Sequence[ChannelModel], *, references: bool) -> list[str]:
+    """One line for each effect that images do not hold."""
+    found: dict[str, None] = {}
+    for channel in channels:
+        if channel.image_effects is None:
+            continue
+        found.update(dict.fromkeys(channel.image_effects.warnings))
+        if references and any(item.id == "composition_error" for item in channel.image_effects.effects):
+            found["effect composition_error is not in the images: references show the product as it is"] = None
+    return list(found)
 
 
 def generate_dataset(

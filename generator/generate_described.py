@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,23 @@ from ..acquisition.dataset_io import DatasetRow, write_dataset
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from ..files import sha256_of_file
+from ._fine_picture import FINE
 from .binning import refuse_binning
 from .describe import Description, Individual, Scene, choose_kind, sample_individual, sample_scene
-from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise
-from .render import SUPERSAMPLING, ExpectedImage, Geometry, geometry_of, render_scene, sample_expected
+from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise, effect_warnings
+from .image_effects import AffectedImage
+from .present_line import present_line
+from .render import (
+    SUPERSAMPLING,
+    ExpectedImage,
+    Geometry,
+    RenderedScene,
+    TracedScene,
+    geometry_of,
+    render_scene,
+    sample_expected,
+    trace_scene,
+)
 from .transfer import Channel
 from .twin import Twin
 
@@ -28,7 +41,7 @@ class DescribedPair:
     """A scene and what the detector shows of it on average: the images (low, high), masks (row, column) and the row."""
 
     scene: Scene
-    expected: tuple[ExpectedImage, ExpectedImage]
+    expected: tuple[ExpectedImage | AffectedImage, ExpectedImage | AffectedImage]
     foreign_object_mask: NDArray[np.bool_]
     product_mask: NDArray[np.bool_]
     row: DatasetRow
@@ -68,6 +81,8 @@ class DescribedScenes:
             )
         if not 1 <= supersampling <= 9:
             raise InputError("supersampling", received=supersampling, expected="1 to 9 sub-pixels along each axis")
+        line = present_line(twin)
+        twin = line.twin
         self.twin = twin
         self.description = description
         self.settings = (low, high)
@@ -75,7 +90,20 @@ class DescribedScenes:
         self.supersampling = supersampling
         self.geometry: Geometry = geometry_of(twin, settings=(low, high), line=description.line)
         material = description.products[0].material or "water"
-        self.models = tuple(ChannelModel(twin, one, material, bad_pixels) for one in (low, high))
+        instrument = replace(
+            twin.instrument,
+            pixel_mm=self.geometry.pixel_mm,
+            source_object_mm=self.geometry.source_object_mm,
+            source_detector_mm=self.geometry.source_detector_mm,
+        )
+        self.models = tuple(
+            ChannelModel(twin, one, material, bad_pixels, line.effects, instrument) for one in (low, high)
+        )
+        self.warnings = (
+            *line.warnings,
+            *(text for model in self.models for text in model.warnings),
+            *effect_warnings(self.models, references=False),
+        )
         self._channels: tuple[Channel, ...] = tuple(model.channel() for model in self.models)
         self._detector = detector_noise(twin, bad_pixels=bad_pixels)
         self._products: dict[int, Individual] = {}
@@ -92,16 +120,34 @@ class DescribedScenes:
         which = number % known if known else number
         product = self._product(which)
         scene = sample_scene(self.description, product, rays=self.geometry.rays(), rng=rng)
-        rendered = render_scene(
-            scene,
-            twin=self.twin,
-            channels=self._channels,
-            geometry=self.geometry,
-            supersampling=self.supersampling,
-        )
+        effects = [model.image_effects for model in self.models]
+        rendered: RenderedScene | TracedScene
+        expected: tuple[ExpectedImage | AffectedImage, ...]
+        if effects[0] is None:
+            rendered = render_scene(
+                scene,
+                twin=self.twin,
+                channels=self._channels,
+                geometry=self.geometry,
+                supersampling=self.supersampling,
+            )
+            expected = rendered.images
+        else:
+            rendered = trace_scene(
+                scene,
+                twin=self.twin,
+                channels=self._channels,
+                geometry=self.geometry,
+                supersampling=FINE,
+                attenuation_scale=effects[0].attenuation_scale,
+            )
+            expected = tuple(
+                one.image(*moments, rendered.lengths_mm, focal_blur_px=self.geometry.focal_blur_px)
+                for one, moments in zip(effects, rendered.moments, strict=True)
+                if one is not None
+            )
         foreign = _mask(rendered.foreign_cover)
         inside = _mask(rendered.cover)
-        expected = rendered.images
         objects = [one.individual for one in scene.foreign_objects]
         return DescribedPair(
             scene=scene,
@@ -121,12 +167,13 @@ class DescribedScenes:
 
     def draw(self, pair: DescribedPair, rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (2, row, column) of a pair, DN; each call draws its own noise."""
-        return np.stack(
-            [
-                sample_expected(image, channel=channel, detector=self._detector, rng=rng)
-                for image, channel in zip(pair.expected, self._channels, strict=True)
-            ]
-        )
+        frames = []
+        for image, channel, model in zip(pair.expected, self._channels, self.models, strict=True):
+            if isinstance(image, AffectedImage) and model.image_effects is not None:
+                frames.append(model.image_effects.sample(image, rng))
+            elif isinstance(image, ExpectedImage):
+                frames.append(sample_expected(image, channel=channel, detector=self._detector, rng=rng))
+        return np.stack(frames)
 
     def _product(self, number: int) -> Individual:
         if number not in self._products:
@@ -153,7 +200,7 @@ class DescribedScenes:
         value = float(np.random.default_rng([self.seed, _SPLIT, product]).random())
         return "test" if value < test else "val" if value < test + validation else "train"
 
-    def _contrast(self, expected: tuple[ExpectedImage, ...], mask: NDArray[np.bool_]) -> float:
+    def _contrast(self, expected: tuple[ExpectedImage | AffectedImage, ...], mask: NDArray[np.bool_]) -> float:
         if not mask.any():
             return math.nan
         dilations = dilations_for_pixel(self.geometry.pixel_mm)
@@ -231,7 +278,7 @@ def generate_from_description(
             )
             if progress is not None:
                 progress(number + 1)
-    warnings = [line for model in scenes.models for line in model.warnings]
+    warnings = list(scenes.warnings)
     if 100.0 * clipped / values > 0.1:
         warnings.append(
             f"{100.0 * clipped / values:.2g} % of the values lie below 1 DN above dark and are clipped in the log image"

@@ -20,6 +20,7 @@ def sample_correlated_quanta(
     psf_model: str,
     psf_sigma_px: float,
     rng: np.random.Generator,
+    kernel: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
     """Zero-mean quantum noise after the optical spread (row, column), DN.
 
@@ -32,6 +33,7 @@ def sample_correlated_quanta(
         step_DN: DN a quantum (row, column) or one number, above 0.
         psf_model, psf_sigma_px: the spread, see generator.psf.
         rng: source of randomness.
+        kernel: in place of the calibrated spread's, (2 R + 1,) per axis or (2 R + 1, 2 R + 1).
 
     Raises:
         InputError: negative or NaN variance, a step of 0 or less.
@@ -42,14 +44,25 @@ def sample_correlated_quanta(
         raise InputError("quantum variance", received=float(np.nanmin(variance)), expected="0 DN^2 or more everywhere")
     if not np.all(step > 0):
         raise InputError("DN a quantum", received=float(np.nanmin(step)), expected="above 0 DN everywhere")
-    kernel = noise_kernel_1d(psf_model, psf_sigma_px)
-    reach = len(kernel) // 2
+    taps = noise_kernel_1d(psf_model, psf_sigma_px) if kernel is None else kernel
+    reach = len(taps) // 2
     mean = np.pad(variance / step**2, reach, mode="edge")
     counts = rng.poisson(mean)
     wide = ((counts - mean) * np.pad(step, reach, mode="edge")).astype(np.float32)
-    blurred = convolve_separable(wide, kernel, mode="constant")
+    return spread_inside(wide, taps)
+
+
+def spread_inside(wide: NDArray[np.floating], kernel: NDArray[np.floating]) -> NDArray[np.float32]:
+    """`wide` (row + 2 R, column + 2 R) convolved with a kernel of reach R, per axis or whole: (row, column)."""
+    reach = len(kernel) // 2
+    if kernel.ndim == 1:
+        spread: NDArray[np.floating] = convolve_separable(wide, kernel, mode="constant")
+    else:
+        from scipy.signal import oaconvolve
+
+        spread = oaconvolve(wide, kernel, mode="same")
     inner = slice(reach, -reach) if reach else slice(None)
-    return np.asarray(blurred[inner, inner])
+    return np.asarray(spread[inner, inner], dtype=np.float32)
 
 
 def sample_frame_noise(
@@ -65,6 +78,7 @@ def sample_frame_noise(
     quantum_share: float = 1.0,
     third_cumulant_share: float = 1.0,
     read_share: float = 1.0,
+    kernel: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
     """Zero-mean noise of a frame of mean `signal_DN`, or the named shares of it (row, column), DN.
 
@@ -79,6 +93,7 @@ def sample_frame_noise(
         quantum_share, third_cumulant_share, read_share: shares of the variance, of the third cumulant and of the
             electronic variance to draw; all 1 for a frame from scratch, less for a top-up.
         rng: source of randomness.
+        kernel: see `sample_correlated_quanta`.
     """
     relative = np.asarray(gain_relative, dtype=np.float64)
     quanta_signal = np.clip(np.asarray(signal_DN, dtype=np.float64), 0.0, None) / relative
@@ -86,7 +101,7 @@ def sample_frame_noise(
     total = quantum_share * gain * quanta_signal
     step = gain * (third_cumulant_share / quantum_share if quantum_share > 0 else 1.0)
     noise = sample_correlated_quanta(
-        total / (1.0 + white_fraction), step, psf_model=psf_model, psf_sigma_px=psf_sigma_px, rng=rng
+        total / (1.0 + white_fraction), step, psf_model=psf_model, psf_sigma_px=psf_sigma_px, rng=rng, kernel=kernel
     ) * relative.astype(np.float32)
     white = relative**2 * total * (white_fraction / (1.0 + white_fraction))
     white = white + read_share * np.asarray(read_variance_DN2, dtype=np.float64)

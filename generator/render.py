@@ -6,7 +6,7 @@ drawn before that spread.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -173,6 +173,40 @@ def render_scene(
     Raises:
         InputError: a twin without spectral part.
     """
+    traced = trace_scene(scene, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+    images = _images(traced.moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+    return RenderedScene(images=images, foreign_cover=traced.foreign_cover, cover=traced.cover)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TracedScene:
+    """A scene before any blur.
+
+    Fields: moments: signal and quantum variance (row x supersampling, column x supersampling) over those of the open beam, a
+    channel each; lengths_mm: material -> (row, column) through the middle of each pixel; foreign_cover, cover: see
+    `RenderedScene`.
+    """
+
+    moments: "Moments" = field(repr=False)
+    lengths_mm: Mapping[str, Array] = field(repr=False)
+    foreign_cover: Array = field(repr=False)
+    cover: Array = field(repr=False)
+
+
+def trace_scene(
+    scene: Scene,
+    *,
+    twin: Twin,
+    channels: Sequence[Channel],
+    geometry: Geometry,
+    supersampling: int = SUPERSAMPLING,
+    attenuation_scale: Callable[[Sequence[str]], Mapping[str, float]] | None = None,
+) -> TracedScene:
+    """What stands in the beam, projected: `render_scene` without blur.
+
+    Args: as there, and
+        attenuation_scale: names of the scene's materials -> factors on their attenuation.
+    """
     rays, fine_rays = geometry.rays(), geometry.rays(supersampling)
     lengths, foreign = scene.lengths_mm(rays)
     names = tuple(lengths)
@@ -191,7 +225,8 @@ def render_scene(
     coarse = np.stack([lengths[name] for name in names]).astype(np.float32).reshape(len(names), -1)
     every = np.concatenate([coarse, *pieces], axis=1)[:, None]
     moments = []
-    for signal, variance in _moments_behind(every, names, twin=twin, channels=channels):
+    scale = {} if attenuation_scale is None else attenuation_scale(names)
+    for signal, variance in _moments_behind(every, names, twin=twin, channels=channels, scale=scale):
         planes = []
         for values in (signal[0], variance[0]):
             plane = values[: coarse.shape[1]].reshape(geometry.rows, geometry.columns)
@@ -206,8 +241,7 @@ def render_scene(
                 start = stop
             planes.append(fine)
         moments.append((planes[0], planes[1]))
-    images = _images(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
-    return RenderedScene(images=images, foreign_cover=foreign_cover, cover=cover)
+    return TracedScene(moments=moments, lengths_mm=lengths, foreign_cover=foreign_cover, cover=cover)
 
 
 def _tiles_with_edges(scene: Scene, rays: Rays, inside: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
@@ -240,7 +274,12 @@ Moments = Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 def _moments_behind(
-    stack: NDArray[np.float32], names: Sequence[str], *, twin: Twin, channels: Sequence[Channel]
+    stack: NDArray[np.float32],
+    names: Sequence[str],
+    *,
+    twin: Twin,
+    channels: Sequence[Channel],
+    scale: Mapping[str, float] | None = None,
 ) -> Moments:
     """Signal and quantum variance behind path lengths (material, row, column), each over that of the open beam."""
     model = spectral_model_of(twin, highest_kV=max(one.setting.kV for one in channels))
@@ -250,6 +289,8 @@ def _moments_behind(
         setting = channel.setting
         weights = model.moment_weights(best, OpenBeam(kV=setting.kV, filters=setting.filters))[:2]
         mu = np.stack([model.mu(name)[: weights.shape[1]] for name in names])
+        if scale:
+            mu = mu * np.array([scale.get(name, 1.0) for name in names])[:, None]
         signal, variance = project_polychromatic(stack, mu, weights / weights.sum(axis=1, keepdims=True))
         found.append((signal, variance))
     return found

@@ -39,12 +39,13 @@ def same_layers(first: Sequence[Filter], second: Sequence[Filter]) -> bool:
     return sorted(str(layer) for layer in first) == sorted(str(layer) for layer in second)
 
 
-def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
+def plan_top_up(*, reference: Setting, target: Setting, reference_gain: float = 1.0) -> TopUp:
     """What a top-up from `reference` to `target` must draw, for the same kV, filter and distance.
 
     With loads L (mAs a frame), N frames averaged and s = L_t / L_r:
     quantum 1/N_t - s/N_r, third cumulant 1/N_t^2 - s^2/N_r^2, electronic 1/N_t - s^2/N_r.
-    n frames of t averaged are not one frame of n t: the electronic noise differs.
+    n frames of t averaged are not one frame of n t: the electronic noise differs. Where the reference's quantum variance per
+    signal was `reference_gain` times the target's, s / N_r of the first is that many times as large, of the second its square.
 
     Raises:
         InputError: different kV, filters or distance, unknown load, or a reference noisier than the target.
@@ -76,7 +77,8 @@ def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
         )
     scale = loads[1] / loads[0]
     frames_r, frames_t = reference.averaged, target.averaged
-    quantum = 1.0 / frames_t - scale / frames_r
+    held = reference_gain * scale / frames_r
+    quantum = 1.0 / frames_t - held
     if quantum <= 1e-9:
         raise InputError(
             "target setting",
@@ -87,9 +89,9 @@ def plan_top_up(*, reference: Setting, target: Setting) -> TopUp:
     return TopUp(
         scale=scale,
         quantum=quantum,
-        third_cumulant=1.0 / frames_t**2 - scale**2 / frames_r**2,
+        third_cumulant=1.0 / frames_t**2 - reference_gain**2 * scale**2 / frames_r**2,
         read=1.0 / frames_t - scale**2 / frames_r,
-        held=scale / frames_r,
+        held=held,
         averaged=frames_t,
     )
 
@@ -112,14 +114,53 @@ def apply_top_up(
 ) -> NDArray[np.float32]:
     """Raw counts (row, column) at the target from a reference's transmission, dark included, DN.
 
+    The sum of `topped_up_charge` and dark, digitised.
+
+    Args: as there, and
+        dark_DN: dark frame at the target's exposure (row, column), DN.
+        bits, quantised: ADC range, and whether it rounds.
+    """
+    charge = topped_up_charge(
+        transmission,
+        plan,
+        open_signal_DN=open_signal_DN,
+        gain_DN=gain_DN,
+        gain_relative=gain_relative,
+        white_fraction=white_fraction,
+        read_variance_DN2=read_variance_DN2,
+        psf_model=psf_model,
+        psf_sigma_px=psf_sigma_px,
+        quantised=quantised,
+        rng=rng,
+    )
+    return digitise(charge + dark_DN, bits=bits, quantised=quantised, averaged=plan.averaged)
+
+
+def topped_up_charge(
+    transmission: NDArray[np.floating],
+    plan: TopUp,
+    *,
+    open_signal_DN: NDArray[np.floating],
+    gain_DN: NDArray[np.floating] | float,
+    gain_relative: NDArray[np.floating] | float,
+    white_fraction: float,
+    read_variance_DN2: NDArray[np.floating] | float,
+    psf_model: str,
+    psf_sigma_px: float,
+    quantised: bool,
+    rng: np.random.Generator,
+    kernel: NDArray[np.floating] | None = None,
+) -> NDArray[np.float64]:
+    """What the pixels hold (row, column) at the target from a reference's transmission, above dark, with its noise, DN.
+
     Args:
         transmission: the reference's I / I0 (row, column), its noise included.
         plan: from `plan_top_up`.
         open_signal_DN: mean above dark without object at the target, one frame (row, column), DN.
         gain_DN: variance per signal at each pixel's spectrum, the spread's share restored, DN.
-        dark_DN: dark frame at the target's exposure (row, column), DN.
-        bits, quantised: ADC range, and whether it rounds.
+        quantised: whether the ADC rounds, which brings a part of the electronic noise.
         rng: source of randomness.
+        kernel: of the noise in place of the calibrated spread's, see `noise.sample_correlated_quanta`.
     """
     signal = np.asarray(open_signal_DN, dtype=np.float64) * transmission
     # where the reference's noise is up, more noise is drawn: this couples them in the third moment; it is taken off
@@ -139,5 +180,6 @@ def apply_top_up(
         rng=rng,
         quantum_share=plan.quantum,
         third_cumulant_share=third_cumulant,
+        kernel=kernel,
     )
-    return digitise(signal + noise + dark_DN, bits=bits, quantised=quantised, averaged=plan.averaged)
+    return np.asarray(signal + noise)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from .noise import digitise, sample_correlated_quanta
+from .noise import digitise, sample_correlated_quanta, spread_inside
 from .psf import convolve_separable, noise_coupling, noise_kernel_1d, sampled_gaussian_1d
 from .two_material import TwoMaterialTables, solve_two_materials
 
@@ -50,7 +50,8 @@ class Channel:
 class DetectorNoise:
     """What of the detector's noise does not depend on the setting; see generator.twin.NoiseModel.
 
-    Fields: gain_relative, read_variance_DN2 (row, column), the latter of one frame with its rounding.
+    Fields: gain_relative, read_variance_DN2 (row, column), the latter of one frame with its rounding; kernel: of noise that
+    is drawn, where effects have changed the calibrated spread.
     """
 
     psf_model: str
@@ -61,6 +62,7 @@ class DetectorNoise:
     read_variance_DN2: NDArray[np.float32] = field(repr=False)
     bits: int | None
     quantised: bool
+    kernel: Array | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,7 +117,7 @@ def transfer_pair(
         InputError: images of another shape, or values that are not finite.
     """
     logs = np.asarray(log_images, dtype=np.float64)
-    solution = solve_two_materials(tables, _quiet_image(logs, references, detector))
+    solution = solve_two_materials(tables, quiet_image(logs, references, detector))
     mixing = solution.transfer()[2:]
     own = solution.log_signal[:2]
     at_target = np.clip(solution.log_signal[2:], _BRIGHTEST_LOG, _DARKEST_LOG)
@@ -153,7 +155,7 @@ def transfer_pair(
     )
 
 
-def _quiet_image(logs: Array, references: Sequence[Channel], detector: DetectorNoise) -> Array:
+def quiet_image(logs: Array, references: Sequence[Channel], detector: DetectorNoise) -> Array:
     """Log images (2, row, column) smoothed, but for detail that no noise can be.
 
     M + w (M0 - M) with M0 the image, M the smoothed one, w = z^4 / (z^4 + 5^4), z^2 the sum of squares of both channels'
@@ -264,7 +266,22 @@ def check_geometry(references: Sequence[Setting], targets: Sequence[Setting]) ->
 def sample_transferred(
     pair: TransferredPair, *, targets: Sequence[Channel], detector: DetectorNoise, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Counts with dark (2, row, column) of a transferred pair at its target, DN: the missing noise is drawn and added.
+    """Counts with dark (2, row, column) of a transferred pair at its target, DN: the missing noise is drawn and added."""
+    charge = transferred_charge(pair, targets=targets, detector=detector, rng=rng)
+    return np.stack(
+        [
+            digitise(
+                charge[c] + one.dark_DN, bits=detector.bits, quantised=detector.quantised, averaged=one.setting.averaged
+            )
+            for c, one in enumerate(targets)
+        ]
+    )
+
+
+def transferred_charge(
+    pair: TransferredPair, *, targets: Sequence[Channel], detector: DetectorNoise, rng: np.random.Generator
+) -> Array:
+    """What the pixels hold (2, row, column) of a transferred pair at its target, above dark, with its noise, DN.
 
     Quantum noise is drawn as independent compound Poisson noise with the target's third cumulant, plus a common part, one
     normal field seen by both channels, whose covariance is minus that of the transferred noise.
@@ -280,7 +297,9 @@ def sample_transferred(
     together = np.where(geometric > 0, missing[0, 1] / np.where(geometric > 0, geometric, 1.0), 0.0)
     common = np.minimum(np.abs(together), 1.0)
     coupling = 3.0 * noise_coupling(detector.psf_model, detector.psf_sigma_px)
-    kernel = noise_kernel_1d(detector.psf_model, detector.psf_sigma_px)
+    kernel: Array = noise_kernel_1d(detector.psf_model, detector.psf_sigma_px)
+    if detector.kernel is not None:
+        kernel = detector.kernel
     reach = len(kernel) // 2
     shape = signal.shape[1:]
     field_of_both = rng.standard_normal((shape[0] + 2 * reach, shape[1] + 2 * reach), dtype=np.float32)
@@ -296,21 +315,15 @@ def sample_transferred(
             psf_model=detector.psf_model,
             psf_sigma_px=detector.psf_sigma_px,
             rng=rng,
+            kernel=kernel,
         )
         amplitude = np.sqrt(seen * own[c] * common * one_frame[c])
         if c == 1:
             amplitude = amplitude * np.sign(together)
         wide = np.pad(amplitude, reach, mode="edge") * field_of_both
-        inner = slice(reach, -reach) if reach else slice(None)
-        counts[c] = signal[c] + noise + convolve_separable(wide, kernel, mode="constant")[inner, inner]
+        counts[c] = signal[c] + noise + spread_inside(wide, kernel)
     counts += _white_noise(pair, one_frame, missing, frames, detector, rng)
-    dark = np.stack([one.dark_DN for one in targets])
-    return np.stack(
-        [
-            digitise(counts[c] + dark[c], bits=detector.bits, quantised=detector.quantised, averaged=int(frames[c]))
-            for c in (0, 1)
-        ]
-    )
+    return counts
 
 
 def _white_noise(

@@ -92,7 +92,7 @@ def tabulate_two_materials(
 
     Args:
         model: tube and detector.
-        parameters: (parameter,) of the model.
+        parameters: (parameter,) of the model, or (beam, parameter) where the tube was another one for some of the beams.
         beams: the two that a solution starts from, then any others.
         materials: names of the library, the product first.
         highest_log: the largest log image of the first beam that the tables need to hold.
@@ -105,8 +105,8 @@ def tabulate_two_materials(
             "beams and materials", received=f"{len(beams)} and {len(materials)}", expected="2 or more, and 2"
         )
     weights = []
-    for beam in beams:
-        rows = model.moment_weights(parameters, beam)[:2]
+    for beam, own in zip(beams, np.broadcast_to(parameters, (len(beams), np.shape(parameters)[-1])), strict=True):
+        rows = model.moment_weights(own, beam)[:2]
         if not rows[0].sum() > 0:
             raise InputError(
                 "beam", received=f"{beam.kV:g} kV without signal", expected="a beam that reaches the detector"

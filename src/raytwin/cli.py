@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "compare": ("compare", "are two POD curves the same?"),
     "plan": ("plan", "how many images and networks a POD study needs"),
     "diagnose": ("diagnose", "where the sim-to-real gap lies, which effect causes it, how far it shrinks"),
+    "blind-check": ("blind_check", "the diagnosis on sealed cases of the virtual lab"),
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
 }

@@ -1,0 +1,142 @@
+"""How far a true effect lies from everything else that could be said, in standard deviations of the session.
+
+sigma of an effect e at its true strength s: the smallest length, in the metric C^-1 of noise and nuisances, of
+
+    m_e(s) - m_f(t)      over every other effect f, its variants and strengths t, and over no effect at all,
+
+so nuisances and the other effect are refitted. In a pair the strength of the partner is refitted too, by its tangent at the
+truth. It is Fisher's separation: the inaccuracy of the catalogue's laws is not in it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..diagnosis.inference import Curve
+from .blind_statistics import CurveKey, SessionStatistics
+
+_GRID = 121  # strengths of a competitor, evenly in the logarithm
+_NONE = "no effect"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Separation:
+    """Standard deviations: sigma from the nearest other model (`nearest`, an id or `no effect`), detection from no effect."""
+
+    sigma: float
+    nearest: str
+    detection: float
+
+
+def separation_of(
+    statistics: SessionStatistics,
+    effect: str,
+    strength: float,
+    *,
+    since: str | None = None,
+    partner: tuple[str, float, str | None] | None = None,
+    without: Sequence[str] = (),
+) -> Separation | None:
+    """Separation of a planted effect from all other models, standard deviations.
+
+    Args:
+        statistics: of the session.
+        effect, strength, since: what was planted; the strength has its sign.
+        partner: the other effect of a pair, its strength and onset.
+        without: effects that are no competitors.
+
+    Returns:
+        None where the catalogue has no response of the effect (it is not in it, or was left out); 0 where nothing in the
+        session responds to it.
+    """
+    if effect in statistics.missing:
+        return Separation(sigma=0.0, nearest=_NONE, detection=0.0)
+    own = _best_variant(statistics, effect, strength, since)
+    if own is None:
+        return None
+    gram = statistics.gram
+    if partner is not None:
+        beside = _best_variant(statistics, partner[0], partner[1], partner[2])
+        if beside is not None:
+            tangent = _tangent(statistics, beside, abs(partner[1]))
+            column = gram @ tangent
+            length = float(tangent @ column)
+            if length > 0:
+                gram = gram - np.outer(column, column) / length
+    mine = np.zeros(len(gram))
+    mine[own.nodes] = _weights(own, np.array([abs(strength)]))[0]
+    image = gram @ mine
+    square = max(float(mine @ image), 0.0)
+    detection = math.sqrt(square)
+    best, nearest = square, _NONE
+    for curve in statistics.curves:
+        if curve.effect == effect or curve.effect in without or (partner is not None and curve.effect == partner[0]):
+            continue
+        strengths = np.geomspace(curve.low / 10.0, 1.5 * curve.high, _GRID)
+        weights = _weights(curve, strengths)
+        quadratic = np.einsum("si,ij,sj->s", weights, gram[curve.nodes, curve.nodes], weights)
+        distance = float(np.min(square - 2.0 * weights @ image[curve.nodes] + quadratic))
+        if distance < best:
+            best, nearest = distance, curve.effect
+    return Separation(sigma=math.sqrt(max(best, 0.0)), nearest=nearest, detection=detection)
+
+
+def matched_filter(statistics: SessionStatistics, *, bare: bool) -> dict[str, float]:
+    """Correlation of the residual with each effect's template, the best of its variants and strengths, standard deviations.
+
+    b / sqrt(G) with the nuisances' covariance, or (`bare`) N r / |N| of probes alone.
+    """
+    result: dict[str, float] = {}
+    for curve in statistics.curves:
+        if bare:
+            top, length = statistics.bare[curve.nodes], statistics.bare_norm[curve.nodes]
+        else:
+            top, length = (
+                statistics.linear[curve.nodes],
+                np.sqrt(np.maximum(np.diag(statistics.gram)[curve.nodes], 0.0)),
+            )
+        values = np.where(length > 1e-6, top / np.maximum(length, 1e-6), 0.0)
+        result[curve.effect] = max(result.get(curve.effect, 0.0), float(values.max(initial=0.0)))
+    return result
+
+
+def _weights(curve: CurveKey, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (strength, node) of a curve's nodes, as inference interpolates between them."""
+    model = Curve(
+        effect=curve.effect,
+        variant=curve.variant,
+        parameters={},
+        low=curve.low,
+        high=curve.high,
+        strengths=np.array(curve.strengths),
+        responses=np.zeros((len(curve.strengths), 0)),
+    )
+    return model.weights(strengths)
+
+
+def _tangent(statistics: SessionStatistics, curve: CurveKey, strength: float) -> NDArray[np.float64]:
+    """Node weights of d m / d s at a strength."""
+    step = 0.01 * strength
+    weights = _weights(curve, np.array([strength - step, strength + step]))
+    result = np.zeros(len(statistics.gram))
+    result[curve.nodes] = (weights[1] - weights[0]) / (2.0 * step)
+    return result
+
+
+def _best_variant(statistics: SessionStatistics, effect: str, strength: float, since: str | None) -> CurveKey | None:
+    """Of an effect's variants of the right sign and onset the one that the session itself likes best at this strength."""
+    own = [curve for curve in statistics.curves if curve.effect == effect]
+    if not own:
+        return None
+    right = [curve for curve in own if curve.sign == math.copysign(1.0, strength)] or own
+    right = [curve for curve in right if since is None or curve.since == since] or right
+
+    def likelihood(curve: CurveKey) -> float:
+        weights = _weights(curve, np.array([abs(strength)]))[0]
+        inner = statistics.gram[curve.nodes, curve.nodes]
+        return float(weights @ statistics.linear[curve.nodes] - 0.5 * weights @ inner @ weights)
+
+    return max(right, key=likelihood)

@@ -30,13 +30,15 @@ class NoiseCovariance:
 
     Fields: covariance_DN2 (2 R + 1, 2 R + 1), lag 0 in the centre, symmetric; samples: independent frames x pixels that
     carry the same information; signal_DN: mean signal above dark over the same pixels; common_mode: variance of the
-    factor that a whole frame shares, relative to the signal (0 where it does not stand out of the pixels' own noise).
+    factor that a whole frame shares, relative to the signal (0 where it does not stand out of the pixels' own noise);
+    pair_share (2 R + 1, 2 R + 1): pairs of good pixels at each lag over pixels, less than 1 because frames end.
     """
 
     covariance_DN2: NDArray[np.float64]
     samples: float
     signal_DN: float
     common_mode: float
+    pair_share: NDArray[np.float64]
 
     @property
     def radius(self) -> int:
@@ -124,6 +126,7 @@ def compute_noise_covariance(
         samples=degrees * pixels,
         signal_DN=signal,
         common_mode=common,
+        pair_share=np.clip(neighbours / pixels, 1.0 / pixels, 1.0),
     )
 
 
@@ -133,10 +136,14 @@ def _half_plane(radius: int) -> list[tuple[int, int]]:
     return sorted(lags, key=lambda lag: (lag[0] ** 2 + lag[1] ** 2, lag))
 
 
-def sampling_covariance(covariance_DN2: NDArray[np.float64], samples: float, radius: int) -> NDArray[np.float64]:
+def sampling_covariance(
+    covariance_DN2: NDArray[np.float64], samples: float, radius: int, pair_share: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Covariance matrix (L, L) of estimated autocovariances at the half-plane lags up to `radius`, DN^4.
 
-    For a stationary Gaussian field: Cov[C(o), C(p)] = sum_k [C(k) C(k + o - p) + C(k) C(k + o + p)] / N.
+    For a stationary Gaussian field: Cov[C(o), C(p)] = sum_k [C(k) C(k + o - p) + C(k) C(k + o + p)] / N. `pair_share`
+    (2 R' + 1, 2 R' + 1), lag 0 in the centre: how many pairs there are at a lag for each of N; the entries are divided by
+    the root of the two lags' shares.
 
     Source: Bartlett, An Introduction to Stochastic Processes (1955), in two dimensions.
     """
@@ -153,6 +160,10 @@ def sampling_covariance(covariance_DN2: NDArray[np.float64], samples: float, rad
         padded[centre + difference[..., 0], centre + difference[..., 1]]
         + padded[centre + total[..., 0], centre + total[..., 1]]
     )
+    if pair_share is not None:
+        middle = pair_share.shape[0] // 2
+        root = np.sqrt(pair_share[middle + lags[:, 0], middle + lags[:, 1]])
+        matrix = matrix / np.outer(root, root)
     return np.asarray(matrix / samples)
 
 
@@ -214,7 +225,7 @@ class _Problem:
             ]
             # weights from the measured covariances favour those that came out low, so the fit's own take their place
             smooth = self._smoothed(window, item.samples, read_variance) if expected is None else expected[number]
-            matrix = sampling_covariance(smooth, item.samples, radius)
+            matrix = sampling_covariance(smooth, item.samples, radius, item.pair_share)
             lower = cholesky(matrix + 1e-12 * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), lower=True)
             inverse = solve_triangular(lower, np.eye(len(lower)), lower=True)
             self.whitening.append(inverse)
@@ -297,7 +308,7 @@ def _summed_gains(
         cut = item.radius - reach
         edge = item.covariance_DN2.shape[0] - cut
         window = item.covariance_DN2[cut:edge, cut:edge]
-        matrix = sampling_covariance(window, item.samples, reach)
+        matrix = sampling_covariance(window, item.samples, reach, item.pair_share)
         # half plane: every lag but 0 counts twice
         twice = np.full(len(matrix), 2.0)
         twice[0] = 1.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, text_from_filters
@@ -25,6 +25,7 @@ COVARIANCE_FRAMES = 400
 _PIECE_BYTES = 8 * 2**20
 _COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
 _FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 16))
+_SERIES_REPRODUCIBILITY = 1e-3  # of the level: what series of one setting are weighted by, beside their noise
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
@@ -290,6 +291,7 @@ def _covariance(
         covariance_DN2=result.covariance_DN2 * item.averaged,
         samples=result.samples,
         signal_DN=result.signal_DN,
+        pair_share=result.pair_share,
         common_mode=result.common_mode,
     )
 
@@ -799,7 +801,7 @@ def _levels(
                 filters=first.filters,
                 gain_DN=estimate_from_sd(float(fit.gain_DN[fitted]), float(fit.gain_sd_DN[fitted])),
                 photon_transfer_slope_DN=estimate_from_sd(float(fit.slope_DN[fitted]), float(fit.slope_sd_DN[fitted])),
-                rate_DN_per_mAs=_rate([point_of[sums[i][0].name] for i in same], darks, good),
+                rate_DN_per_mAs=_rate([point_of[sums[i][0].name] for i in same], darks, good, flat_shape),
                 source_detector_mm=distance,
                 saturation_DN=min(saturated) if saturated else None,
                 flat_shape=flat_shape.astype(np.float32),
@@ -810,8 +812,26 @@ def _levels(
     return tuple(levels)
 
 
-def _rate(points: Sequence[SeriesPoint], darks: _Darks, good: NDArray[np.bool_]) -> Estimate | None:
-    """Signal per mAs (DN) by weighted mean over the series; the scatter between them is part of the interval."""
+def median_variance(noise_variance: ArrayLike, *, spread_sd: ArrayLike, pixels: int) -> NDArray[np.float64]:
+    """Variance of the median of a fixed map under noise, in the unit of `noise_variance`.
+
+        var = s sqrt((2 m)^2 + (pi / 2 s)^2) / n
+
+    s: noise sd of a pixel, m: sd of the map. Where m >> s only the pixels within s of the median can move it, so its noise is
+    sqrt(2 m / s) times that of the mean. Right at both ends, between them within 15 % for Gaussian maps.
+    """
+    noise = np.asarray(noise_variance, dtype=np.float64)
+    spread = np.asarray(spread_sd, dtype=np.float64)
+    return np.asarray(np.sqrt(noise * (4.0 * spread**2 + (0.5 * math.pi) ** 2 * noise)) / pixels)
+
+
+def _rate(
+    points: Sequence[SeriesPoint], darks: _Darks, good: NDArray[np.bool_], flat_shape: NDArray[np.float64]
+) -> Estimate | None:
+    """Signal per mAs (DN) by weighted mean over the series; the scatter between them is part of the interval.
+
+    What a single series cannot show, how well tube and filters repeat themselves, is not: the spectral fit learns it.
+    """
     known = [point for point in points if point.load_mAs]
     if not known:
         return None
@@ -819,15 +839,17 @@ def _rate(points: Sequence[SeriesPoint], darks: _Darks, good: NDArray[np.bool_])
     signal = np.array([point.signal_DN for point in known])
     noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
     frames = np.array([point.frames for point in known], dtype=np.float64)
-    # median over pixels: quantum and read noise average out, the dark's own noise and 0.1 % of reproducibility stay
-    variance = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames / good.sum() * 2.0 + (
-        1e-3 * signal
-    ) ** 2
-    weight = load**2 / variance
-    rate = float(np.sum(weight * signal / load) / np.sum(weight))
-    scatter = float(np.sum(weight * (signal / load - rate) ** 2)) / max(len(known) - 1, 1)
-    sd = math.sqrt(max(scatter, 1.0) / float(np.sum(weight)))
-    return estimate_from_sd(rate, sd)
+    of_a_pixel = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames
+    # robust: a few pixels far off do not move a median
+    spread = 1.4826 * float(np.median(np.abs(flat_shape[good] - np.median(flat_shape[good]))))
+    sampling = median_variance(of_a_pixel, spread_sd=spread * signal, pixels=int(good.sum())) / load**2
+    weight = 1.0 / (sampling + (_SERIES_REPRODUCIBILITY * signal / load) ** 2)
+    weight /= weight.sum()
+    rate = float(np.sum(weight * signal / load))
+    variance = float(np.sum(weight**2 * sampling))
+    if len(known) > 1:
+        variance = max(variance, float(np.sum(weight * (signal / load - rate) ** 2)) / (len(known) - 1))
+    return estimate_from_sd(rate, math.sqrt(variance))
 
 
 def _evidence(

@@ -26,10 +26,10 @@ class Prior:
 PRIORS: dict[str, Prior] = {
     "inherent_filtration_mm_Al": Prior(
         centre=1.0,
-        sd=1.5,
+        sd=1.0,
         low=0.0,
         high=12.0,
-        reason="exit window, oil, housing and air as mm Al, beyond what is declared",
+        reason="exit window, oil, housing and air: 0 to 2.5 mm Al in most tubes, beyond what is declared",
     ),
     "log_scintillator_thickness": Prior(
         centre=0.0, sd=0.2, low=-1.6, high=1.6, reason="packing density and tolerance of a declared scintillator"
@@ -95,15 +95,20 @@ ATTENUATION_SCALE = Prior(centre=0.0, sd=0.01, reason="density and thickness of 
 TABLE_SHARE = Prior(
     centre=0.33, sd=0.47, reason="0 is xraylib, 1 the other table: xraylib, Chantler and PENELOPE are equally likely"
 )
+# of the shares of the two other tables of a material: of three equally likely tables one is right
+SHARES_CORRELATION = -0.5
 
-# The sizes of these small departures differ from line to line, together: one factor for all their standard deviations,
-# learned from the data. Its median is 0.3, its upper 95 % bound 1.4: most lines show little of all this, some much.
+# Sizes of small departures, learned from the data. Nobody states them for a line, and lines differ by more than ten: each
+# has a lognormal prior, by its median and its logarithm's standard deviation. The upper 95 % bounds are what a poor line
+# shows (1.6 of the standard deviations above, 0.3 % of a level, 1 % of a gain), the lower ones next to nothing.
+
+# departures from tables and models, one factor for all their standard deviations
 DEPARTURES = ("kV_tilt", "yield_exponent", "hardness_exponent", "escape_scale", "log_mu_")
 DEPARTURE_FACTOR = 0.3
 LOG_DEPARTURE_SD = 0.8
 
 # Departure of single levels and gains from any such model: reproducibility of tube and filters, and physics that is not
-# in it. Learned from the levels with these as the prior: logarithm of the relative standard deviation.
-LEVEL_DISCREPANCY = 0.0006
-GAIN_DISCREPANCY = 0.002
-LOG_DISCREPANCY_SD = 0.8  # a factor of 2.2 either way
+# in it. Relative standard deviation; a level carries no other allowance for reproducibility.
+LEVEL_DISCREPANCY = 0.0003
+GAIN_DISCREPANCY = 0.001
+LOG_DISCREPANCY_SD = 1.2

@@ -39,6 +39,7 @@ from .priors import (
     LOG_DISCREPANCY_SD,
     MEASURED_SPECTRUM,
     PRIORS,
+    SHARES_CORRELATION,
     TABLE_SHARE,
     UNDECLARED_SCINTILLATOR,
     Prior,
@@ -282,8 +283,8 @@ def fit_spectrum(
             correction=correction,
             cover=model.cover,
             counting=model.counting,
-            level_discrepancy=float(np.sqrt(np.mean(discrepancies["level"] ** 2))),
-            gain_discrepancy=float(np.sqrt(np.mean(discrepancies["gain"] ** 2))),
+            level_discrepancy=_sd_of_mixture(discrepancies["level"]),
+            gain_discrepancy=_sd_of_mixture(discrepancies["gain"]),
             calibrated_kV=(min(voltages), max(voltages)),
             calibrated_filters=tuple(sorted({text_from_filters(level.filters) for level in known})),
         ),
@@ -377,9 +378,24 @@ class _Posterior:
         self.is_gain = np.array([item.kind == "gain" for item in data])
         self.dimensions = len(self.shape) + len(self.learned) + 1  # the last is the factor of the departures
         self.departs = np.array([name.startswith(DEPARTURES) for name in self.linear_names])
+        # one of the tables is right, so shares of two others exclude each other: what one takes is missing to the other
+        self.mixing = np.eye(len(self.linear))
+        for first, second in self._share_pairs():
+            self.mixing[second, first] = SHARES_CORRELATION
+            self.mixing[second, second] = math.sqrt(1.0 - SHARES_CORRELATION**2)
         self.alternative = next(
             (i for i, place in enumerate(self.shape) if names[place] == ALTERNATIVE_SCINTILLATOR), None
         )
+
+    def _share_pairs(self) -> list[tuple[int, int]]:
+        """Places among the linear parameters of each material's shares of the two other tables."""
+        first, second = (f"{table}_" for table in OTHER_TABLES)
+        place = {name: i for i, name in enumerate(self.linear_names)}
+        return [
+            (i, place[second + name.removeprefix(first)])
+            for name, i in place.items()
+            if name.startswith(first) and second + name.removeprefix(first) in place
+        ]
 
     def parameters(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Full parameter sets (draw, parameter), the linear ones at their prior centres, from shapes (draw, shape)."""
@@ -445,7 +461,7 @@ class _Posterior:
         """Log likelihood (draw,), parameters, and mean and lower root of the precision of the linear ones given u."""
         full = self.parameters(u)
         expected, slope = self.expectation(full)
-        slope = slope * self.linear_sd(u)[:, None, :]
+        slope = (slope * self.linear_sd(u)[:, None, :]) @ self.mixing
         variance = self.variances(u)
         misfit = self.value - expected
         weighted = slope / variance[:, :, None]
@@ -475,7 +491,7 @@ class _Posterior:
         if rng is not None:
             normal = rng.standard_normal(z.shape)
             z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
-        full[:, self.linear] += self.linear_sd(u) * z
+        full[:, self.linear] += self.linear_sd(u) * (z @ self.mixing.T)
         escape = list(self.model.names).index("escape_scale")
         bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
         full[:, escape] = np.clip(full[:, escape], bounds[0][escape], bounds[1][escape])
@@ -573,6 +589,20 @@ class _Posterior:
 
     def _density(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(self.log_likelihood(u) - 0.5 * np.sum(u**2, axis=1))
+
+
+def _sd_of_mixture(sizes: NDArray[np.float64]) -> float:
+    """Standard deviation of the Gaussian whose 95 % interval is that of Gaussians of these equally likely `sizes` (draw,)."""
+    from scipy.special import ndtr
+
+    low, high = float(sizes.min()), float(sizes.max())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if np.mean(ndtr(-_Z95 * middle / sizes)) > 0.025:
+            low = middle
+        else:
+            high = middle
+    return high
 
 
 def _weights(logarithms: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

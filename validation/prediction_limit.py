@@ -27,7 +27,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -44,7 +44,15 @@ from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text, setting_from_text, text_from_filters
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.next_measurement import rank_measurements
-from raytwin.calibration.priors import ATTENUATION_SCALE, GAIN_DISCREPANCY, LEVEL_DISCREPANCY, PRIORS, TABLE_SHARE
+from raytwin.calibration.priors import (
+    ATTENUATION_SCALE,
+    DEPARTURE_FACTOR,
+    GAIN_DISCREPANCY,
+    LEVEL_DISCREPANCY,
+    PRIORS,
+    SHARES_CORRELATION,
+    TABLE_SHARE,
+)
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.twin import Twin
 from raytwin.lab.attenuation import composition, mu_per_mm
@@ -211,11 +219,14 @@ class Part:
 
 
 def prior_sd() -> dict[str, float]:
-    """Prior standard deviation of each unknown: the twin's widths, under the names of this script."""
+    """Prior standard deviation of each unknown: the twin's widths, departures at their median size; this script's names."""
+    from scipy.stats import truncnorm
+
     tables = {"scale": ATTENUATION_SCALE.sd, "first table": TABLE_SHARE.sd, "second table": TABLE_SHARE.sd}
-    return {
+    filtration = PRIORS["inherent_filtration_mm_Al"]
+    found = {
         # cut at 0, the prior is narrower than its sd says
-        "filtration": 0.72 * PRIORS["inherent_filtration_mm_Al"].sd,
+        "filtration": float(truncnorm(-filtration.centre / filtration.sd, math.inf, scale=filtration.sd).std()),
         "thickness": PRIORS["log_scintillator_thickness"].sd,
         "voltage": PRIORS["kV_error"].sd,
         "voltage tilt": PRIORS["kV_tilt"].sd,
@@ -229,6 +240,18 @@ def prior_sd() -> dict[str, float]:
         "scintillator table": PRIORS["scintillator_table"].sd,
         **{f"{material} {what}": sd for material in ("Al", "Cu") for what, sd in tables.items()},
     }
+    departures = {"voltage tilt", "yield", "hardness", "escape", "Al scale", "Cu scale"}
+    return {name: sd * (DEPARTURE_FACTOR if name in departures else 1.0) for name, sd in found.items()}
+
+
+def prior_covariance(names: Sequence[str]) -> Array:
+    """Prior covariance (unknown, unknown): of three tables one is right, whichever the other two are measured from."""
+    sd = prior_sd()
+    covariance = np.diag([sd[name] ** 2 for name in names])
+    for material in ("Al", "Cu"):
+        first, second = names.index(f"{material} first table"), names.index(f"{material} second table")
+        covariance[first, second] = covariance[second, first] = SHARES_CORRELATION * TABLE_SHARE.sd**2
+    return covariance
 
 
 class Forward:
@@ -356,7 +379,7 @@ def information_limit(
     beam: tuple[float, str],
     errors: dict[tuple[float, str], tuple[float, float]],
     *,
-    sd: Array,
+    prior: Array,
     discrepancies: tuple[float, float],
     read_share: float,
 ) -> tuple[float, float]:
@@ -366,11 +389,11 @@ def information_limit(
         derivatives: of level and gain by the unknowns, of all beams.
         beam: to predict.
         errors: of each measured beam, the relative sd of level and of gain.
-        sd: prior standard deviations of the unknowns.
+        prior: covariance of the unknowns before any measurement.
         discrepancies: relative sd of a single level and gain beyond the unknowns, of measured and predicted beams.
         read_share: share of the setting's variance that is not quantum noise.
     """
-    information = np.diag(1.0 / sd**2)
+    information = np.linalg.inv(prior)
     for measured, known in errors.items():
         for row, own, extra in zip(derivatives[measured], known, discrepancies, strict=True):
             information = information + np.outer(row, row) / (own**2 + extra**2)
@@ -394,7 +417,7 @@ def run_system(seed: int, *, kind: str, folder: Path) -> dict[str, Any]:
     """Everything that is kept of one system."""
     session, lab = prepare(seed, kind, folder)
     derivatives = {(kV, layers): (np.array(level), np.array(gain)) for kV, layers, level, gain in lab["derivatives"]}
-    sd = np.array([prior_sd()[name] for name in lab["unknowns"]])
+    prior = prior_covariance(lab["unknowns"])
     rows: list[dict[str, Any]] = []
     for protocol, chosen in PROTOCOLS.items():
         twin = calibrated(session, chosen, seed)
@@ -415,7 +438,7 @@ def run_system(seed: int, *, kind: str, folder: Path) -> dict[str, Any]:
                     derivatives,
                     (setting.kV, text_from_filters(setting.filters)),
                     errors,
-                    sd=sd,
+                    prior=prior,
                     discrepancies=extra,
                     read_share=max(0.0, 1.0 - quantum / truth["sd_DN"] ** 2),
                 )

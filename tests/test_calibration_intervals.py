@@ -1,0 +1,98 @@
+"""Widths of what calibration states: nothing counted twice, nothing left out."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.setting import filters_from_text
+from raytwin.calibration.noise_covariance import compute_noise_covariance, fit_spread, sampling_covariance
+from raytwin.calibration.photon_transfer import median_variance
+from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
+from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
+from raytwin.generator.twin import Level, estimate_from_sd
+
+SMALL = (24, 24)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 4.0])
+def test_noise_of_a_median_over_pixels_grows_with_the_spread_of_the_map(spread):
+    rng = np.random.default_rng(0)
+    pixels, maps, draws = 900, 30, 60
+    squares = []
+    for _ in range(maps):
+        exact = spread * rng.standard_normal(pixels)
+        noisy = np.median(exact + rng.standard_normal((draws, pixels)), axis=1)
+        squares.append(np.mean((noisy - np.median(exact)) ** 2))
+    stated = float(median_variance(1.0, spread_sd=spread, pixels=pixels))
+    # the maps are the independent ones
+    error = np.std(squares) / math.sqrt(maps)
+    assert np.mean(squares) == pytest.approx(stated, rel=0.15, abs=3.5 * error)
+
+
+def test_shares_of_lags_rows_and_columns_beyond_the_frame_are_missing():
+    rng = np.random.default_rng(1)
+    found = compute_noise_covariance(
+        [rng.standard_normal((8, *SMALL))], signal_DN=np.zeros(SMALL), good=np.ones(SMALL, dtype=bool), radius=4
+    )
+    expected = np.outer(1.0 - np.abs(np.arange(-4, 5)) / SMALL[0], 1.0 - np.abs(np.arange(-4, 5)) / SMALL[1])
+    assert found.pair_share == pytest.approx(expected)
+
+
+def test_sampling_covariance_of_white_noise_is_that_of_the_pairs_there_are():
+    covariance = np.zeros((9, 9))
+    covariance[4, 4] = 3.0
+    share = np.full((9, 9), 0.5)
+    share[4, 4] = 1.0
+    matrix = sampling_covariance(covariance, 1000.0, 2, share)
+    assert matrix[0, 0] == pytest.approx(2 * 9.0 / 1000.0)
+    assert np.diag(matrix)[1:] == pytest.approx(9.0 / 500.0)
+
+
+def test_chi_square_of_a_small_frame_is_that_of_its_degrees_of_freedom():
+    rng = np.random.default_rng(2)
+    good = np.ones(SMALL, dtype=bool)
+    total, degrees = 0.0, 0
+    for _ in range(12):
+        flat = compute_noise_covariance(
+            [20.0 * rng.standard_normal((40, *SMALL))], signal_DN=np.full(SMALL, 400.0), good=good, radius=5
+        )
+        dark = compute_noise_covariance(
+            [5.0 * rng.standard_normal((40, *SMALL))], signal_DN=np.zeros(SMALL), good=good, radius=5
+        )
+        found = fit_spread([flat, dark], group=[0, -1], models=["aperture"])
+        total, degrees = total + found.chi_square, degrees + found.degrees
+    # 5 % beside chance: differences of neighbouring frames make covariances a little less than Gaussian
+    assert total < 1.05 * chi2.ppf(0.999, degrees)
+
+
+def test_sd_of_a_mixture_has_its_interval():
+    sizes = np.exp(0.8 * np.random.default_rng(3).standard_normal(4000))
+    sd = _sd_of_mixture(sizes)
+    assert np.mean(norm.cdf(-1.959964 * sd / sizes)) == pytest.approx(0.025, abs=1e-6)
+    assert sd > np.median(sizes)
+    assert _sd_of_mixture(np.full(10, 0.3)) == pytest.approx(0.3)
+
+
+def test_shares_of_two_other_tables_exclude_each_other():
+    # one level: of the tables the data say nothing, so that the draws are the prior's
+    level = Level(
+        kV=90.0,
+        filters=filters_from_text("Cu:0.05"),
+        gain_DN=estimate_from_sd(5.0, 0.05),
+        photon_transfer_slope_DN=estimate_from_sd(2.0, 0.02),
+        rate_DN_per_mAs=estimate_from_sd(3000.0, 3.0),
+        source_detector_mm=1059.0,
+        saturation_DN=None,
+        flat_shape=np.ones((1, 1), dtype=np.float32),
+        series=("flat",),
+        role="calibration",
+    )
+    instrument = Instrument(pixel_mm=0.15, source_detector_mm=1059.0, scintillator=filters_from_text("CsI:0.5"))
+    posterior = fit_spectrum([level], instrument, rng=np.random.default_rng(4)).posterior
+    first, second = posterior.column("chantler_Cu"), posterior.column("penelope_Cu")
+    # 512 draws: 0.033 for a correlation of -0.5, 3 % for a standard deviation
+    assert np.corrcoef(first, second)[0, 1] == pytest.approx(SHARES_CORRELATION, abs=0.12)
+    assert [first.std(), second.std()] == pytest.approx([TABLE_SHARE.sd] * 2, rel=0.15)

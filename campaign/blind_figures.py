@@ -37,6 +37,12 @@ def _png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
+def _legend(axis: Any, **more: Any) -> None:
+    """A legend where there is anything to explain."""
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(**more)
+
+
 def _middle(row: Mapping[str, Any]) -> float:
     low, high = max(row["sigma_from"], 1.0), row["sigma_to"] or 30.0
     return math.sqrt(low * high)
@@ -71,7 +77,7 @@ def plot_accuracy(scores: Mapping[str, Any], baselines: Mapping[str, Mapping[str
     axis.set_xticks([1, 2, 3, 4, 5, 10, 20, 50], ["1", "2", "3", "4", "5", "10", "20", "50"])
     axis.set_xticks([], minor=True)
     axis.set_title("single effects, full measurement set", fontsize=10)
-    axis.legend(fontsize=8, loc="center right")
+    _legend(axis, fontsize=8, loc="center right")
     axis = axes[0, 1]
     for name, entry in [("diagnosis", scores), *baselines.items()]:
         rows = [row for row in entry["top1"]["single_by_sigma"] if row["n"]]
@@ -89,7 +95,7 @@ def plot_accuracy(scores: Mapping[str, Any], baselines: Mapping[str, Mapping[str
     axis.set_xticks([1, 2, 3, 4, 5, 10, 20, 50], ["1", "2", "3", "4", "5", "10", "20", "50"])
     axis.set_xticks([], minor=True)
     axis.set_title("beside baselines", fontsize=10)
-    axis.legend(fontsize=8)
+    _legend(axis, fontsize=8)
     return _png(figure)
 
 
@@ -123,7 +129,7 @@ def plot_reliability(scores: Mapping[str, Any], baselines: Mapping[str, Mapping[
                 label="classifier",
             )
         axis.set(xlim=(0, 1.02), ylim=(0, 1.06), xlabel="stated probability", ylabel="share that was true", title=title)
-        axis.legend(fontsize=8)
+        _legend(axis, fontsize=8)
     return _png(figure)
 
 
@@ -195,7 +201,7 @@ def plot_strengths(outcomes: Sequence[Outcome]) -> bytes:
     axis.set_yticks([0.2, 0.5, 0.9, 1.1, 2, 5], ["0.2", "0.5", "0.9", "1.1", "2", "5"])
     axis.set_yticks([], minor=True)
     if rows:
-        axis.legend(fontsize=7, ncols=2, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        _legend(axis, fontsize=7, ncols=2, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return _png(figure)
 
 
@@ -249,7 +255,7 @@ def plot_unknown(outcomes: Sequence[Outcome]) -> bytes:
         xlabel="stated probability of an unknown effect",
         ylabel="share of cases up to",
     )
-    axis.legend(fontsize=8)
+    _legend(axis, fontsize=8)
     axis = axes[0, 1]
     verdicts = ("no_gap", "explained", "ambiguous", UNKNOWN, FAILED)
     left = np.zeros(len(groups))
@@ -261,5 +267,5 @@ def plot_unknown(outcomes: Sequence[Outcome]) -> bytes:
         left += share
     axis.set(xlim=(0, 1), xlabel="share of cases by verdict")
     axis.invert_yaxis()
-    axis.legend(fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    _legend(axis, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return _png(figure)

@@ -179,7 +179,7 @@ def _number(name: str, value: float | None, aim: str, good: Any) -> dict[str, An
 
 
 def case_rows(check: OpenedCheck, outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """One row a case, as `cases.csv` has them; several values of a cell are joined by `+`."""
+    """One row a case, as `cases.csv` has them; several values of a cell are joined by `;`."""
     rows = []
     labels = [label for label in check.labels if label["stream"] == "case"]
     for label, outcome in zip(labels, outcomes, strict=True):
@@ -190,23 +190,23 @@ def case_rows(check: OpenedCheck, outcomes: Sequence[Outcome]) -> list[dict[str,
             {
                 "case": outcome.index,
                 "label": outcome.label,
-                "truth": "+".join(truth),
+                "truth": ";".join(truth),
                 "strength": _joined(outcome.strengths[name] for name in truth),
-                "since": "+".join(outcome.since[name] for name in truth),
+                "since": ";".join(outcome.since[name] for name in truth),
                 "protocol": outcome.protocol,
                 "geometry": outcome.geometry,
-                "left_out": "+".join(outcome.leave_out),
-                "withheld": "+".join(outcome.withheld),
+                "left_out": ";".join(outcome.leave_out),
+                "withheld": ";".join(outcome.withheld),
                 "sigma": _cell(outcome.sigma),
                 "nearest": outcome.nearest,
                 "detection_sigma": _cell(min(detection, default=None)),
                 "verdict": outcome.verdict,
                 "top1": outcome.top1,
-                "named": "+".join(sorted(outcome.named)),
+                "named": ";".join(sorted(outcome.named)),
                 "top1_right": int(top1_right(outcome)),
                 "top_set_right": int(top_set_right(outcome)),
                 "exactly_right": int(exactly_right(outcome)),
-                "leading": "+".join(outcome.leading) or "none",
+                "leading": ";".join(outcome.leading) or "none",
                 "leading_probability": _cell(outcome.leading_probability),
                 "p_truth": _joined(outcome.marginal.get(name, 0.0) for name in truth),
                 "p_none": _cell(outcome.p_none),
@@ -250,4 +250,4 @@ def _cell(value: float | None) -> str:
 
 def _joined(values: Any) -> str:
     cells = [_cell(value) for value in values]
-    return "+".join(cells) if any(cells) else ""
+    return ";".join(cells) if any(cells) else ""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lab.effects import EFFECTS as LAB_EFFECTS
 from .blind_cases import SETS
 from .blind_separation import Separation
 
@@ -367,6 +368,7 @@ def compute_scores(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[
         },
         "unknown": {
             "auroc": auroc(_p_unknown(unknown), _p_unknown(catalogue)),
+            "auroc_upper_half": auroc(_p_unknown([item for item in unknown if _strong(item)]), _p_unknown(catalogue)),
             "auroc_with_none": auroc(_p_unknown(unknown), _p_unknown(catalogue + none)),
             "found": share(item.verdict == UNKNOWN for item in unknown),
             "seen": share(item.verdict not in ("no_gap", FAILED) for item in unknown),
@@ -397,6 +399,13 @@ def compute_scores(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[
 
 def _p_unknown(outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
     return np.array([item.p_unknown for item in outcomes], dtype=np.float64)
+
+
+def _strong(outcome: Outcome) -> bool:
+    """Whether an effect outside the catalogue lies in the upper half (logarithm) of its range in the lab."""
+    name = outcome.truth[0]
+    law = LAB_EFFECTS[name]
+    return abs(outcome.strengths[name]) >= math.sqrt(law.low * law.high)
 
 
 def _counts(words: Iterable[str]) -> dict[str, int]:

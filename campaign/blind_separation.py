@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..diagnosis.inference import Curve
 from .blind_statistics import CurveKey, SessionStatistics
 
-_GRID = 121  # strengths of a competitor, evenly in the logarithm
+_GRID = 61  # strengths of a competitor, evenly in the logarithm
 _NONE = "no effect"
 
 
@@ -75,10 +75,17 @@ def separation_of(
     for curve in statistics.curves:
         if curve.effect == effect or curve.effect in without or (partner is not None and curve.effect == partner[0]):
             continue
-        strengths = np.geomspace(curve.low / 10.0, 1.5 * curve.high, _GRID)
-        weights = _weights(curve, strengths)
-        quadratic = np.einsum("si,ij,sj->s", weights, gram[curve.nodes, curve.nodes], weights)
-        distance = float(np.min(square - 2.0 * weights @ image[curve.nodes] + quadratic))
+        inner, cross = gram[curve.nodes, curve.nodes], image[curve.nodes]
+        low, high = curve.low / 10.0, 1.5 * curve.high
+        distance = square
+        for _ in range(2):  # the second time between the neighbours of the best
+            strengths = np.geomspace(low, high, _GRID)
+            weights = _weights(curve, strengths)
+            quadratic = np.einsum("si,ij,sj->s", weights, inner, weights)
+            distances = square - 2.0 * weights @ cross + quadratic
+            at = int(np.argmin(distances))
+            distance = min(distance, float(distances[at]))
+            low, high = strengths[max(at - 1, 0)], strengths[min(at + 1, _GRID - 1)]
         if distance < best:
             best, nearest = distance, curve.effect
     return Separation(sigma=math.sqrt(max(best, 0.0)), nearest=nearest, detection=detection)

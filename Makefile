@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation validation-prediction benchmark check format clean
+.PHONY: demo test test-slow validation validation-prediction blind-check benchmark check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -35,6 +35,12 @@ validation: $(READY)
 # predictions against truth and against the information limit: hours; a stopped run goes on where it was
 validation-prediction: $(READY)
 	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
+
+# the diagnosis on sealed cases: hours; a stopped run goes on where it was. SEED must be one that nobody has looked at
+CASES ?= 600
+SEED ?= 20261121
+blind-check: $(READY)
+	$(BIN)/raytwin blind-check -n $(CASES) --seed $(SEED) -o build/blind_$(SEED) --train-cases 300 --workers 2
 
 # speed and memory as this machine has them, each against its reference in the same run
 benchmark: $(READY)

@@ -33,6 +33,7 @@ from .blind_cases import BlindCase, draw_cases, is_development_seed, names_of_se
 
 CASE_TIMEOUT_S = 3600.0
 _ERROR_LINES = 400  # characters of an error that are kept
+_SECOND = "second.h5"
 _KEPT_VARIABLES = ("PATH", "HOME", "LANG", "LC_ALL", "PYTHONPATH", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "SYSTEMROOT")
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -43,7 +44,8 @@ class BlindOptions:
 
     Fields: cases; seed; size (rows and columns); frames a series (None: usual); without: effects left out of the catalogue
     for all; leave_one_out: every case has one effect, which is left out for it; only: sets or ids that effects are drawn
-    from (empty: all); train_cases: how many more to teach the baselines.
+    from (empty: all); train_cases: how many more to teach the baselines; second_day: the line is measured on another day too, to see
+    how far the improved twin shrinks the gap there.
     """
 
     cases: int
@@ -54,6 +56,7 @@ class BlindOptions:
     leave_one_out: bool = False
     only: tuple[str, ...] = ()
     train_cases: int = 0
+    second_day: bool = False
 
     def __post_init__(self) -> None:
         from ..generator.effects import EFFECTS
@@ -86,11 +89,12 @@ class Work:
     """What is done with one case: `measure(label, session)` writes a file, `judge(session, without, features_only)` reads it.
 
     The second gets nothing of the label. It returns what blind_judge writes and leaves `statistics.npz` (or nothing) beside
-    the session. `stop` ends what runs.
+    the session. `measure_again` writes a session of another day, `second.h5` beside the first. `stop` ends what runs.
     """
 
     measure: Callable[[Mapping[str, Any], Path], None]
     judge: Callable[[Path, Sequence[str], bool], dict[str, Any]]
+    measure_again: Callable[[Mapping[str, Any], Path], None] = lambda label, session: None
     stop: Callable[[], None] = lambda: None
 
 
@@ -122,11 +126,24 @@ class Processes:
 
     def work(self) -> Work:
         """These processes as a worker's steps."""
-        return Work(measure=self.measure, judge=self.judge, stop=self.stop)
+        return Work(measure=self.measure, judge=self.judge, measure_again=self.measure_again, stop=self.stop)
 
     def measure(self, label: Mapping[str, Any], session: Path) -> None:
         """Measure a case. Raises RuntimeError with the process' last line when it fails."""
-        task = {"label": label, "path": str(session), "size": self._options.size, "frames": self._options.frames}
+        self._measure(label, session, day=0)
+
+    def measure_again(self, label: Mapping[str, Any], session: Path) -> None:
+        """Measure a case on another day."""
+        self._measure(label, session, day=1)
+
+    def _measure(self, label: Mapping[str, Any], session: Path, *, day: int) -> None:
+        task = {
+            "label": label,
+            "path": str(session),
+            "size": self._options.size,
+            "frames": self._options.frames,
+            "session": day,
+        }
         self._run("blind_measure", [], folder=session.parent, given=json.dumps(task))
 
     def judge(self, session: Path, without: Sequence[str], features_only: bool) -> dict[str, Any]:
@@ -134,6 +151,8 @@ class Processes:
         words = [session.name, *(word for name in without for word in ("--without", name))]
         if features_only:
             words.append("--features-only")
+        if (session.parent / _SECOND).exists():
+            words += ["--second", _SECOND]
         self._run("blind_judge", words, folder=session.parent, given="")
         result: dict[str, Any] = json.loads((session.parent / "answer.json").read_text(encoding="utf-8"))
         return result
@@ -375,6 +394,8 @@ def _run_case(
         begun = time.perf_counter()
         try:
             work.measure(case.label(), session)
+            if options.second_day and case.stream == "case":
+                work.measure_again(case.label(), own / _SECOND)
             measured_s = time.perf_counter() - begun
             result = work.judge(session, withheld(case, options), case.stream == "train")
             result |= {"error": "", "measured_s": measured_s, "acquisition_sha256": sha256_of_file(session)}

@@ -51,7 +51,9 @@ def refuse_to_peek() -> None:
     sys.addaudithook(hook)
 
 
-def judge_session(path: Path, *, without: list[str], features_only: bool, statistics_path: Path) -> dict[str, Any]:
+def judge_session(
+    path: Path, *, without: list[str], features_only: bool, statistics_path: Path, second: Path | None = None
+) -> dict[str, Any]:
     """The answer of `diagnose` for a session, with features for the baselines; inner products go to `statistics_path`.
 
     Args:
@@ -59,6 +61,7 @@ def judge_session(path: Path, *, without: list[str], features_only: bool, statis
         without: effects to leave out of the catalogue.
         features_only: assemble probes but weigh no hypotheses.
         statistics_path: `.npz` file to write.
+        second: acquisition file of another day, on which the improved twin is tried.
     """
     import numpy as np
 
@@ -66,11 +69,13 @@ def judge_session(path: Path, *, without: list[str], features_only: bool, statis
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
     from ..diagnosis.diagnose import calibrated_twin, diagnose, diagnosis_answer
+    from .blind_second_day import second_day_shrinkage
     from .blind_statistics import code_digest, session_features, session_statistics, write_statistics
 
     code = code_digest()
     start = time.perf_counter()
     answer: dict[str, Any] | None = None
+    shrinkage: dict[str, float] | None = None
     with open_acquisition(path) as acquisition:
         rng = np.random.default_rng(_SEED)
         if features_only:
@@ -85,9 +90,13 @@ def judge_session(path: Path, *, without: list[str], features_only: bool, statis
                 # what was withheld must have a response too, to say afterwards how far it lay from all the others
                 twin = replace(found.twin, effects=())
                 problem = build_problem(acquisition, twin, variants=catalogue_variants())
+    if second is not None and not features_only:
+        with open_acquisition(second) as acquisition:
+            shrinkage = second_day_shrinkage(acquisition, found.twin, found.added, without=without)
     write_statistics(statistics_path, session_statistics(problem))
     return {
         "answer": answer,
+        "shrinkage_found": shrinkage,
         "features": session_features(problem),
         "seconds": seconds,
         "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
@@ -101,6 +110,7 @@ def main() -> int:
     parser.add_argument("acquisition", type=Path)
     parser.add_argument("--without", action="append", default=[])
     parser.add_argument("--features-only", action="store_true")
+    parser.add_argument("--second", type=Path)
     words = parser.parse_args()
     refuse_to_peek()
     from ._plain import plain
@@ -110,6 +120,7 @@ def main() -> int:
         without=words.without,
         features_only=words.features_only,
         statistics_path=Path("statistics.npz"),
+        second=words.second,
     )
     Path("answer.json").write_text(json.dumps(plain(result), allow_nan=False), encoding="utf-8")
     return 0

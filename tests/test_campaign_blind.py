@@ -281,6 +281,17 @@ def test_withheld_effects_are_all_that_the_diagnosis_is_told(tmp_path):
     assert told[6:] == [(("heel",), True)] * 2
 
 
+def test_a_second_day_is_measured_beside_the_first_and_only_for_judged_cases(tmp_path):
+    days = []
+
+    def again(label, path):
+        days.append((label["stream"], path.name, sorted(item.name for item in path.parent.iterdir())))
+
+    options = BlindOptions(cases=3, seed=FRESH, train_cases=2, second_day=True)
+    checked(tmp_path / "check", options, Work(measure=fake_measure, judge=fake_judge, measure_again=again))
+    assert days == [("case", "second.h5", ["session.h5"])] * 3
+
+
 # ---- running, stopping, going on
 
 

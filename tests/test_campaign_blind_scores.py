@@ -36,6 +36,7 @@ from raytwin.campaign.blind_scores import (
     wilson_interval,
     withheld_scores,
 )
+from raytwin.campaign.blind_second_day import shrinkage
 from raytwin.campaign.blind_separation import Separation, matched_filter, separation_of
 from raytwin.campaign.blind_statistics import (
     CurveKey,
@@ -496,3 +497,43 @@ def test_a_session_that_lacks_every_feature_is_judged_by_the_rest_of_the_trainin
     answer = rule.probability({})
     assert all(math.isfinite(value) for value in answer.values())
     assert sum(answer.values()) == pytest.approx(1.0)
+
+
+# ---- a second day
+
+
+def second_day_problem(rng, *, series=24, each=40, factors=3):
+    """Flats of equal beams in time order; a factor that all share."""
+    views = tuple(
+        SimpleNamespace(session=SimpleNamespace(series=SimpleNamespace(kind="flat", scene="", kV=40.0)))
+        for _ in range(series)
+    )
+    size = series * each
+    return SimpleNamespace(
+        residual=rng.standard_normal(size),
+        factors=0.5 * rng.standard_normal((size, factors)),
+        series_of=np.repeat(np.arange(series), each),
+        views=views,
+    )
+
+
+def test_the_whole_response_added_takes_the_whole_gap_away():
+    rng = np.random.default_rng(21)
+    problem = second_day_problem(rng)
+    response = 3.0 * rng.standard_normal(len(problem.residual))
+    problem.residual = problem.residual + response
+    found = shrinkage(problem, response)
+    assert found["value"] == pytest.approx(1.0, abs=0.03)
+    assert found["low"] <= 1.0 <= found["high"] + 0.03
+    # half the response leaves rms sqrt(1 + 1.5^2) of sqrt(1 + 3^2)
+    half = shrinkage(problem, 0.5 * response)
+    before, after = math.sqrt(10.0), math.sqrt(1 + 1.5**2)
+    assert half["value"] == pytest.approx((before - after) / (before - 1.0), abs=0.04)
+
+
+def test_what_nuisances_take_up_is_no_gap_and_noise_has_no_shrinkage():
+    rng = np.random.default_rng(22)
+    problem = second_day_problem(rng)
+    assert shrinkage(problem, 0.1 * rng.standard_normal(len(problem.residual))) is None
+    problem.residual = problem.residual + problem.factors @ np.array([1.0, -1.5, 0.7])
+    assert shrinkage(problem, np.zeros(len(problem.residual))) is None

@@ -52,6 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="more cases, with other seeds, to teach the baselines that learn (default 0: those are left out)",
     )
+    parser.add_argument(
+        "--second-day",
+        action="store_true",
+        help="measure each line on another day too and see how far the improved twin shrinks the gap there (twice the time)",
+    )
     parser.add_argument("--keep-sessions", action="store_true", help="keep the acquisition files (some 50 MB each)")
     parser.add_argument(
         "--development", action="store_true", help="allow a seed that was developed with; the report says so"
@@ -81,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         leave_one_out=arguments.leave_one_out,
         only=tuple(arguments.only),
         train_cases=arguments.train_cases,
+        second_day=arguments.second_day,
     )
     folder: Path = arguments.output
     seal, cases = begin_check(folder, options, development=arguments.development)

@@ -36,10 +36,10 @@ validation: $(READY)
 validation-prediction: $(READY)
 	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
 
-# the diagnosis on sealed cases: hours; a stopped run goes on where it was. SEED must be one that nobody has looked at
+# the diagnosis on sealed cases, hours: `make blind-check SEED=...` with one that nobody has looked at; a stopped run goes on
 CASES ?= 600
-SEED ?= 20261121
 blind-check: $(READY)
+	@test -n "$(SEED)" || { echo "say which seed: make blind-check SEED=123456 [CASES=600]"; exit 2; }
 	$(BIN)/raytwin blind-check -n $(CASES) --seed $(SEED) -o build/blind_$(SEED) --train-cases 300 --workers 2
 
 # speed and memory as this machine has them, each against its reference in the same run

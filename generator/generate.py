@@ -41,7 +41,7 @@ from .transfer import (
     transferred_charge,
 )
 from .twin import Level, Twin
-from .twin_spectrum import slope_share, spectral_model_of
+from .twin_spectrum import secondary_gain_DN, slope_share, spectral_model_of
 from .two_material import TwoMaterialTables, tabulate_two_materials
 
 RECIPES = ("raytwin", "as_published")
@@ -104,6 +104,7 @@ class ChannelModel:
     dark_DN: NDArray[np.float32] = field(init=False)
     read_variance_DN2: NDArray[np.float32] = field(init=False)
     gain_DN: float = field(init=False)
+    secondary_DN: float = field(init=False)
     warnings: tuple[str, ...] = field(init=False)
     _transmission: NDArray[np.float64] = field(init=False)
     _gain_ratio: NDArray[np.float64] = field(init=False)
@@ -132,6 +133,9 @@ class ChannelModel:
         self.dark_DN = dark
         self.read_variance_DN2 = variance
         self.gain_DN = predicted.gain_DN.value
+        secondary = secondary_gain_DN(twin, self.target)
+        white = twin.noise.white_fraction
+        self.secondary_DN = self.gain_DN * white / (1.0 + white) if secondary is None else secondary
         self.warnings = self._warnings(predicted.extrapolated)
         self.image_effects = None
         if self.effects:
@@ -142,6 +146,7 @@ class ChannelModel:
                 open_signal_DN=self.open_signal_DN,
                 open_level_DN=predicted.mean_DN.value,
                 gain_DN=self.gain_DN,
+                secondary_DN=self.secondary_DN,
                 dark_DN=self.dark_DN,
                 read_variance_DN2=self.read_variance_DN2,
                 product_material=self.product_material,
@@ -183,12 +188,20 @@ class ChannelModel:
     def channel(self) -> Channel:
         """The same as a transfer needs it."""
         return Channel(
-            setting=self.target, open_signal_DN=self.open_signal_DN, gain_DN=self.gain_DN, dark_DN=self.dark_DN
+            setting=self.target,
+            open_signal_DN=self.open_signal_DN,
+            gain_DN=self.gain_DN,
+            dark_DN=self.dark_DN,
+            secondary_DN=self.secondary_DN,
         )
 
     def gain_behind(self, transmission: NDArray[np.floating]) -> NDArray[np.float64]:
         """Gain (row, column) of the spectrum behind as much product as the transmission says, DN."""
         return np.asarray(self.gain_DN * np.interp(transmission, self._transmission, self._gain_ratio))
+
+    def white_behind(self, gain_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signal-following white variance over quantum variance before the spread (row, column), at pixels of this gain."""
+        return np.asarray(self.secondary_DN / np.maximum(gain_DN - self.secondary_DN, 1e-3 * gain_DN))
 
     def thickness_behind(self, transmission: NDArray[np.floating]) -> NDArray[np.float64]:
         """Product (row, column) that transmits as much, mm; 0 where the twin has no spectral part."""
@@ -226,13 +239,14 @@ class ChannelModel:
             if effects.changes_picture():
                 quiet = self._quiet(straight, reference)
                 straight = straight + effects.picture_change(quiet, self.thickness_behind(quiet))
+            gain = self.gain_behind(straight)
             charge = topped_up_charge(
                 straight,
                 plan,
                 open_signal_DN=self.open_signal_DN,
-                gain_DN=self.gain_behind(straight),
+                gain_DN=gain,
                 gain_relative=self.twin.maps.gain_relative,
-                white_fraction=noise.white_fraction,
+                white_fraction=self.white_behind(gain),
                 read_variance_DN2=self.read_variance_DN2,
                 psf_model=noise.psf_model,
                 psf_sigma_px=noise.psf_sigma_px.value,
@@ -241,13 +255,14 @@ class ChannelModel:
                 kernel=effects.pattern.kernel,
             )
             return effects.read_out(charge, rng)
+        gain = self.gain_behind(transmission)
         return apply_top_up(
             transmission,
             plan,
             open_signal_DN=self.open_signal_DN,
-            gain_DN=self.gain_behind(transmission),
+            gain_DN=gain,
             gain_relative=self.twin.maps.gain_relative,
-            white_fraction=noise.white_fraction,
+            white_fraction=self.white_behind(gain),
             read_variance_DN2=self.read_variance_DN2,
             psf_model=noise.psf_model,
             psf_sigma_px=noise.psf_sigma_px.value,

@@ -60,10 +60,10 @@ class ImageEffects:
     """The effects of a line at one setting, for images.
 
     Fields: twin (without effects); effects; setting; open_signal_DN (row, column) and open_level_DN (its level under even
-    illumination) of one exposure; gain_DN of the open beam; dark_DN, read_variance_DN2 (row, column); product_material;
-    instrument: distances and pitch where a description states others than the twin's; flat_DN (row, column): open field of
-    the line as it is, above dark, with all that a correction's flat would hold: gain and pixels that changed are not in it;
-    warnings: effects that are left out, one line each.
+    illumination) of one exposure; gain_DN of the open beam and secondary_DN, what secondary quanta add to it; dark_DN,
+    read_variance_DN2 (row, column); product_material; instrument: distances and pitch where a description states others than
+    the twin's; flat_DN (row, column): open field of the line as it is, above dark, with all that a correction's flat would
+    hold: gain and pixels that changed are not in it; warnings: effects that are left out, one line each.
     """
 
     twin: Twin
@@ -72,6 +72,7 @@ class ImageEffects:
     open_signal_DN: FloatArray
     open_level_DN: float
     gain_DN: float
+    secondary_DN: float
     dark_DN: NDArray[np.float32]
     read_variance_DN2: NDArray[np.float32]
     product_material: str
@@ -222,10 +223,12 @@ class ImageEffects:
 
     def _image_of(self, state: LineState) -> AffectedImage:
         noise = self.twin.noise
-        secondary = noise.white_fraction
-        picture, power = spread_maps(
+        # secondary quanta follow the signal, whatever the spectrum
+        white = np.minimum(self.secondary_DN * np.maximum(state.signal_DN, 0.0), 0.9 * state.variance_DN2)
+        state = replace(state, variance_DN2=state.variance_DN2 - white)
+        picture, _ = spread_maps(
             state.signal_DN,
-            state.variance_DN2 / (1.0 + secondary),
+            state.variance_DN2,
             state=state,
             pattern=self.pattern,
             psf_model=noise.psf_model,
@@ -237,13 +240,13 @@ class ImageEffects:
         before, variance = blurred_object(state)
         # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
         before = np.maximum(before, 1e-300)
-        quantum = variance / (1.0 + secondary) / before
+        quantum = variance / before
         mean = charge * (1.0 - state.bend_per_DN * charge)
         return AffectedImage(
             state=state,
             charge_DN=charge,
             scale=np.sqrt(np.maximum(scale, 0.0)),
-            white_DN=np.sqrt(np.maximum(scale * power, 0.0) * (secondary / self.pattern.share)),
+            white_DN=np.sqrt(np.maximum(scale * self.secondary_DN * picture, 0.0)),
             before_DN=before,
             quantum_DN=np.maximum(quantum, 1e-9 * float(np.max(quantum)) + 1e-300),
             pattern=self.pattern,

@@ -70,7 +70,7 @@ def sample_frame_noise(
     *,
     gain_DN: ArrayLike,
     gain_relative: NDArray[np.floating] | float = 1.0,
-    white_fraction: float,
+    white_fraction: NDArray[np.floating] | float,
     read_variance_DN2: ArrayLike,
     psf_model: str,
     psf_sigma_px: float,
@@ -88,7 +88,7 @@ def sample_frame_noise(
         signal_DN: mean above dark (row, column), DN; negative values count as 0.
         gain_DN: variance per signal with the spread's share restored, one number or (row, column), DN.
         gain_relative: the pixel's own gain over the detector median.
-        white_fraction: signal-following white variance over quantum variance before the spread.
+        white_fraction: signal-following white variance over quantum variance before the spread, one number or (row, column).
         read_variance_DN2: electronic variance, one number or (row, column), DN^2.
         quantum_share, third_cumulant_share, read_share: shares of the variance, of the third cumulant and of the
             electronic variance to draw; all 1 for a frame from scratch, less for a top-up.

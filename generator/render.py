@@ -342,12 +342,19 @@ def sample_expected(
     # rounding comes with digitising
     rounding = 1.0 / 12.0 if detector.quantised else 0.0
     read_DN2 = np.asarray(detector.read_variance_DN2, dtype=np.float64) - rounding
+    signal = channel.open_signal_DN * image.transmission
+    gain, white = image.gain_DN, detector.white_fraction
+    if channel.secondary_DN is not None:
+        # what secondary quanta add follows the signal but not the spectrum: it goes with the electronic noise
+        secondary = np.minimum(channel.secondary_DN, 0.9 * gain)
+        gain, white = gain - secondary, 0.0
+        read_DN2 = np.maximum(read_DN2, 0.0) + secondary * np.maximum(signal, 0.0) * detector.gain_relative
     frame = sample_frames(
-        channel.open_signal_DN * image.transmission,
-        gain_DN=image.gain_DN,
+        signal,
+        gain_DN=gain,
         key=draw_key(rng),
         gain_relative=detector.gain_relative,
-        white_fraction=detector.white_fraction,
+        white_fraction=white,
         kernel_1d=noise_kernel_1d(detector.psf_model, detector.psf_sigma_px),
         read_noise_DN=np.sqrt(np.maximum(read_DN2, 0.0)),
         dark_DN=channel.dark_DN,

@@ -37,13 +37,15 @@ class Channel:
     """One setting of the line as a transfer needs it.
 
     Fields: setting; open_signal_DN (row, column) of one frame; gain_DN (variance per signal of the open beam, the spread's
-    share restored); dark_DN (row, column).
+    share restored); dark_DN (row, column); secondary_DN: variance per signal of secondary quanta in it, the same behind any
+    object; None: the detector's white fraction of the gain.
     """
 
     setting: Setting
     open_signal_DN: Array = field(repr=False)
     gain_DN: float
     dark_DN: NDArray[np.float32] = field(repr=False)
+    secondary_DN: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +129,8 @@ def transfer_pair(
     reference_signal = np.stack([one.open_signal_DN for one in references]) * np.exp(-own)
     frames = np.array([one.setting.averaged for one in references], dtype=np.float64)[:, None, None]
     gain = np.stack([one.gain_DN * solution.gain_ratio[j] for j, one in enumerate(references)])
-    variance = (detector.slope_share * relative * gain * reference_signal + read_DN2) / (frames * reference_signal**2)
+    slope = np.stack([_slope(one, detector, gain[j]) for j, one in enumerate(references)])
+    variance = (relative * slope * reference_signal + read_DN2) / (frames * reference_signal**2)
     logs_target = at_target + np.einsum("cjyx,jyx->cyx", mixing, logs - own)
     unbiased = 0.5 * np.einsum("cjyx,jyx->cyx", mixing * (1.0 - mixing), variance)
 
@@ -303,41 +306,55 @@ def transferred_charge(
     reach = len(kernel) // 2
     shape = signal.shape[1:]
     field_of_both = rng.standard_normal((shape[0] + 2 * reach, shape[1] + 2 * reach), dtype=np.float32)
-    seen = 1.0 / (1.0 + detector.white_fraction)
+    white = np.stack([white_fraction_of(one, detector, pair.gain_DN[c]) for c, one in enumerate(targets)])
+    seen = 1.0 / (1.0 + white)
     counts = np.empty(signal.shape)
     for c in (0, 1):
         alone = own[c] * (1.0 - common)
         third = 1.0 / frames[c] ** 2 - pair.held_third[c] - coupling * own[c] * pair.held[c, c]
         share = np.maximum(third, 0.01 * own[c]) / np.maximum(alone, 1e-12)
         noise = relative * sample_correlated_quanta(
-            seen * alone * one_frame[c] / relative**2,
+            seen[c] * alone * one_frame[c] / relative**2,
             pair.gain_DN[c] * np.clip(share, 1e-3, 1e3),
             psf_model=detector.psf_model,
             psf_sigma_px=detector.psf_sigma_px,
             rng=rng,
             kernel=kernel,
         )
-        amplitude = np.sqrt(seen * own[c] * common * one_frame[c])
+        amplitude = np.sqrt(seen[c] * own[c] * common * one_frame[c])
         if c == 1:
             amplitude = amplitude * np.sign(together)
         wide = np.pad(amplitude, reach, mode="edge") * field_of_both
         counts[c] = signal[c] + noise + spread_inside(wide, kernel)
-    counts += _white_noise(pair, one_frame, missing, frames, detector, rng)
+    counts += _white_noise(pair, white / (1.0 + white) * one_frame, missing, frames, detector, rng)
     return counts
+
+
+def white_fraction_of(channel: Channel, detector: DetectorNoise, gain_DN: Array) -> Array:
+    """Signal-following white variance over quantum variance before the spread (row, column), at each pixel's gain."""
+    if channel.secondary_DN is None:
+        return np.full(gain_DN.shape, detector.white_fraction)
+    return np.asarray(channel.secondary_DN / np.maximum(gain_DN - channel.secondary_DN, 1e-3 * gain_DN))
+
+
+def _slope(channel: Channel, detector: DetectorNoise, gain_DN: Array) -> Array:
+    """Photon-transfer slope (row, column) of one pixel at its gain, DN."""
+    left = detector.slope_share * (1.0 + detector.white_fraction) - detector.white_fraction
+    white = white_fraction_of(channel, detector, gain_DN)
+    return np.asarray(gain_DN * (left + white) / (1.0 + white))
 
 
 def _white_noise(
     pair: TransferredPair,
-    one_frame: Array,
+    white_DN2: Array,
     missing: Array,
     frames: Array,
     detector: DetectorNoise,
     rng: np.random.Generator,
 ) -> Array:
     """Signal-following white noise and electronic noise that the reference lacks (2, row, column), DN."""
-    white = detector.white_fraction / (1.0 + detector.white_fraction)
-    root = np.sqrt(one_frame)
-    covariance = white * missing * root[:, None] * root[None, :] - pair.held_read_DN2
+    root = np.sqrt(white_DN2)
+    covariance = missing * root[:, None] * root[None, :] - pair.held_read_DN2
     for c in (0, 1):
         # rounding comes with digitising
         rounding = 1.0 / 12.0 / frames[c] if detector.quantised else 0.0

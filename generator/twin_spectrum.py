@@ -4,6 +4,7 @@ import math
 from functools import lru_cache
 from typing import Any
 
+from ..acquisition.setting import Setting
 from ..errors import InputError
 from .psf import blur_variance_share
 from .spectral_signal import SpectralModel, attenuation_scale_name
@@ -74,3 +75,26 @@ def slope_share(twin: Twin) -> float:
     share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
     white = twin.noise.white_fraction
     return (share + white) / (1.0 + white)
+
+
+def secondary_gain_DN(twin: Twin, setting: Setting | None = None) -> float | None:
+    """Variance per signal of what secondary quanta add, white and without regard to the spectrum, DN.
+
+    K electrons a keV, drawn at random, add as much variance for each DN of signal whatever the photons' energies were, while
+    the quantum variance per signal (gain less this) grows with them. Of a level with gain g and photon-transfer slope s,
+    where the spread leaves a share h of the quantum variance in one pixel: (s - g h) / (1 - h).
+
+    Args:
+        twin: the calibrated line.
+        setting: whose own level is used where it was measured; else the mean over all levels.
+
+    Returns:
+        0 or more; None where the twin has no levels.
+    """
+    share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    own = None if setting is None else twin.level_at(setting)
+    levels = twin.levels if own is None else (own,)
+    if not levels or share > 0.999:
+        return None
+    found = [(one.photon_transfer_slope_DN.value - one.gain_DN.value * share) / (1.0 - share) for one in levels]
+    return max(sum(found) / len(found), 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..generator.effects import EFFECTS
 from .blind_scores import FAILED, NONE, UNKNOWN, Outcome, strength_rows, top1_right
+from .blind_separation import NO_EFFECT
 
 RIGHT, WRONG, MUTED = "#1b7f3b", "#c23b22", "#7a7a7a"
 _BASELINE_COLOURS = {
@@ -164,6 +165,36 @@ def plot_confusion(outcomes: Sequence[Outcome]) -> bytes:
     axis.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
     axis.axhline(len(true_names) - 0.5, color=MUTED, linewidth=1)
     axis.set(xlabel="first name", ylabel="planted (none, one effect, or one outside the catalogue)")
+    return _png(figure)
+
+
+def plot_distances(distances: Mapping[str, Mapping[str, float]]) -> bytes:
+    """Median distance of planted effects (rows) from every other effect and from none (columns), sigma. PNG."""
+    rows = list(distances)
+    columns = [NO_EFFECT, *EFFECTS]
+    table = np.array([[distances[row].get(column, math.nan) for column in columns] for row in rows], dtype=float)
+    table = table.reshape(len(rows), len(columns))
+    figure, axes = _figure(12.0, 1.8 + 0.42 * max(len(rows), 1))
+    axis = axes[0, 0]
+    if rows:
+        shown = axis.imshow(
+            np.log10(np.clip(table, 0.3, 300)),
+            cmap="RdYlGn",
+            vmin=-0.3,
+            vmax=1.7,
+            interpolation="nearest",
+            aspect="auto",
+        )
+        bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, math.log10(3), math.log10(5), 1, math.log10(30)])
+        bar.ax.set_yticklabels(["1", "3", "5", "10", "30"])
+        bar.set_label("distance, sigma")
+    for row in range(len(rows)):
+        for column in range(len(columns)):
+            if math.isfinite(table[row, column]):
+                axis.text(column, row, f"{table[row, column]:.3g}", ha="center", va="center", fontsize=6.5)
+    axis.set_xticks(range(len(columns)), [name.replace("_", " ") for name in columns], rotation=60, ha="right")
+    axis.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
+    axis.set(xlabel="other model, refitted", ylabel="planted")
     return _png(figure)
 
 

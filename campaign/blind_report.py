@@ -9,6 +9,7 @@ from ..files import whole_file
 from .blind_figures import (
     plot_accuracy,
     plot_confusion,
+    plot_distances,
     plot_limits,
     plot_reliability,
     plot_strengths,
@@ -88,6 +89,7 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         "accuracy": plot_accuracy(full, scores["baselines"]),
         "reliability": plot_reliability(every, scores["baselines"]),
         "confusion": plot_confusion(outcomes),
+        "distances": plot_distances(every["distances"]),
         "strengths": plot_strengths(outcomes),
         "limits": plot_limits(outcomes),
         "unknown": plot_unknown(outcomes),
@@ -114,6 +116,7 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         baselines=[_baseline_row("diagnosis", every), *(_baseline_row(n, s) for n, s in scores["baselines"].items())],
         trained_on=scores["trained_on"],
         effects=[_effect_row(name, entry) for name, entry in every["by_effect"].items() if entry["top1"]["n"]],
+        wrong_names=every["wrong_names"],
         sets=every["confusion_by_set"],
         unknown_effects=every["unknown"]["by_effect"],
         reduced=scores["reduced_measurement_set"],

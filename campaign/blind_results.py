@@ -1,6 +1,7 @@
 """From opened labels and answers to `cases.csv` and `scores.json`."""
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -51,7 +52,13 @@ def score_check(check: OpenedCheck) -> CheckResult:
             continue
         without = withheld(case_from_label(label), check.options)
         outcomes.append(
-            outcome_of(label, answer, separations=_separations(label, statistics, without), withheld=without)
+            outcome_of(
+                label,
+                answer,
+                separations=_separations(label, statistics, without),
+                withheld=without,
+                misfit=_misfit(statistics),
+            )
         )
         sessions.append(example)
     effects = tuple(EFFECTS)
@@ -96,6 +103,12 @@ def _separations(
         if found is not None:
             result[item["id"]] = found
     return result
+
+
+def _misfit(statistics: SessionStatistics | None) -> float | None:
+    if statistics is None or statistics.probes == 0:
+        return None
+    return (statistics.chi_square - statistics.probes) / math.sqrt(2.0 * statistics.probes)
 
 
 def _by_protocol(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[str, Any]:
@@ -199,6 +212,8 @@ def case_rows(check: OpenedCheck, outcomes: Sequence[Outcome]) -> list[dict[str,
                 "withheld": ";".join(outcome.withheld),
                 "sigma": _cell(outcome.sigma),
                 "nearest": outcome.nearest,
+                "sigma_from_top1": _cell(outcome.sigma_from_top1),
+                "misfit": _cell(outcome.misfit),
                 "detection_sigma": _cell(min(detection, default=None)),
                 "verdict": outcome.verdict,
                 "top1": outcome.top1,
@@ -216,6 +231,7 @@ def case_rows(check: OpenedCheck, outcomes: Sequence[Outcome]) -> list[dict[str,
                 "strength_high": _joined(None if item is None else item[2] for item in found),
                 "shrinks_by": _cell(outcome.shrinks_by[0] if outcome.shrinks_by else None),
                 "shrinkage_found": _cell(outcome.shrinkage_found[0] if outcome.shrinkage_found else None),
+                "measured_s": _cell(outcome.measured_s),
                 "seconds": _cell(outcome.seconds),
                 "peak_memory_MB": _cell(outcome.peak_memory_MB),
                 "error": outcome.error,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..lab.effects import EFFECTS as LAB_EFFECTS
 from .blind_cases import SETS
-from .blind_separation import Separation
+from .blind_separation import NO_EFFECT, Separation
 
 UNKNOWN = "unknown_effect"
 NONE = "none"
@@ -27,6 +27,7 @@ _PROBABILITY_BINS = 10
 _HONEST_DRAWS = 400
 _STRENGTH_WITHIN = 0.10
 _MARGINAL_FROM = 0.02
+_TIE = 4.0  # standard deviations within which two models count as tied
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +39,8 @@ class Outcome:
     this case); verdict (or `failed`); error; top1 (id, `none`, `unknown_effect` or `failed`); named (what the answer names: ids,
     or `none`, `unknown_effect`); leading (effects of the most probable hypothesis), leading_probability; top_set (effects of the
     hypotheses that hold 90 %); marginal (probability by effect); p_none, p_unknown; found (value, low, high of the strength by
-    effect, signed); separations by id; shrinks_by and shrinkage_found (value, low, high; or None); seconds; peak_memory_MB.
+    effect, signed); separations by id; misfit (what noise and nuisances leave unexplained without any effect:
+    (chi square - probes) / sqrt(2 probes)); shrinks_by and shrinkage_found (value, low, high; or None); seconds; peak_memory_MB.
     """
 
     index: int
@@ -62,6 +64,8 @@ class Outcome:
     p_unknown: float
     found: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     separations: Mapping[str, Separation] = field(default_factory=dict)
+    misfit: float | None = None
+    measured_s: float | None = None
     shrinks_by: tuple[float, float, float] | None = None
     shrinkage_found: tuple[float, float, float] | None = None
     seconds: float | None = None
@@ -78,6 +82,14 @@ class Outcome:
         """The model nearest to the truth."""
         own = [self.separations[name] for name in self.truth if name in self.separations]
         return min(own, key=lambda item: item.sigma).nearest if own else ""
+
+    @property
+    def sigma_from_top1(self) -> float | None:
+        """How far a single effect lies from the model that was named in its place; None where the name is right or no model."""
+        if len(self.truth) != 1 or self.truth[0] not in self.separations or self.top1 == self.truth[0]:
+            return None
+        own = self.separations[self.truth[0]]
+        return own.detection if self.top1 == NONE else own.distances.get(self.top1)
 
     @property
     def expected(self) -> frozenset[str]:
@@ -106,6 +118,7 @@ def outcome_of(
     *,
     separations: Mapping[str, Separation] | None = None,
     withheld: Sequence[str] = (),
+    misfit: float | None = None,
 ) -> Outcome:
     """A label and what the diagnosing process wrote, as one outcome."""
     common: dict[str, Any] = {
@@ -119,6 +132,8 @@ def outcome_of(
         "leave_out": tuple(label["leave_out"]),
         "withheld": tuple(withheld),
         "separations": dict(separations or {}),
+        "misfit": misfit,
+        "measured_s": result.get("measured_s"),
         "error": result.get("error", ""),
         "seconds": result.get("seconds"),
         "peak_memory_MB": result.get("peak_memory_MB"),
@@ -389,6 +404,9 @@ def compute_scores(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[
         },
         "strength": strength_scores(catalogue),
         "shrinkage": shrinkage_scores(outcomes),
+        "wrong_names": wrong_names(single),
+        "distances": distances(single, effects),
+        "misfit_without_effect": _spread([item.misfit for item in none]),
         "confusion": confusion(outcomes),
         "confusion_by_set": confusion_by_set(single),
         "by_effect": by_effect(single, effects),
@@ -486,6 +504,40 @@ def shrinkage_scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "median_difference": float(np.median(differences)) if differences else None,
         "inside_interval": share(stated[1] <= found[0] <= stated[2] for stated, found in pairs),
     }
+
+
+def wrong_names(single: Sequence[Outcome]) -> dict[str, int]:
+    """Why first names of single effects are wrong.
+
+    `tie`: the named model (or no effect) lies within 4 standard deviations of the truth, so that the data could hardly tell;
+    `ours`: it lies farther away; `unknown`, `failed`: nothing was named.
+    """
+    result = {"tie": 0, "ours": 0, "unknown": 0, FAILED: 0, "not_known": 0}
+    for item in single:
+        if top1_right(item):
+            continue
+        if item.top1 in (UNKNOWN, FAILED):
+            result["unknown" if item.top1 == UNKNOWN else FAILED] += 1
+        elif item.sigma_from_top1 is None:
+            result["not_known"] += 1
+        else:
+            result["tie" if item.sigma_from_top1 < _TIE else "ours"] += 1
+    return result
+
+
+def distances(single: Sequence[Outcome], effects: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Distinguishability: median distance of each planted effect from each other one and from none, standard deviations."""
+    result: dict[str, dict[str, float]] = {}
+    for effect in effects:
+        own = [item.separations[effect] for item in single if item.truth == (effect,) and effect in item.separations]
+        if own:
+            row = {NO_EFFECT: float(np.median([item.detection for item in own]))}
+            for other in effects:
+                known = [item.distances[other] for item in own if other in item.distances]
+                if known:
+                    row[other] = float(np.median(known))
+            result[effect] = row
+    return result
 
 
 def confusion(outcomes: Sequence[Outcome]) -> dict[str, dict[str, int]]:

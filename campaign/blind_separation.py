@@ -9,8 +9,8 @@ truth. It is Fisher's separation: the inaccuracy of the catalogue's laws is not 
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +19,21 @@ from ..diagnosis.inference import Curve
 from .blind_statistics import CurveKey, SessionStatistics
 
 _GRID = 61  # strengths of a competitor, evenly in the logarithm
-_NONE = "no effect"
+NO_EFFECT = "no effect"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """Standard deviations: sigma from the nearest other model (`nearest`, an id or `no effect`), detection from no effect."""
+    """How far an effect lies from other models, standard deviations.
+
+    Fields: sigma, nearest: the nearest one (an id or `no effect`); detection: from no effect; distances: from each other effect
+    at its best variant and strength, by id.
+    """
 
     sigma: float
     nearest: str
     detection: float
+    distances: Mapping[str, float] = field(default_factory=dict)
 
 
 def separation_of(
@@ -53,7 +58,7 @@ def separation_of(
         session responds to it.
     """
     if effect in statistics.missing:
-        return Separation(sigma=0.0, nearest=_NONE, detection=0.0)
+        return Separation(sigma=0.0, nearest=NO_EFFECT, detection=0.0)
     own = _best_variant(statistics, effect, strength, since)
     if own is None:
         return None
@@ -71,7 +76,7 @@ def separation_of(
     image = gram @ mine
     square = max(float(mine @ image), 0.0)
     detection = math.sqrt(square)
-    best, nearest = square, _NONE
+    distances: dict[str, float] = {}
     for curve in statistics.curves:
         if curve.effect == effect or curve.effect in without or (partner is not None and curve.effect == partner[0]):
             continue
@@ -82,13 +87,17 @@ def separation_of(
             strengths = np.geomspace(low, high, _GRID)
             weights = _weights(curve, strengths)
             quadratic = np.einsum("si,ij,sj->s", weights, inner, weights)
-            distances = square - 2.0 * weights @ cross + quadratic
-            at = int(np.argmin(distances))
-            distance = min(distance, float(distances[at]))
+            squares = square - 2.0 * weights @ cross + quadratic
+            at = int(np.argmin(squares))
+            distance = min(distance, float(squares[at]))
             low, high = strengths[max(at - 1, 0)], strengths[min(at + 1, _GRID - 1)]
-        if distance < best:
-            best, nearest = distance, curve.effect
-    return Separation(sigma=math.sqrt(max(best, 0.0)), nearest=nearest, detection=detection)
+        distances[curve.effect] = min(distances.get(curve.effect, detection), math.sqrt(max(distance, 0.0)))
+    nearest = min(distances, key=lambda name: distances[name], default=NO_EFFECT)
+    # a competitor whose best strength is none is no effect
+    if not distances or distances[nearest] >= detection * (1.0 - 1e-9):
+        nearest = NO_EFFECT
+    sigma = min([detection, *distances.values()])
+    return Separation(sigma=sigma, nearest=nearest, detection=detection, distances=distances)
 
 
 def matched_filter(statistics: SessionStatistics, *, bare: bool) -> dict[str, float]:

@@ -402,6 +402,28 @@ def test_confusions_are_pooled_by_set():
     assert table[NONE] == {NONE: 1}
 
 
+def test_a_wrong_name_is_a_tie_where_the_two_lie_close_and_our_fault_where_they_do_not():
+    def case(named, distance, verdict="explained"):
+        separations = {
+            "heel": Separation(sigma=2.0, nearest="kv_error", detection=30.0, distances={"kv_error": distance})
+        }
+        return outcome("single", ["heel"], verdict=verdict, named=[named], separations=separations)
+
+    cases = [
+        case("kv_error", 2.0),
+        case("kv_error", 12.0),
+        case("row_noise", 2.0),
+        case("none", 0.0, verdict="no_gap"),
+        case("heel", 2.0),
+        case("", 2.0, verdict="unknown_effect"),
+    ]
+    scores = compute_scores(cases, tuple(EFFECTS))
+    assert scores["wrong_names"] == {"tie": 1, "ours": 2, "unknown": 1, "failed": 0, "not_known": 1}
+    assert cases[3].sigma_from_top1 == 30.0
+    assert cases[4].sigma_from_top1 is None
+    assert scores["distances"] == {"heel": {"no effect": 30.0, "kv_error": 2.0}}
+
+
 def test_withheld_effects_must_be_unknown_and_not_another_with_confidence():
     cases = [
         outcome("single", ["heel"], verdict="unknown_effect", withheld=("heel",), sigma=8.0),

@@ -144,7 +144,7 @@ def render_expected(
         raise InputError("path lengths", received=wrong or "none", expected=f"maps of {shape} (rows, columns)")
     stack = np.stack([np.asarray(one, dtype=np.float32) for one in lengths_mm.values()])
     moments = _moments_behind(stack, tuple(lengths_mm), twin=twin, channels=channels)
-    return _images(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+    return images_of_moments(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,7 +174,9 @@ def render_scene(
         InputError: a twin without spectral part.
     """
     traced = trace_scene(scene, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
-    images = _images(traced.moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
+    images = images_of_moments(
+        traced.moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling
+    )
     return RenderedScene(images=images, foreign_cover=traced.foreign_cover, cover=traced.cover)
 
 
@@ -296,9 +298,15 @@ def _moments_behind(
     return found
 
 
-def _images(
+def images_of_moments(
     moments: Moments, *, twin: Twin, channels: Sequence[Channel], geometry: Geometry, supersampling: int
 ) -> tuple[ExpectedImage, ...]:
+    """Transmission (no unit) and gain (DN) after all blur, a channel each.
+
+    Args:
+        moments: signal and quantum variance (row x supersampling, column x supersampling) over those of the open beam.
+        twin, channels, geometry, supersampling: as in `render_expected`.
+    """
     focal = geometry.focal_blur_px * supersampling
     spread = twin.noise.psf_sigma_px.value * supersampling
     images = []

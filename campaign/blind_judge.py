@@ -72,36 +72,31 @@ def judge_session(
     from .blind_second_day import second_day_shrinkage
     from .blind_statistics import code_digest, session_features, session_statistics, write_statistics
 
-    code = code_digest()
+    result: dict[str, Any] = {"answer": None, "code_sha256": code_digest()}
     start = time.perf_counter()
-    answer: dict[str, Any] | None = None
-    shrinkage: dict[str, float] | None = None
     with open_acquisition(path) as acquisition:
         rng = np.random.default_rng(_SEED)
         if features_only:
             problem = build_problem(acquisition, calibrated_twin(acquisition, rng=rng), variants=catalogue_variants())
-            seconds = time.perf_counter() - start
         else:
             found = diagnose(acquisition, rng=rng, without=without)
             problem = found.problem
-            answer = diagnosis_answer(found, inputs={"seed": _SEED})
-            seconds = time.perf_counter() - start
-            if without:
+            result["answer"] = diagnosis_answer(found, inputs={"seed": _SEED})
+        result["seconds"] = time.perf_counter() - start
+        result["peak_memory_MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        # from here on nothing touches the answer any more
+        try:
+            if without and not features_only:
                 # what was withheld must have a response too, to say afterwards how far it lay from all the others
-                twin = replace(found.twin, effects=())
-                problem = build_problem(acquisition, twin, variants=catalogue_variants())
-    if second is not None and not features_only:
-        with open_acquisition(second) as acquisition:
-            shrinkage = second_day_shrinkage(acquisition, found.twin, found.added, without=without)
-    write_statistics(statistics_path, session_statistics(problem))
-    return {
-        "answer": answer,
-        "shrinkage_found": shrinkage,
-        "features": session_features(problem),
-        "seconds": seconds,
-        "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-        "code_sha256": code,
-    }
+                problem = build_problem(acquisition, replace(found.twin, effects=()), variants=catalogue_variants())
+            result["features"] = session_features(problem)
+            write_statistics(statistics_path, session_statistics(problem))
+            if second is not None and not features_only:
+                with open_acquisition(second) as another:
+                    result["shrinkage_found"] = second_day_shrinkage(another, found.twin, found.added, without=without)
+        except Exception as error:
+            result["statistics_error"] = f"{type(error).__name__}: {error}"
+    return result
 
 
 def main() -> int:

@@ -104,6 +104,8 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         development=scores["development_seed"],
         seal=scores["seal_sha256"],
         options=scores["options"],
+        statistics_errors=scores["statistics_errors"],
+        without_statistics=scores["without_statistics"],
         code_versions=scores["code_versions"],
         aims=[
             row

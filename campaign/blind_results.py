@@ -72,6 +72,10 @@ def score_check(check: OpenedCheck) -> CheckResult:
         "options": asdict(check.options),
         "development_seed": is_development_seed(check.options.seed),
         "code_versions": list(check.versions),
+        "without_statistics": sum(bool(answer.get("statistics_error")) for answer in check.answers),
+        "statistics_errors": sorted(
+            {str(answer["statistics_error"]) for answer in check.answers if answer.get("statistics_error")}
+        ),
         "trained_on": sum(bool(item.features) for item in training),
         "scores": compute_scores(outcomes, effects),
         "full_measurement_set": compute_scores(full, effects),

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import Problem, build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
-from ..diagnosis.inference import Nuisances
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 
@@ -120,9 +119,7 @@ def _folds(problem: Problem) -> NDArray[np.intp]:
 
 def _left_over(problem: Problem, residual: NDArray[np.float64], fit: NDArray[np.bool_]) -> NDArray[np.float64]:
     """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction."""
-    nuisances = Nuisances(problem.factors[fit])
-    held = problem.factors[~fit]
-    left = residual[~fit] - held @ nuisances.fitted(residual[fit])
-    # 1 + f (I + F^T F)^-1 f^T; the inverse by solving for the factors' unit vectors
-    inverse = np.linalg.inv(np.eye(held.shape[1]) + problem.factors[fit].T @ problem.factors[fit])
+    own, held = problem.factors[fit], problem.factors[~fit]
+    inverse = np.linalg.inv(np.eye(own.shape[1]) + own.T @ own)
+    left = residual[~fit] - held @ (inverse @ (own.T @ residual[fit]))
     return np.asarray(left / np.sqrt(1.0 + np.einsum("pi,ij,pj->p", held, inverse, held, optimize=True)))

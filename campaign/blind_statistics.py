@@ -10,14 +10,13 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..diagnosis.assemble import Problem
-from ..diagnosis.inference import Nuisances
-from ..diagnosis.whitening import whiten
+if TYPE_CHECKING:
+    from ..diagnosis.assemble import Problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,12 +62,32 @@ class SessionStatistics:
     missing: tuple[str, ...]
 
 
-def session_statistics(problem: Problem) -> SessionStatistics:
+class _Metric:
+    """a^T C^-1 b with C = I + F F^T: a.b - z_a.z_b, z = L^-1 F^T a, L L^T = I + F^T F."""
+
+    def __init__(self, factors: NDArray[np.float64]) -> None:
+        self._factors = factors
+        self._lower = np.linalg.cholesky(np.eye(factors.shape[1]) + factors.T @ factors)
+
+    def project(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """z (vector, factor) of vectors (vector, probe)."""
+        from scipy.linalg import solve_triangular
+
+        return np.asarray(solve_triangular(self._lower, self._factors.T @ vectors.T, lower=True).T)
+
+    def solve(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """C^-1 times a vector (probe,)."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(vector - self._factors @ cho_solve((self._lower, True), self._factors.T @ vector))
+
+
+def session_statistics(problem: "Problem") -> SessionStatistics:
     """Inner products of a problem's residual and responses."""
-    white = whiten(problem.residual, problem.factors, problem.curves, problem.blocks)
-    shared = Nuisances(white.factors)
-    nodes = np.concatenate([curve.responses for curve in white.curves]) if white.curves else np.zeros((0, 0))
-    bare_nodes = np.concatenate([curve.responses for curve in problem.curves]) if problem.curves else nodes
+    metric = _Metric(problem.factors)
+    residual = problem.residual
+    nodes = np.concatenate([np.zeros((0, len(residual))), *(curve.responses for curve in problem.curves)])
+    z_nodes, z_residual = metric.project(nodes), metric.project(residual[None, :])[0]
     keys = []
     position = 0
     for curve, variant in zip(problem.curves, problem.variants, strict=True):
@@ -85,30 +104,26 @@ def session_statistics(problem: Problem) -> SessionStatistics:
             )
         )
         position += len(curve.strengths)
-    residual = white.residual[None, :]
-    if position == 0:
-        nodes = bare_nodes = np.zeros((0, residual.shape[1]))
     return SessionStatistics(
         curves=tuple(keys),
-        gram=shared.inner(nodes, nodes),
-        linear=shared.inner(nodes, residual)[:, 0],
-        chi_square=float(shared.inner(residual, residual)[0, 0]),
-        bare=bare_nodes @ problem.residual,
-        bare_norm=np.linalg.norm(bare_nodes, axis=1),
-        bare_residual=float(np.linalg.norm(problem.residual)),
-        probes=len(problem.residual),
+        gram=nodes @ nodes.T - z_nodes @ z_nodes.T,
+        linear=nodes @ residual - z_nodes @ z_residual,
+        chi_square=float(residual @ residual - z_residual @ z_residual),
+        bare=nodes @ residual,
+        bare_norm=np.linalg.norm(nodes, axis=1),
+        bare_residual=float(np.linalg.norm(residual)),
+        probes=len(residual),
         missing=tuple(sorted(problem.missing_effects)),
     )
 
 
-def session_features(problem: Problem) -> dict[str, float]:
+def session_features(problem: "Problem") -> dict[str, float]:
     """What a classifier without a forward model may look at: mean and scatter of each family of probes, by name.
 
     A family is one statistic of one axis and kind of scene at one of the session's tube voltages. The mean is
     asinh(mean z sqrt(n)), the scatter log(rms z), of z after the nuisances took their part.
     """
-    nuisances = Nuisances(problem.factors)
-    z = np.asarray(nuisances.solve(problem.residual))
+    z = _Metric(problem.factors).solve(problem.residual)
     voltages = sorted({view.session.series.kV for view in problem.views if _lit(view) and view.session.series.kV})
     families: dict[str, list[float]] = {}
     for index, name in enumerate(problem.names):

@@ -599,4 +599,5 @@ def test_three_small_sessions_end_to_end(tmp_path, capsys):
     assert hashlib.sha256(sealed).hexdigest() == scores["seal_sha256"]
     assert scores["scores"]["cases"]["all"] == 2
     assert len(scores["code_versions"]) == 1
+    assert scores["statistics_errors"] == []
     assert "data:image/png;base64," in (folder / "report.html").read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation validation-prediction blind-check benchmark check format clean
+.PHONY: demo test test-slow validation validation-generator validation-prediction blind-check benchmark check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -31,6 +31,10 @@ validation: $(READY)
 	$(BIN)/python validation/gvxr_transmission.py
 	$(BIN)/python validation/reference_transfer.py --json build/reference_transfer.json
 	$(BIN)/python validation/effects_against_lab.py --json build/effects_against_lab.json
+
+# generated frames against the lab's: statistics and classifiers, figures in build/generator_vs_lab; half an hour a system
+validation-generator: $(READY)
+	for seed in 0 2; do $(BIN)/python validation/generator_vs_lab.py --seed $$seed --output build/generator_vs_lab/$$seed --json build/generator_vs_lab/$$seed.json || exit 1; done
 
 # predictions against truth and against the information limit: hours; a stopped run goes on where it was
 validation-prediction: $(READY)

@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.calibration.validate import validate_twin
 from raytwin.cli import main
+from raytwin.files import sha256_of_file
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.predict_many import predict_levels
 from raytwin.generator.present_line import WORKED_IN, present_line
-from raytwin.generator.series import SeriesRequest, expected_series
+from raytwin.generator.series import SeriesRequest, expected_series, sample_series
 from raytwin.generator.twin_io import write_twin
 
 MEASURED = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
@@ -136,3 +139,58 @@ def test_the_predict_command_applies_the_effects_of_the_twin_file(series_line, t
         found[name] = json.loads(capsys.readouterr().out)
     assert found["changed"]["mean_DN"] == found["plain"]["mean_DN"]
     assert found["changed"]["gain_DN"]["value"] == pytest.approx(1.6 * found["plain"]["gain_DN"]["value"])
+
+
+# ------------------------------------------------------------------------------------------------ validate
+
+
+def session_with(path, twin, effects, settings):
+    """Darks and flats as a line with these effects gives them."""
+    rng = np.random.default_rng(8)
+    with write_acquisition(path, twin.instrument) as writer:
+        for exposure_ms in sorted({one.exposure_ms for one in settings}):
+            dark = SeriesRequest(kind="dark", setting=None, frames=30, exposure_ms=exposure_ms)
+            frames = np.stack(list(sample_series(twin, dark, rng=rng, effects=())))
+            writer.add_series(f"dark_{exposure_ms:g}", kind="dark", exposure_ms=exposure_ms, frames=frames)
+        for setting in settings:
+            flat = SeriesRequest(kind="flat", setting=setting, frames=30, exposure_ms=setting.exposure_ms)
+            frames = np.stack(list(sample_series(twin, flat, rng=rng, effects=effects)))
+            writer.add_series(f"flat_{setting.kV:g}", kind="flat", setting=setting, frames=frames)
+    return path
+
+
+def test_validate_finds_a_line_with_effects_inside_the_intervals_of_the_twin_that_has_them(
+    make_model_twin, tmp_path, capsys
+):
+    import json
+
+    twin = make_model_twin((32, 32), source_object_mm=990.0)
+    effects = (
+        AppliedEffect(id="filtration_error", parameters={"strength": 0.5}, since="calibration"),
+        AppliedEffect(id="excess_noise", parameters={"strength": 60.0}, since="calibration"),
+        AppliedEffect(id="row_noise", parameters={"strength": 1.0}, since="calibration"),
+    )
+    path = session_with(tmp_path / "session.h5", twin, effects, [MEASURED, UNMEASURED])
+    write_twin(tmp_path / "before.h5", twin)
+    write_twin(tmp_path / "after.h5", replace(twin, effects=effects))
+    found = {}
+    for name in ("before", "after"):
+        assert main(["validate", str(tmp_path / f"{name}.h5"), str(path), "--json"]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    assert all(row["inside"]["mean"] for row in found["after"]["rows"])
+    assert found["after"]["median_abs_error_percent"]["sd"] < 1.5
+    assert found["before"]["median_abs_error_percent"]["mean"] > 2.0
+    assert found["before"]["median_abs_error_percent"]["sd"] > 10.0
+
+
+def test_flats_that_calibrated_are_compared_without_what_came_later(series_line, tmp_path):
+    path = session_with(tmp_path / "session.h5", series_line, (), [MEASURED])
+    known = replace(
+        with_effect(series_line, "kv_error", strength=4.0),
+        levels=tuple(replace(level, series=(f"flat_{level.kV:g}",)) for level in series_line.levels),
+        provenance={"acquisition_sha256": sha256_of_file(path)},
+    )
+    with open_acquisition(path) as acquisition:
+        (row,) = validate_twin(known, acquisition).rows
+    assert row.used_in_calibration
+    assert row.predicted_mean_DN.value == pytest.approx(predict_flatfield(series_line, MEASURED).mean_DN.value)

@@ -8,14 +8,27 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
-from ..acquisition.setting import text_from_filters
+from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
+from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
 from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
-from ..spectra import Spectrum
-from .next_measurement import rank_measurements
+from ..spectra import (
+    DEFAULT_ANGLE_DEG,
+    DEFAULT_MODEL,
+    MAXIMUM_KV_OF_ANODE,
+    MINIMUM_KV,
+    MODELS,
+    Spectrum,
+    energy_grid_keV,
+    tube_fluence_interpolated,
+)
+from .next_measurement import rank_measurements, voltages_within_reach
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
-from .spectral_fit import SpectralFit, fit_spectrum
+from .priors import PRIORS
+from .spectral_fit import SpectralFit, fit_spectrum, model_for
 from .wedges import measure_transmissions, wedge_evidence
+
+_POSTERIOR_KV_ERROR = 0.045  # relative, either way: draws of the posterior hardly go further
 
 
 def calibrate_twin(
@@ -43,6 +56,7 @@ def calibrate_twin(
         InputError: the session cannot calibrate anything; the message says what is missing.
     """
     tell = progress or (lambda stage: None)
+    _prepare_spectra(acquisition, tell=tell, advise=advise)
     transfer = compute_photon_transfer(acquisition, estimator=estimator, progress=tell)
     warnings = list(transfer.warnings)
     evidence = dict(transfer.evidence)
@@ -123,6 +137,48 @@ def calibrate_twin(
         ranked = rank_measurements(twin)
         twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
     return twin
+
+
+def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None], advise: bool) -> None:
+    """Compute and keep the spectra and attenuation tables of a session before its frames fill the memory.
+
+    SpekPy takes 150 to 250 MB for a moment whenever it computes a spectrum or reads its tables; beside the maps of a
+    full-size detector that would be the peak of the whole calibration.
+    """
+    flats = [item for item in acquisition.of_kind("flat") if item.kV is not None and item.role != "evaluation"]
+    anode = acquisition.instrument.anode or "W"
+    measured = sorted({float(item.kV or 0.0) for item in flats})
+    if not measured or not (measured[0] >= MINIMUM_KV and measured[-1] <= MAXIMUM_KV_OF_ANODE.get(anode, 0.0)):
+        return  # whatever is wrong is said where it belongs
+    tell("spectra")
+    # the finest of SpekPy's spectra, where the lines lie, takes most and comes first
+    for name in MODELS:
+        tube_fluence_interpolated(
+            measured[0],
+            energies_keV=energy_grid_keV(measured[0]),
+            anode=anode,
+            anode_angle_deg=acquisition.instrument.anode_angle_deg or DEFAULT_ANGLE_DEG,
+            model=name,
+            for_sums=name == DEFAULT_MODEL,
+        )
+    materials = [layer.material for item in flats for layer in item.filters]
+    wanted = dict.fromkeys(measured, PRIORS["kV_error"].high)
+    for kV in voltages_within_reach(measured, anode) if advise else ():
+        wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
+    for highest_kV in sorted({measured[-1], max(wanted)}):
+        model = model_for(acquisition.instrument, materials=materials, highest_kV=highest_kV)
+        stack = tuple(Filter(material=material, thickness_mm=0.1) for material in sorted({*materials, "Al", "Cu"}))
+        samples = np.repeat(model.default_parameters()[None, :], 25, axis=0)
+        for kV, largest in wanted.items():
+            samples[:, model.names.index("kV_error")] = np.linspace(-largest, largest, len(samples))
+            if kV <= model.highest_kV:
+                model.log_derivatives(
+                    samples, OpenBeam(kV=kV, filters=stack), ["spectrum_model", *_shares(model.names)]
+                )
+
+
+def _shares(names: Sequence[str]) -> list[str]:
+    return [name for name in names if name.startswith(OTHER_TABLES)]
 
 
 def _contradicts(fit: SpectralFit) -> bool:

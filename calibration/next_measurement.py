@@ -73,7 +73,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     if posterior is None or not measured:
         return ()
     voltages = sorted({float(level.kV or 0.0) for level in measured})
-    every_kV = _voltages(voltages, posterior.anode)
+    every_kV = voltages_within_reach(voltages, posterior.anode)
     model = spectral_model_of(twin, highest_kV=max(every_kV))
     stacks = {filters_from_text(text) for text in posterior.calibrated_filters}
     plates = sorted({*stacks, *(filters_from_text(text) for text in _PLATES)}, key=str)
@@ -148,7 +148,7 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     return tuple(sorted(ranked, key=lambda item: item.shrinks_to))
 
 
-def _voltages(measured: Sequence[float], anode: str) -> tuple[float, ...]:
+def voltages_within_reach(measured: Sequence[float], anode: str) -> tuple[float, ...]:
     """Round tube voltages (kV) within reach: the measured ones, the middle of the widest gap, above, and below a single one."""
     highest = MAXIMUM_KV_OF_ANODE.get(anode, 300.0)
     found = set(measured)

@@ -95,3 +95,23 @@ def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, ca
     assert predicted["mean_DN"]["value"] == pytest.approx(row["mean_DN"]["value"])
     # the row's interval holds the measured series' own noise too
     assert row["mean_DN"]["high"] - row["mean_DN"]["low"] > predicted["mean_DN"]["high"] - predicted["mean_DN"]["low"]
+
+
+def test_no_spectrum_is_computed_once_frames_have_been_read(session, monkeypatch):
+    # SpekPy's own tables and the maps of a large detector would not fit into 400 MB together
+    from raytwin.spectra import _cache, tube
+
+    stages: list[str] = []
+    read: list[tuple[str, str]] = []
+
+    def recorded(name, key, *, size):
+        read.append((stages[-1], name))
+        return _cache.read_kept(name, key, size=size)
+
+    monkeypatch.setattr(tube, "read_kept", recorded)
+    for kept in (tube._tube_node, tube._line_offsets):
+        kept.cache_clear()
+    with open_acquisition(session["path"]) as acquisition:
+        calibrate_twin(acquisition, rng=np.random.default_rng(2), progress=stages.append)
+    assert {stage for stage, _ in read} == {"spectra"}
+    assert stages.index("spectra") < stages.index("darks")

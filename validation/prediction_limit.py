@@ -57,7 +57,7 @@ from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.twin import Twin
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.lab.bench import Bench
-from raytwin.lab.response import beam_of, compute_deposits
+from raytwin.lab.response import Deposits, beam_of, compute_deposits
 from raytwin.lab.system import LabSystem, detector_maps, sample_system
 from raytwin.lab.truth import flat_truth
 
@@ -284,12 +284,12 @@ class Forward:
         rows["model"] = by(_other_spectrum_model(kV, self.system.anode_angle_deg, energy))
         for material in ("Al", "Cu"):
             thickness = sum(layer.thickness_mm for layer in filters if layer.material == material)
-            depth = mu_per_mm(material, energy) * thickness
+            depth = _mu_per_mm(material, energy) * thickness
             rows[f"{material} scale"] = by(-depth)
             inherent = sum(
                 layer.thickness_mm for layer in self.system.inherent_filtration if layer.material == material
             )
-            whole = mu_per_mm(material, energy) * (thickness + inherent)
+            whole = _mu_per_mm(material, energy) * (thickness + inherent)
             for what, table in (("first table", "xraylib"), ("second table", "penelope")):
                 rows[f"{material} {what}"] = by(-whole * _other_attenuation(material, table, energy))
         departure = np.mean([_other_attenuation("CsI", table, energy) for table in ("xraylib", "penelope")], axis=0)
@@ -311,9 +311,9 @@ class Forward:
         extra = (Filter(material="Al", thickness_mm=1.0),) if moved.get("filtration") else ()
         light = beam_of(system, kV=kV, filters=filters)
         if extra:
-            passed = np.exp(-mu_per_mm("Al", light.energy_keV) * moved["filtration"])
+            passed = np.exp(-_mu_per_mm("Al", light.energy_keV) * moved["filtration"])
             light = replace(light, photons_per_mAs_mm2=light.photons_per_mAs_mm2 * passed)
-        deposits = compute_deposits(light.energy_keV, scintillator_mm=system.scintillator_mm)
+        deposits = _deposits(light.energy_keV, system.scintillator_mm)
         size = light.energy_keV.size
         probability = deposits.probability.copy()
         if "escape" in moved:
@@ -332,7 +332,26 @@ class Forward:
         return np.array([math.log(level), math.log(float(np.sum(light.photons_per_mAs_mm2 * second)) / level)])
 
 
-_KEPT: dict[Any, Array] = {}
+_KEPT: dict[Any, Any] = {}
+
+
+def _mu_per_mm(material: str, energy_keV: Array) -> Array:
+    """The lab's attenuation, kept: its table reads a database at every call."""
+    key = ("attenuation", material, energy_keV.size, float(energy_keV[0]), float(energy_keV[-1]))
+    if key not in _KEPT:
+        _KEPT[key] = mu_per_mm(material, energy_keV)
+    return np.asarray(_KEPT[key])
+
+
+def _deposits(energy_keV: Array, scintillator_mm: float) -> Deposits:
+    """The lab's deposits in a scintillator, those of the last line kept."""
+    key = ("deposits", energy_keV.size, float(energy_keV[0]), float(energy_keV[-1]), scintillator_mm)
+    if key not in _KEPT:
+        for old in [name for name in _KEPT if name[0] == "deposits"][:-200]:
+            del _KEPT[old]
+        _KEPT[key] = compute_deposits(energy_keV, scintillator_mm=scintillator_mm)
+    found: Deposits = _KEPT[key]
+    return found
 
 
 def _other_attenuation(material: str, table: str, energy_keV: Array) -> Array:
@@ -354,7 +373,7 @@ def _other_attenuation(material: str, table: str, energy_keV: Array) -> Array:
             values = sum(
                 share * np.asarray(penelope.get_mu_over_rho(number, energy_keV)) for number, share in fractions.items()
             )
-        ratio = np.asarray(values) * composition(material)[1] / 10.0 / mu_per_mm(material, energy_keV)
+        ratio = np.asarray(values) * composition(material)[1] / 10.0 / _mu_per_mm(material, energy_keV)
         _KEPT[key] = np.clip(ratio - 1.0, -0.1, 0.1)
     return _KEPT[key]
 

@@ -26,10 +26,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
 from ._plain import canonical, digest
 from .blind_cases import BlindCase, draw_cases, is_development_seed, names_of_sets, seal_of, sealed_text
+from .blind_code import check_frozen_code, code_digest, freeze_code, same_code
 
 CASE_TIMEOUT_S = 3600.0
 _ERROR_LINES = 400  # characters of an error that are kept
@@ -117,8 +118,10 @@ class _StoppedError(Exception):
 class Processes:
     """Measuring and diagnosing in processes of their own; `stop` ends those that run."""
 
-    def __init__(self, options: BlindOptions, *, timeout_s: float = CASE_TIMEOUT_S) -> None:
+    def __init__(self, options: BlindOptions, *, code: Path | None = None, timeout_s: float = CASE_TIMEOUT_S) -> None:
+        """`code`: folder of the frozen package (None: as it is installed)."""
         self._options = options
+        self._code = code
         self._timeout_s = timeout_s
         self._running: set[subprocess.Popen[str]] = set()
         self._lock = threading.Lock()
@@ -167,6 +170,10 @@ class Processes:
     def _run(self, module: str, words: Sequence[str], *, folder: Path, given: str) -> None:
         environment = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
         environment |= dict.fromkeys(_THREADS, "1") | {"TMPDIR": str(folder)}
+        if self._code is not None:
+            environment["PYTHONPATH"] = os.pathsep.join(
+                filter(None, (str(self._code), environment.get("PYTHONPATH", "")))
+            )
         command = [sys.executable, "-P", "-m", f"{__package__}.{module}", *words]
         with self._lock:
             if self._stopped.is_set():
@@ -246,6 +253,7 @@ def begin_check(folder: Path, options: BlindOptions, *, development: bool = Fals
             "options_sha256": _options_digest(options, salt),
             "cases": options.cases,
             "train_cases": options.train_cases,
+            "code_sha256": code_digest(),
             "sealed_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         }
         _write_json(seal_path, page)
@@ -267,6 +275,50 @@ def begin_check(folder: Path, options: BlindOptions, *, development: bool = Fals
             remedy="go on with the version that began the check",
         )
     return str(page["sha256"]), cases
+
+
+@contextlib.contextmanager
+def frozen_code(folder: Path) -> Iterator[Path]:
+    """The code of a check, copied when it begins and kept over stops until its answers are all in.
+
+    Raises:
+        InputError: the copy is gone and the code has changed since.
+        RaytwinError: the code cannot be imported.
+    """
+    note = folder / ".private" / "code"
+    expected = str(_read_json(folder / "seal.json")["code_sha256"])
+    if note.exists():
+        kept = Path(note.read_text(encoding="utf-8"))
+        if (kept / "raytwin").is_dir() and code_digest(kept / "raytwin") == expected:
+            check_frozen_code(kept)
+            yield kept
+            _drop_code(kept, note, folder)
+            return
+    if not any((folder / "answers").glob("*.json")):
+        # nothing was answered yet: a check that could not start may start with code that was mended
+        expected = code_digest()
+        _write_json(folder / "seal.json", _read_json(folder / "seal.json") | {"code_sha256": expected})
+    same_code(expected, folder)
+    place = freeze_code(Path(tempfile.mkdtemp(prefix="raytwin-code-")))
+    try:
+        if code_digest(place / "raytwin") != expected:
+            raise RaytwinError("the code was changed while it was copied; try again")
+        check_frozen_code(place)
+    except RaytwinError:
+        shutil.rmtree(place, ignore_errors=True)
+        raise
+    if note.parent.exists():
+        with whole_file(note) as temporary:
+            temporary.write_text(str(place), encoding="utf-8")
+    yield place
+    _drop_code(place, note, folder)
+
+
+def _drop_code(place: Path, note: Path, folder: Path) -> None:
+    """Remove the copy; not reached after a stop, so that the run can go on with it."""
+    if place.name.startswith("raytwin-code-") and (folder / "answers").exists():
+        shutil.rmtree(place, ignore_errors=True)
+        note.unlink(missing_ok=True)
 
 
 def run_check(
@@ -295,7 +347,7 @@ def run_check(
     answers = folder / "answers"
     answers.mkdir(exist_ok=True)
     with _only_one(folder), _workplace(folder) as place:
-        left = [case for case in cases if not answer_path(folder, case).exists()]
+        left = unanswered(folder, cases)
         begin(len(left))
         if (folder / "answers.json").exists() and left:
             raise InputError(
@@ -329,7 +381,7 @@ def open_check(folder: Path, options: BlindOptions, cases: Sequence[BlindCase]) 
     Raises:
         InputError: an answer is missing, or was changed after the labels were opened, or the seal does not fit.
     """
-    missing = [case for case in cases if not answer_path(folder, case).exists()]
+    missing = unanswered(folder, cases)
     if missing:
         raise InputError(
             str(folder), received=f"{len(missing)} cases without an answer", expected="an answer to every case"
@@ -365,6 +417,11 @@ def open_check(folder: Path, options: BlindOptions, cases: Sequence[BlindCase]) 
         folder=folder,
         versions=tuple(versions),
     )
+
+
+def unanswered(folder: Path, cases: Sequence[BlindCase]) -> list[BlindCase]:
+    """The cases that have no answer yet."""
+    return [case for case in cases if not answer_path(folder, case).exists()]
 
 
 def answer_path(folder: Path, case: BlindCase) -> Path:

@@ -69,8 +69,9 @@ def judge_session(
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
     from ..diagnosis.diagnose import calibrated_twin, diagnose, diagnosis_answer
+    from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
-    from .blind_statistics import code_digest, session_features, session_statistics, write_statistics
+    from .blind_statistics import session_features, session_statistics, write_statistics
 
     result: dict[str, Any] = {"answer": None, "code_sha256": code_digest()}
     start = time.perf_counter()

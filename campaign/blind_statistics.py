@@ -5,7 +5,6 @@ numbers G = N C^-1 N^T, b = N C^-1 r and r^T C^-1 r hold everything that separat
 itself may be thrown away.
 """
 
-import hashlib
 import math
 import re
 from dataclasses import dataclass
@@ -148,19 +147,6 @@ def session_features(problem: "Problem") -> dict[str, float]:
 
 def _lit(view: Any) -> bool:
     return bool(view.session.series.kind in ("flat", "object"))
-
-
-def code_digest() -> str:
-    """SHA-256 over the package's own source, so that answers of different versions are not mixed unseen."""
-    state = hashlib.sha256()
-    campaign = Path(__file__).parent
-    for room in ("acquisition", "calibration", "diagnosis", "generator", "materials", "spectra"):
-        folder = campaign.parent / room
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in (".py", ".toml"):
-                state.update(f"{room}/{path.relative_to(folder).as_posix()}".encode())
-                state.update(path.read_bytes())
-    return state.hexdigest()
 
 
 def write_statistics(path: Path, statistics: SessionStatistics) -> None:

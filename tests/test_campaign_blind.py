@@ -21,14 +21,23 @@ from raytwin.campaign.blind_cases import (
     names_of_sets,
     seal_of,
 )
-from raytwin.campaign.blind_check import BlindOptions, Work, answer_path, begin_check, open_check, run_check
+from raytwin.campaign.blind_check import (
+    BlindOptions,
+    Work,
+    answer_path,
+    begin_check,
+    frozen_code,
+    open_check,
+    run_check,
+)
+from raytwin.campaign.blind_code import check_frozen_code, code_digest, freeze_code
 from raytwin.campaign.blind_measure import measure_case
 from raytwin.campaign.blind_report import summary_text, write_report
 from raytwin.campaign.blind_results import case_rows, score_check, write_cases
 from raytwin.campaign.blind_scores import compute_scores, strength_scores
 from raytwin.campaign.blind_statistics import CurveKey, SessionStatistics, write_statistics
 from raytwin.cli import main
-from raytwin.errors import InputError
+from raytwin.errors import InputError, RaytwinError
 from raytwin.generator.effects import EFFECTS
 from raytwin.lab.cases import LABELS
 from raytwin.lab.effects import EFFECTS as LAB
@@ -456,6 +465,38 @@ def test_sessions_are_thrown_away_unless_they_are_to_be_kept(tmp_path):
     assert not list((tmp_path / "thrown").rglob("*.h5"))
     checked(tmp_path / "kept", options, keep_sessions=True)
     assert len(list((tmp_path / "kept" / "sessions").glob("case_*.h5"))) == 3
+
+
+# ---- the code that answers
+
+
+def test_the_frozen_code_is_the_package_and_is_what_runs(tmp_path):
+    frozen = freeze_code(tmp_path / "code")
+    assert code_digest(frozen / "raytwin") == code_digest()
+    check_frozen_code(frozen)
+    changed = frozen / "raytwin" / "diagnosis" / "diagnose.py"
+    changed.write_text("import nothing_of_that_name\n" + changed.read_text(encoding="utf-8"), encoding="utf-8")
+    assert code_digest(frozen / "raytwin") != code_digest()
+    with pytest.raises(RaytwinError, match=r"cannot be imported: ModuleNotFoundError: .*nothing_of_that_name"):
+        check_frozen_code(frozen)
+
+
+def test_a_check_goes_on_with_the_code_that_it_was_begun_with(tmp_path):
+    folder = tmp_path / "check"
+    begin_check(folder, BlindOptions(cases=1, seed=FRESH))
+    with pytest.raises(KeyboardInterrupt), frozen_code(folder) as first:
+        raise KeyboardInterrupt
+    (folder / "answers").mkdir()
+    (folder / "answers" / "case_00000.json").write_text("{}", encoding="utf-8")
+    with frozen_code(folder) as second:
+        assert second == first
+        assert (second / "raytwin" / "lab" / "cases.py").exists()
+    assert not second.exists()
+    page = json.loads((folder / "seal.json").read_text(encoding="utf-8"))
+    page["code_sha256"] = "f" * 64
+    (folder / "seal.json").write_text(json.dumps(page), encoding="utf-8")
+    with pytest.raises(InputError, match=r"begun with other code; .*hash to ffffffffffff"), frozen_code(folder):
+        pass
 
 
 # ---- seeds

@@ -69,7 +69,15 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from .. import __version__
-    from ..campaign.blind_check import BlindOptions, Processes, begin_check, open_check, run_check
+    from ..campaign.blind_check import (
+        BlindOptions,
+        Processes,
+        begin_check,
+        frozen_code,
+        open_check,
+        run_check,
+        unanswered,
+    )
     from ..campaign.blind_report import summary_text, write_report
     from ..campaign.blind_results import case_rows, score_check, write_cases
     from ..errors import InputError
@@ -102,16 +110,18 @@ def run(arguments: argparse.Namespace) -> int:
         bar.update()
 
     try:
-        run_check(
-            folder,
-            options,
-            cases,
-            Processes(options).work(),
-            workers=arguments.workers,
-            keep_sessions=arguments.keep_sessions,
-            begin=begin,
-            advance=advance,
-        )
+        if unanswered(folder, cases):
+            with frozen_code(folder) as code:
+                run_check(
+                    folder,
+                    options,
+                    cases,
+                    Processes(options, code=code).work(),
+                    workers=arguments.workers,
+                    keep_sessions=arguments.keep_sessions,
+                    begin=begin,
+                    advance=advance,
+                )
     finally:
         if bar is not None:
             bar.close()

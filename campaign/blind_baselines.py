@@ -9,7 +9,7 @@ features. The last two have no model of the line; they learn from cases with oth
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,11 +30,32 @@ _FALLBACK_THRESHOLD = 4.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Example:
-    """A session as baselines see it. Fields: targets (share of each class in its label); features by name; statistics."""
+    """A session as baselines see it.
+
+    Fields: targets (share of each class in its label); features by name; bare, matched: best correlation of the residual with
+    each effect's templates, without and with the nuisances' covariance, standard deviations.
+    """
 
     targets: Mapping[str, float]
     features: Mapping[str, float]
-    statistics: SessionStatistics | None
+    bare: Mapping[str, float] = field(default_factory=dict)
+    matched: Mapping[str, float] = field(default_factory=dict)
+
+    def templates(self, *, bare: bool) -> Mapping[str, float]:
+        """One of the two."""
+        return self.bare if bare else self.matched
+
+
+def example_of(
+    label: str, truth: Sequence[str], features: Mapping[str, float], statistics: SessionStatistics | None
+) -> Example:
+    """A session's example; nothing of the session's own inner products is kept."""
+    return Example(
+        targets=targets_of(label, truth),
+        features=features,
+        bare={} if statistics is None else matched_filter(statistics, bare=True),
+        matched={} if statistics is None else matched_filter(statistics, bare=False),
+    )
 
 
 def targets_of(label: str, truth: Sequence[str]) -> dict[str, float]:
@@ -96,9 +117,9 @@ class TemplateRule:
     bare: bool
     threshold: float
 
-    def probability(self, statistics: SessionStatistics | None, effects: Sequence[str]) -> dict[str, float]:
+    def probability(self, session: Example, effects: Sequence[str]) -> dict[str, float]:
         """All on the name that is chosen."""
-        values = {} if statistics is None else matched_filter(statistics, bare=self.bare)
+        values = session.templates(bare=self.bare)
         best = max(values, key=lambda name: values[name], default=NONE)
         chosen = best if values and values[best] > self.threshold else NONE
         return {name: float(name == chosen) for name in classes_of(effects)}
@@ -107,9 +128,9 @@ class TemplateRule:
 def fit_template_rule(examples: Sequence[Example], *, bare: bool) -> TemplateRule:
     """Set the threshold so that one training case without effect in twenty exceeds it; 4.5 without such cases."""
     largest = [
-        max(matched_filter(item.statistics, bare=bare).values(), default=0.0)
+        max(item.templates(bare=bare).values())
         for item in examples
-        if item.statistics is not None and item.targets.get(NONE) == 1.0
+        if item.templates(bare=bare) and item.targets.get(NONE) == 1.0
     ]
     threshold = float(np.quantile(largest, 1.0 - FALSE_ALARM)) if len(largest) >= 5 else _FALLBACK_THRESHOLD
     return TemplateRule(bare=bare, threshold=threshold)
@@ -288,8 +309,7 @@ def baseline_outcomes(
     for name, bare in (("nearest_template", True), ("matched_filter", False)):
         rule = fit_template_rule(training, bare=bare)
         result[name] = [
-            answered(item, rule.probability(session.statistics, effects))
-            for item, session in zip(outcomes, sessions, strict=True)
+            answered(item, rule.probability(session, effects)) for item, session in zip(outcomes, sessions, strict=True)
         ]
     usable = [item for item in training if item.features]
     if len(usable) >= 2 * _FOLDS:

@@ -10,7 +10,7 @@ from typing import Any
 from ..files import whole_file
 from ..generator.effects import EFFECTS
 from ._plain import plain
-from .blind_baselines import Example, baseline_outcomes, baseline_scores, targets_of
+from .blind_baselines import Example, baseline_outcomes, baseline_scores, example_of
 from .blind_cases import case_from_label, is_development_seed
 from .blind_check import OpenedCheck, statistics_path, withheld
 from .blind_scores import (
@@ -44,9 +44,7 @@ def score_check(check: OpenedCheck) -> CheckResult:
         path = statistics_path(check.folder, label["stream"], label["index"])
         statistics = read_statistics(path) if path.exists() else None
         truth = tuple(item["id"] for item in label["effects"])
-        example = Example(
-            targets=targets_of(label["label"], truth), features=answer.get("features", {}), statistics=statistics
-        )
+        example = example_of(label["label"], truth, answer.get("features", {}), statistics)
         if label["stream"] == "train":
             training.append(example)
             continue

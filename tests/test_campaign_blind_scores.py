@@ -479,7 +479,7 @@ def test_template_thresholds_let_one_case_in_twenty_pass():
         for _ in range(300)
     ]
     rule = fit_template_rule(quiet, bare=True)
-    alarms = [rule.probability(item.statistics, tuple("abcd"))[NONE] == 0.0 for item in quiet]
+    alarms = [rule.probability(item, tuple("abcd"))[NONE] == 0.0 for item in quiet]
     assert np.mean(alarms) == pytest.approx(0.05, abs=0.005)
     assert fit_template_rule([], bare=True).threshold == 4.5
 
@@ -495,7 +495,7 @@ def examples(rng, n, effects):
         features["strange"] = float(rng.standard_normal()) + 4.0 * (label == "unknown")
         if rng.random() < 0.2:
             features.pop(str(rng.choice(effects)))
-        result.append(Example(targets=targets_of(label, truth), features=features, statistics=None))
+        result.append(Example(targets=targets_of(label, truth), features=features))
     return result
 
 

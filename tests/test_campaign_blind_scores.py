@@ -473,10 +473,7 @@ def test_a_matched_filter_is_normal_where_there_is_nothing():
 def test_template_thresholds_let_one_case_in_twenty_pass():
     rng = np.random.default_rng(13)
     quiet = [
-        Example(
-            targets={NONE: 1.0}, features={}, statistics=statistics_of(np.eye(4), np.eye(4), rng.standard_normal(4))
-        )
-        for _ in range(300)
+        example_of("none", (), {}, statistics_of(np.eye(4), np.eye(4), rng.standard_normal(4))) for _ in range(300)
     ]
     rule = fit_template_rule(quiet, bare=True)
     alarms = [rule.probability(item, tuple("abcd"))[NONE] == 0.0 for item in quiet]

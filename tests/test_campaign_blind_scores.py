@@ -13,6 +13,7 @@ from raytwin.campaign.blind_baselines import (
     answered,
     classes_of,
     commonest,
+    example_of,
     fit_logistic,
     fit_signatures,
     fit_template_rule,

@@ -630,6 +630,13 @@ class ReferenceImages:
         yield from effect_warnings(self.channels, references=True)
 
 
+def effects_provenance(twin: Twin | None) -> dict[str, str]:
+    """Entry for a dataset's provenance that says which effects the twin has; none where it has none."""
+    if twin is None or not twin.effects:
+        return {}
+    return {"effects": "+".join(f"{item.id}={item.parameters.get('strength', math.nan):g}" for item in twin.effects)}
+
+
 def effect_warnings(channels: Sequence[ChannelModel], *, references: bool) -> list[str]:
     """One line for each effect that images do not hold."""
     found: dict[str, None] = {}
@@ -714,6 +721,7 @@ def generate_dataset(
         "foreign_material": foreign_material if drawn.transfers else None,
         "bad_pixels": bad_pixels,
         "registration_px": None if registration_px is None else str(registration_px),
+        **effects_provenance(twin if recipe == "raytwin" else None),
     }
     with write_dataset(out, shape=reference.shape, provenance=provenance) as writer:
         for number in range(images):

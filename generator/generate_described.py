@@ -16,7 +16,7 @@ from ..files import sha256_of_file
 from ._fine_picture import FINE
 from .binning import refuse_binning
 from .describe import Description, Individual, Scene, choose_kind, sample_individual, sample_scene
-from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise, effect_warnings
+from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise, effect_warnings, effects_provenance
 from .image_effects import AffectedImage
 from .present_line import present_line
 from .render import (
@@ -256,6 +256,7 @@ def generate_from_description(
         "recipe": "raytwin",
         "bad_pixels": bad_pixels,
         "supersampling": supersampling,
+        **effects_provenance(twin),
     }
     with_foreign = clipped = values = 0
     products = set()

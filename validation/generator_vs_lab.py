@@ -445,34 +445,45 @@ def run(seed: int, size: Size, *, network: bool, output: Path | None) -> dict[st
     if output is not None:
         draw(curves, output)
     sets = image_sets(size, seed, system, twin, [Session(system, bad, [seed, number]) for number in (21, 22)])
-    if output is not None:
-        np.savez_compressed(output / "images.npz", **{name: one.astype(np.float16) for name, one in sets.items()})
     classified = []
     for patch in (16, 64):
         classified += classify(sets, patch=patch, size=size, seed=seed, network=network)
     return {"seed": seed, "statistics": rows, "classifiers": classified}
 
 
+PLACES = {
+    "photon transfer": "band of signal, dark to bright",
+    "noise power": "ring of spatial frequency, 0 to 0.6 cycles per pixel",
+    "edge profile": "distance from the edge, half pixels from -4",
+    "histogram": "bin of log values, each a twentieth of the lab's",
+}
+
+
 def draw(curves: Mapping[tuple[float, float], Mapping[str, list[Array]]], output: Path) -> None:
-    """Curves of lab (grey: replicates) and generator (blue: replicates) as figures."""
+    """Figures of every statistic: departures of single replicates from the lab's mean, in the lab's standard deviations."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     output.mkdir(parents=True, exist_ok=True)
+    kinds = (("lab", "0.6"), ("lab again", "0.8"), ("from maps", "tab:blue"), ("told transmissions", "tab:orange"))
     for statistic in next(iter(curves.values())):
         figure, axes = pyplot.subplots(
-            2, max(len(curves) // 2, 1), figsize=(11, 6), squeeze=False, layout="constrained"
+            2, max(len(curves) // 2, 1), figsize=(12, 6.5), squeeze=False, layout="constrained"
         )
         for axis, ((kV, exposure_ms), found) in zip(axes.ravel(), curves.items(), strict=False):
-            lab, _, made, _ = found[statistic]
-            for values, colour, label in ((lab, "0.6", "lab"), (made, "tab:blue", "from maps")):
-                for number, one in enumerate(values):
-                    style = {"marker": "."} if one.size < 3 else {"linewidth": 0.8}
-                    axis.plot(one, color=colour, label=label if number == 0 else None, **style)
+            middle, scatter = found[statistic][0].mean(axis=0), found[statistic][0].std(axis=0, ddof=1)
+            for number, ((name, colour), values) in enumerate(zip(kinds, found[statistic], strict=True)):
+                away = (values - middle) / scatter
+                place = np.arange(away.shape[1]) + 0.12 * (number - 1.5)
+                axis.plot(place, away.T, ".", color=colour, markersize=2.5)
+                axis.plot(place, away.mean(axis=0), "_", color=colour, markersize=9, label=f"{name}, mean")
+            axis.axhline(0.0, color="0.8", linewidth=0.6)
             axis.set_title(f"{kV:g} kV, {exposure_ms:g} ms", fontsize=9)
-        axes[0, 0].legend(fontsize=8)
+        axes[0, 0].legend(fontsize=7)
+        figure.supxlabel(PLACES[statistic.split(",")[0]], fontsize=9)
+        figure.supylabel("departure from the lab's mean, standard deviations of a replicate", fontsize=9)
         figure.suptitle(statistic)
         figure.savefig(output / (statistic.replace(", ", "_").replace(" ", "_") + ".png"), dpi=110)
         pyplot.close(figure)

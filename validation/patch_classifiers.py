@@ -96,6 +96,15 @@ def logistic_scores(
     return score(test[0]), score(test[1])
 
 
+def _layers_of(patches: Patches) -> Patches:
+    """What the network sees (patch, layer, size, size): log images, their fine detail over its rms, and that rms."""
+    from scipy.ndimage import uniform_filter
+
+    detail = patches - uniform_filter(patches, (0, 0, 5, 5), mode="nearest")
+    rms = np.sqrt((detail**2).mean(axis=(2, 3), keepdims=True)) + 1e-9
+    return np.concatenate([patches, detail / rms, np.log(rms) + 0.0 * patches], axis=1).astype(np.float32)
+
+
 def network_scores(
     train: tuple[Patches, Patches], test: tuple[Patches, Patches], *, epochs: int, seed: int, device: str = "cpu"
 ) -> tuple[Array, Array]:
@@ -105,8 +114,8 @@ def network_scores(
 
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    whole = np.concatenate(train)
-    middle, scale = whole.mean(axis=(0, 2, 3), keepdims=True), whole.std(axis=(0, 2, 3), keepdims=True)
+    whole = _layers_of(np.concatenate(train))
+    middle, scale = whole.mean(axis=(0, 2, 3), keepdims=True), whole.std(axis=(0, 2, 3), keepdims=True) + 1e-6
     label = np.concatenate([np.zeros(len(train[0])), np.ones(len(train[1]))]).astype(np.float32)
     size = whole.shape[-1]
     layers: list[nn.Module] = [nn.Conv2d(whole.shape[1], 16, 3, padding=1), nn.ReLU()]
@@ -141,7 +150,7 @@ def network_scores(
         found = []
         with torch.no_grad():
             for start in range(0, len(values), 256):
-                piece = np.ascontiguousarray((values[start : start + 256] - middle) / scale)
+                piece = np.ascontiguousarray((_layers_of(values[start : start + 256]) - middle) / scale)
                 found.append(network(torch.from_numpy(piece).to(device))[:, 0].cpu().numpy())
         return np.concatenate(found).astype(np.float64)
 

@@ -1,7 +1,7 @@
 """Session and twin -> the problem that inference solves: residual probes, nuisance factors, responses to every effect."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
-from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series
+from ..generator.series import (
+    ExpectedSeries,
+    ModelCache,
+    SeriesRequest,
+    expected_series,
+    session_conditions,
+    with_conditions,
+)
 from ..generator.twin import Twin
 from . import changes as scales
 from .changes import TwinChange, Variant, smooth_twin, twin_changes
@@ -34,6 +41,7 @@ from .session import SessionSeries, read_session
 from .summaries import BLOCK_PX, SeriesSummary, summarise_series
 
 Map = NDArray[np.float32]
+_CACHE_BYTES = 200_000_000
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _LABEL_PIXELS = 150  # that a noise label needs
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
@@ -100,6 +108,46 @@ class Problem:
     dark_weights: dict[float, dict[str, float]]
     skipped: tuple[str, ...]
     missing_effects: dict[str, str]
+    conditions: dict[str, float]
+    respond: Callable[[Sequence[Variant]], dict[int, NDArray[np.float64]]]
+
+    def released(self) -> "Problem":
+        """Without the frames' projections that `respond` holds."""
+
+        def spent(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+            raise RuntimeError(f"{len(asked)} variants asked of a problem whose projections were released")
+
+        return replace(self, respond=spent)
+
+    def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
+        """With further variants and their responses (strength, probe)."""
+        curves = [
+            Curve(
+                effect=variant.effect,
+                variant=variant.name,
+                parameters=dict(variant.parameters),
+                low=variant.low,
+                high=variant.high,
+                strengths=np.array(variant.strengths),
+                responses=responses,
+                since=variant.since,
+                spread=next((item.spread for item in self.curves if item.effect == variant.effect), None),
+            )
+            for variant, responses in more
+        ]
+        return replace(
+            self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Absorbed:
+    """What calibration takes in of a change: change of each calibrating mean frame, of its scalars, darks, gain."""
+
+    mean_DN: dict[str, Map]
+    scalars: dict[str, dict[str, float]]
+    dark_DN: dict[float, Map]
+    gain: Map
 
 
 @dataclass(slots=True)
@@ -111,6 +159,7 @@ class _Change:
     effects: tuple[AppliedEffect, ...]
     parameters: NDArray[np.float64] | None
     step_sd: float = 1.0
+    spectral: bool = False
     failed: str = ""
 
 
@@ -216,9 +265,9 @@ def build_problem(
     caches: dict[int, ModelCache] = {}
 
     def expect(request: SeriesRequest, change: _Change, unchanged: ExpectedSeries | None = None) -> ExpectedSeries:
-        if unchanged is not None and not _touches(change, request.kind):
+        if unchanged is not None and not _touches(change, request):
             return unchanged
-        cache = caches.setdefault(id(change.twin), ModelCache())
+        cache = caches.setdefault(id(change.twin), ModelCache(draft=True, budget_bytes=_CACHE_BYTES))
         return expected_series(
             change.twin,
             request,
@@ -227,6 +276,11 @@ def build_problem(
             cache=cache,
             use_measured_level=False,
         )
+
+    conditions = session_conditions([item.request for item in session], readout_ms=twin.instrument.readout_ms)
+
+    def effect_change(variant: Variant, strength: float) -> _Change:
+        return _Change(variant.effect, base, (with_conditions(variant.applied(strength), conditions),), None)
 
     nothing = _Change("base", base, (), None)
     tell("expectation")
@@ -384,10 +438,12 @@ def build_problem(
     all_changes: list[_Change] = []
     for variant in variants:
         for strength in variant.strengths:
-            all_changes.append(_Change(variant.effect, base, (variant.applied(strength),), None))
+            all_changes.append(effect_change(variant, strength))
     nuisance_changes: list[TwinChange] = twin_changes(base)
     for step in nuisance_changes:
-        all_changes.append(_Change(step.name, step.twin, (), step.parameters, step.step_sd))
+        all_changes.append(
+            _Change(step.name, step.twin, (), step.parameters, step.step_sd, spectral=step.parameters is not None)
+        )
 
     contexts: dict[str, ScalarContext] = {}
     base_scalars: dict[str, dict[str, float]] = {}
@@ -424,82 +480,96 @@ def build_problem(
         base_scalars[item.name] = expected_scalars(model, contexts[item.name])
 
     tell("responses")
-    # 1. what each change does to the calibrating series, and through them to darks and gain
+    nowhere = np.zeros((1, 1), np.float32)
     calibrating = [item for item in kept if item.calibrates]
-    delta: list[dict[str, Map]] = []
-    scalar_change: list[dict[str, dict[str, float]]] = []
-    dark_of: list[dict[float, Map]] = []
-    absorbed: list[Map] = []
-    for change in all_changes:
+
+    def absorb(change: _Change) -> _Absorbed:
+        """What a change does to the calibrating series, and through them to darks and gain map."""
         own: dict[str, Map] = {}
         own_scalars: dict[str, dict[str, float]] = {}
+        dark_change: dict[float, Map] = {}
+        taken = nowhere
         for item in calibrating:
             try:
                 model = expect(item.request, change, expected[item.name])
             except InputError as error:
                 change.failed = str(error)
-                break
+                return _Absorbed(own, own_scalars, dark_change, taken)
+            if model is expected[item.name]:
+                own[item.name] = nowhere
+                own_scalars[item.name] = base_scalars[item.name]
+                continue
             scale = max(mean_signal[item.name], 1.0)
             own[item.name] = _compact(np.asarray(model.mean_DN) - np.asarray(expected[item.name].mean_DN), scale)
             own_scalars[item.name] = expected_scalars(model, contexts[item.name])
-        delta.append(own)
-        scalar_change.append(own_scalars)
-        dark_change: dict[float, Map] = {}
-        taken = np.zeros((1, 1), np.float32)
-        if not change.failed:
-            for item in kept:
-                exposure = item.series.exposure_ms or 0.0
-                if exposure not in dark_change:
-                    total_dark = np.zeros((1, 1), np.float32)
-                    for name, weight in dark_weights(item).items():
-                        total_dark = total_dark + np.float32(weight) * own[name]
-                    dark_change[exposure] = total_dark
-            for item in flats:
-                signal_map = np.maximum(np.asarray(expected[item.name].signal_DN, dtype=np.float32), 1e-6)
-                lit = own[item.name] - dark_change[item.series.exposure_ms or 0.0]
-                taken = taken + np.float32(shares[item.name]) * (lit / _compact(signal_map, 1.0))
-        dark_of.append(dark_change)
-        absorbed.append(taken)
+        for item in kept:
+            exposure = item.series.exposure_ms or 0.0
+            if exposure not in dark_change:
+                total_dark = nowhere
+                for name, weight in dark_weights(item).items():
+                    total_dark = total_dark + np.float32(weight) * own[name]
+                dark_change[exposure] = total_dark
+        for item in flats:
+            signal_map = np.maximum(np.asarray(expected[item.name].signal_DN, dtype=np.float32), 1e-6)
+            lit = own[item.name] - dark_change[item.series.exposure_ms or 0.0]
+            taken = taken + np.float32(shares[item.name]) * (lit / _compact(signal_map, 1.0))
+        return _Absorbed(own, own_scalars, dark_change, taken)
+
+    def move(item: SessionSeries, change: _Change, taken: _Absorbed) -> tuple[Map, dict[str, float]] | None:
+        """What a change does to the corrected mean frame of a series, DN, and its scalar probes; None: it cannot be asked."""
+        if change.failed:
+            return None
+        model = expected[item.name]
+        kind = item.series.kind
+        dark_shift = taken.dark_DN.get(item.series.exposure_ms or 0.0, nowhere)
+        if item.calibrates:
+            moved, values = taken.mean_DN[item.name], taken.scalars[item.name]
+        else:
+            try:
+                changed = expect(item.request, change, model)
+            except InputError as error:
+                change.failed = str(error)
+                return None
+            if changed is model:
+                moved = nowhere
+            else:
+                moved = _compact(
+                    np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), max(mean_signal[item.name], 1.0)
+                )
+            if changed is model and not (kind == "afterglow" and bool(np.any(dark_shift))):
+                values = base_scalars[item.name]
+            else:
+                values = expected_scalars(changed, contexts[item.name], dark_change_DN=-dark_shift)
+        moved = moved - dark_shift
+        if item.name in placements and _only_displaces(change):
+            moved = nowhere
+        if kind in ("flat", "object") and bool(np.any(taken.gain)):
+            signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float32), shape)
+            moved = moved - signal * taken.gain
+        if item.name in first_of_place and item.name in placements:
+            values = (
+                values | {"displacement along rows": 0.0, "displacement along columns": 0.0} | _displacement_of(change)
+            )
+        return np.asarray(moved, dtype=np.float32), values
+
+    taken_in = [absorb(change) for change in all_changes]
 
     # 2. series by series: templates, projections, responses
+    thicker_scenes: dict[tuple[str, str], dict[str, NDArray[np.floating]]] = {}
+    thicker_cache = ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
     blocks: list[dict[str, Any]] = []
     views: list[SeriesView] = []
     for item in kept:
         tell(f"responses of {item.name}")
         model = expected[item.name]
         signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float64), shape)
-        exposure = item.series.exposure_ms or 0.0
         kind = item.series.kind
         maps: list[Map | None] = []
         scalars: list[dict[str, float] | None] = []
-        for index, change in enumerate(all_changes):
-            if change.failed:
-                maps.append(None)
-                scalars.append(None)
-                continue
-            if item.calibrates:
-                moved = delta[index][item.name]
-                values = scalar_change[index][item.name]
-            else:
-                try:
-                    changed = expect(item.request, change, model)
-                except InputError as error:
-                    change.failed = str(error)
-                    maps.append(None)
-                    scalars.append(None)
-                    continue
-                moved = _compact(
-                    np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), max(mean_signal[item.name], 1.0)
-                )
-                dark_shift = dark_of[index].get(exposure, np.zeros((1, 1), np.float32))
-                values = expected_scalars(changed, contexts[item.name], dark_change_DN=-dark_shift)
-            moved = moved - dark_of[index].get(exposure, np.zeros((1, 1), np.float32))
-            if item.name in placements and _only_displaces(change):
-                moved = np.zeros((1, 1), np.float32)
-            if kind in ("flat", "object"):
-                moved = moved - np.asarray(signal, dtype=np.float32) * absorbed[index]
-            maps.append(np.asarray(moved, dtype=np.float32))
-            scalars.append(values)
+        for change, taken in zip(all_changes, taken_in, strict=True):
+            found = move(item, change, taken)
+            maps.append(None if found is None else found[0])
+            scalars.append(None if found is None else found[1])
         residual_map = corrected[item.name] - signal
         lies = placements.get(item.name)
         mask = clean if lies is None else _inside(clean, lies)
@@ -558,11 +628,10 @@ def build_problem(
         scalar_probes = [probe for probe in scalar_probes if probe.name in base_scalars[item.name]]
         if lies is not None and item.name in first_of_place:
             scalar_probes += _displacement_probes(lies)
-            base_scalars[item.name] |= {"displacement along rows": 0.0, "displacement along columns": 0.0}
-            for index, change in enumerate(all_changes):
-                there = scalars[index]
-                if there is not None:
-                    there |= _displacement_of(change)
+            base_scalars[item.name] = base_scalars[item.name] | {
+                "displacement along rows": 0.0,
+                "displacement along columns": 0.0,
+            }
         floor_map = _half_difference(item, summaries[item.name])
         views.append(
             SeriesView(
@@ -576,13 +645,23 @@ def build_problem(
                 floor_rms=floor_map,
             )
         )
-        thicker: dict[str, Map] = {}
+        thicker: dict[str, tuple[Map, dict[str, float]]] = {}
         for material in item.request.thickness_mm or {} if kind == "object" else {}:
-            request = _thicker(item.request, material, 1.0 + scales.THICKNESS_SD)
-            thicker[material] = np.asarray(
-                np.asarray(expected_series(base, request, effects=(), use_measured_level=False).mean_DN)
-                - np.asarray(model.mean_DN),
-                dtype=np.float32,
+            # one mapping for all series of the scene, so that it is drawn once
+            scene = thicker_scenes.setdefault(
+                (item.series.scene, material),
+                _thicker(item.request.thickness_mm or {}, material, 1.0 + scales.THICKNESS_SD),
+            )
+            changed = expected_series(
+                base,
+                replace(item.request, thickness_mm=scene),
+                effects=(),
+                cache=thicker_cache,
+                use_measured_level=False,
+            )
+            thicker[material] = (
+                np.asarray(np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), dtype=np.float32),
+                expected_scalars(changed, contexts[item.name]),
             )
         blocks.append(
             _block(
@@ -598,6 +677,26 @@ def build_problem(
                 shape,
             )
         )
+
+    def respond(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+        """Responses (strength, probe) of further variants, by their place in `asked`; failed ones are left out."""
+        result = {}
+        for number, variant in enumerate(asked):
+            rows = []
+            for strength in variant.strengths:
+                change = effect_change(variant, strength)
+                taken = absorb(change)
+                parts = []
+                for item, block in zip(kept, blocks, strict=True):
+                    found = move(item, change, taken)
+                    if found is not None:
+                        parts.append(_standardised(block, base_scalars[item.name], found[0], found[1], shape))
+                if not change.failed:
+                    rows.append(np.concatenate(parts))
+            if len(rows) == len(variant.strengths):
+                result[number] = np.stack(rows)
+        return result
+
     return _join(
         blocks,
         views,
@@ -609,13 +708,15 @@ def build_problem(
         base=base,
         gain_shares=shares,
         dark_weights=weights_of_exposure,
+        conditions=conditions,
+        respond=respond,
     )
 
 
 def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:
     """What effects add to each view's corrected mean frame (row, column), DN, calibration having taken in its part."""
     shape = problem.base.maps.shape
-    cache = ModelCache()
+    cache = ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
     moved: dict[str, NDArray[np.float64]] = {}
     for view in problem.views:
         changed = expected_series(
@@ -641,16 +742,18 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     return result
 
 
-def _touches(change: _Change, kind: str) -> bool:
-    """Whether a change can show in a series of this kind."""
+def _touches(change: _Change, request: SeriesRequest) -> bool:
+    """Whether a change can show in a series."""
     if not change.effects:
-        return True
+        return change.spectral is False or request.beam_on
     for effect in change.effects:
+        if effect.since == "calibration" and not request.after_calibration:
+            continue
         stage = EFFECTS[effect.id].stage
         if effect.id in ("misregistration", "object_scatter", "composition_error") or stage == "object_blur":
-            touched = kind == "object" and not _only_displaces(change)
-        elif stage in ("beam", "arrivals", "quanta", "optics"):
-            touched = kind in ("flat", "object")
+            touched = request.kind == "object" and not _only_displaces(change)
+        elif stage in ("beam", "arrivals", "quanta", "optics", "exposure"):
+            touched = request.beam_on
         else:
             touched = True
         if touched:
@@ -858,46 +961,63 @@ def _block(
     base_scalars: dict[str, float],
     maps: Sequence[Map | None],
     scalars: Sequence[dict[str, float] | None],
-    thicker: dict[str, Map],
+    thicker: dict[str, tuple[Map, dict[str, float]]],
     shape: tuple[int, int],
 ) -> dict[str, Any]:
     names = projection.names() + [
         ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit) for probe in scalar_probes
     ]
     scalar_residual = np.array([(probe.value - base_scalars[probe.name]) / probe.sd for probe in scalar_probes])
-    residual = np.concatenate([projection.apply(residual_map), scalar_residual])
-    responses = np.zeros((len(maps), len(residual)))
-    for index, (image, values) in enumerate(zip(maps, scalars, strict=True)):
-        if image is None or values is None:
-            continue
-        responses[index, : len(projection)] = projection.apply(np.broadcast_to(image, shape))
-        responses[index, len(projection) :] = [
-            (values.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd
-            for probe in scalar_probes
+    # unit noise again once the floor of what edges show is added
+    floored = 1.0 / math.hypot(1.0, scales.SHARPNESS_FLOOR)
+    shrink = np.array(
+        [
+            floored
+            if item.series.kind == "object" and name.axis == "sharpness" and name.statistic == "mean frame"
+            else 1.0
+            for name in names
         ]
-    local = _local_nuisances(item, projection, signal, scalar_probes, thicker)
-    if item.series.kind == "object":
-        # unit noise again once the floor is added
-        shrink = np.array(
-            [
-                1.0 / math.hypot(1.0, scales.SHARPNESS_FLOOR)
-                if name.axis == "sharpness" and name.statistic == "mean frame"
-                else 1.0
-                for name in names
-            ]
-        )
-        residual = residual * shrink
-        responses = responses * shrink
-        local = {key: column * shrink for key, column in local.items()}
-    return {
+    )
+    residual = np.concatenate([projection.apply(residual_map), scalar_residual])
+    local = _local_nuisances(item, projection, signal, scalar_probes, thicker, base_scalars)
+    block = {
         "item": item,
         "names": names,
-        "residual": residual,
-        "responses": responses,
-        "local": local,
+        "projection": projection,
+        "scalar_probes": tuple(scalar_probes),
+        "shrink": shrink,
+        "residual": residual * shrink,
+        "local": {key: column * shrink for key, column in local.items()},
         "sd": np.concatenate([np.ones(len(projection)), [probe.sd for probe in scalar_probes]]),
         "maps": len(projection),
     }
+    responses = np.zeros((len(maps), len(residual)))
+    for index, (image, values) in enumerate(zip(maps, scalars, strict=True)):
+        if image is not None and values is not None:
+            responses[index] = _standardised(block, base_scalars, image, values, shape)
+    block["responses"] = responses
+    return block
+
+
+def _standardised(
+    block: dict[str, Any],
+    base_scalars: Mapping[str, float],
+    image: Map,
+    values: Mapping[str, float],
+    shape: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Response (probe,) of one series' probes to a change of its mean frame and scalars."""
+    projection: MapProjection = block["projection"]
+    moved = (
+        projection.apply(np.broadcast_to(image, shape))
+        if image.shape == shape or float(image.flat[0]) != 0.0
+        else np.zeros(len(projection))
+    )
+    scalar = [
+        (values.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd
+        for probe in block["scalar_probes"]
+    ]
+    return np.asarray(np.concatenate([moved, scalar]) * block["shrink"])
 
 
 def _local_nuisances(
@@ -905,7 +1025,8 @@ def _local_nuisances(
     projection: MapProjection,
     signal: NDArray[np.float64],
     scalar_probes: Sequence[Scalar],
-    thicker: dict[str, Map],
+    thicker: dict[str, tuple[Map, dict[str, float]]],
+    base_scalars: Mapping[str, float],
 ) -> dict[str, NDArray[np.float64]]:
     """Factors of one series, by name; equal names in several series are one nuisance."""
     series = item.series
@@ -951,8 +1072,17 @@ def _local_nuisances(
             result[f"edges, {label}, of {series.name}"] = scales.EDGE_OF_SERIES * column_of
         for number, field in enumerate(_rough_edges(dy, dx, place)):
             result[f"rough edge {number} of {place}"] = of_map(field)
-        for material, moved in thicker.items():
-            response = of_map(moved)
+        for material, (moved, values) in thicker.items():
+            # less light is less noise, too
+            quieter = [
+                values.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name] for probe in scalar_probes
+            ]
+            response = np.concatenate(
+                [
+                    projection.apply(moved),
+                    [change / probe.sd for change, probe in zip(quieter, scalar_probes, strict=True)],
+                ]
+            )
             result[f"thickness of {material} in {scene}"] = response
             result[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
             result[f"attenuation of {material} at {series.kV:g} kV"] = response * (
@@ -1007,6 +1137,8 @@ def _join(
     base: Twin,
     gain_shares: dict[str, float],
     dark_weights: dict[float, dict[str, float]],
+    conditions: dict[str, float],
+    respond: Callable[[Sequence[Variant]], dict[int, NDArray[np.float64]]],
 ) -> Problem:
     residual = np.concatenate([block["residual"] for block in blocks])
     sizes = [len(block["residual"]) for block in blocks]
@@ -1094,6 +1226,8 @@ def _join(
         dark_weights=dark_weights,
         skipped=tuple(skipped),
         missing_effects=missing,
+        conditions=conditions,
+        respond=respond,
     )
 
 
@@ -1122,10 +1256,8 @@ def _spread(
     return np.stack(columns, axis=1) if columns else None
 
 
-def _thicker(request: SeriesRequest, material: str, factor: float) -> SeriesRequest:
-    """The request with one material of its scene thicker by a factor."""
-    thickness = {
-        name: (image * np.float32(factor) if name == material else image)
-        for name, image in (request.thickness_mm or {}).items()
-    }
-    return replace(request, thickness_mm=thickness)
+def _thicker(
+    thickness_mm: Mapping[str, NDArray[np.floating]], material: str, factor: float
+) -> dict[str, NDArray[np.floating]]:
+    """The scene with one material thicker by a factor."""
+    return {name: (image * np.float32(factor) if name == material else image) for name, image in thickness_mm.items()}

@@ -17,6 +17,26 @@ from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.twin import Estimate, Twin
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
+# where the mean is linear in the strength one is enough, where it nearly is two
+_ONE_SHARE = (0.8,)
+_TWO_SHARES = (0.6, 1.0)
+_SHARES_OF = {
+    **dict.fromkeys(
+        (
+            "object_scatter",
+            "veiling_glare",
+            "mtf_tail",
+            "k_fluorescence",
+            "image_lag",
+            "dark_drift",
+            "nonlinearity",
+        ),
+        _ONE_SHARE,
+    ),
+    "focal_spot": (0.2, 0.4, 0.6, 0.8, 1.0),
+    "motion_blur": (0.0, 0.25, 0.5, 0.75, 1.0),
+    **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "heel"), _TWO_SHARES),
+}
 _MOST_VARIANTS = 4
 _BOTH_ONSETS = frozenset(
     (
@@ -100,6 +120,8 @@ def variants_of(effect: Effect) -> list[Variant]:
             values = [item.low * (middle / item.low) ** 0.5, item.high * (middle / item.high) ** 0.5]
         elif item.signed:
             values = [-item.high, item.high] if len(inner) == 1 else [-item.default, item.default]
+        elif item.low == 0.0 and item.high == 1.0:
+            values = [0.0, 1.0]  # a share: none or all
         else:
             span = item.high - item.low
             count = 4 if item.name.endswith("_deg") else 2
@@ -115,7 +137,8 @@ def variants_of(effect: Effect) -> list[Variant]:
         choices += [{"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
-    nodes = tuple(low * (high / low) ** share for share in STRENGTH_SHARES)
+    shares = _SHARES_OF.get(effect.id, STRENGTH_SHARES)
+    nodes = tuple(low * (high / low) ** share for share in shares)
     usual = "calibration" if effect.after_calibration else "always"
     onsets = ("always", "calibration") if effect.id in _BOTH_ONSETS else (usual,)
     result = []

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..calibration.calibrate import calibrate_twin
 from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.series import with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
+from .refine import refine
 from .session import calibrating_names
-from .whitening import whiten
+from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
@@ -143,18 +145,40 @@ def judge(
     tell = progress or (lambda stage: None)
     tell("hypotheses")
     nuisances = Nuisances(problem.factors)
-    white = whiten(problem.residual, problem.factors, problem.curves, problem.blocks)
-    hypotheses = weigh_hypotheses(
-        white.residual,
-        curves=white.curves,
-        nuisances=Nuisances(white.factors),
+    whitening = Whitening(problem.factors, problem.blocks)
+    residual = whitening.apply(problem.residual[None, :])[0]
+    shared = Nuisances(whitening.factors)
+
+    def weigh(curves: Sequence[Curve]) -> tuple[Hypothesis, ...]:
+        return weigh_hypotheses(
+            residual,
+            curves=curves,
+            nuisances=shared,
+            groups=problem.groups,
+            group_names=problem.group_names,
+            unknown_groups=problem.parts,
+            unknown_names=problem.part_names,
+            priors=priors or Priors(),
+            power=POWER,
+        )
+
+    whitened = whitening.curves(problem.curves)
+    hypotheses = weigh(whitened)
+    tell("refinement")
+    closer = refine(
+        hypotheses,
+        variants={(item.effect, item.name): item for item in problem.variants},
+        residual=residual,
+        nuisances=shared,
         groups=problem.groups,
-        group_names=problem.group_names,
-        unknown_groups=problem.parts,
-        unknown_names=problem.part_names,
-        priors=priors or Priors(),
-        power=POWER,
+        respond=problem.respond,
+        whitener=whitening,
     )
+    if closer:
+        problem = problem.with_variants(closer)
+        whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
+        hypotheses = weigh(whitened)
+    problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     hypotheses = tuple(
         replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
@@ -261,7 +285,7 @@ def judge(
 
 def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
-    return variant.applied(strength)
+    return with_conditions(variant.applied(strength), problem.conditions)
 
 
 def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:

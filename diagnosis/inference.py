@@ -22,11 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LAW_ERROR = 0.10
+# relative errors of an effect's law and how probable each is: real effects follow the catalogue's laws more or less well
+LAW_ERRORS: tuple[tuple[float, float], ...] = ((0.10, 0.7), (0.30, 0.3))
 LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
-_UNKNOWN_TAU = np.geomspace(1.0, 300.0, 14)
+_UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
+_LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
+_LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
+UNKNOWN_SHARE = 0.1  # of the groups of probes in which an effect outside the catalogue shows
+_SWEEPS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,8 +42,8 @@ class Curve:
     strength); low, high: plausible range of the strength; strengths (node,) > 0 ascending; responses (node, probe): m_e at
     the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
     that come with the effect (a drifting output shifts each series' level by chance).
-    Between nodes and zero the response is interpolated
-    (piecewise quadratic through 0 and the two nearest nodes).
+    Between nodes and zero the response is interpolated (Lagrange through
+    the four nearest points, 0 one of them).
     """
 
     effect: str
@@ -52,19 +57,24 @@ class Curve:
     spread: NDArray[np.float64] | None = None
 
     def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Weights (strength, node) with which the nodes' responses add up at given strengths; Lagrange through 0."""
+        """Weights (strength, node) with which the nodes' responses add up at given strengths."""
         nodes = self.strengths
         s = np.atleast_1d(np.asarray(strength, dtype=np.float64))
+        points = np.concatenate([[0.0], nodes])
         result = np.zeros((len(s), len(nodes)))
-        if len(nodes) == 1:
-            result[:, 0] = s / nodes[0]
-            return result
-        right = np.clip(np.searchsorted(nodes, s), 1, len(nodes) - 1)
-        a, b = nodes[right - 1], nodes[right]
-        # quadratic through (0, 0), (a, .), (b, .)
+        used = min(len(points), 4)
+        # the interval's two points and their neighbours; the point 0 adds nothing
+        first = np.clip(np.searchsorted(points, s) - used // 2, 0, len(points) - used)
         row = np.arange(len(s))
-        result[row, right - 1] = s * (s - b) / (a * (a - b))
-        result[row, right] = s * (s - a) / (b * (b - a))
+        for i in range(used):
+            at = first + i
+            weight = np.ones(len(s))
+            for j in range(used):
+                if j != i:
+                    other = points[first + j]
+                    weight *= (s - other) / (points[at] - other)
+            inner = at > 0
+            result[row[inner], at[inner] - 1] = weight[inner]
         return result
 
     def response(self, strength: float) -> NDArray[np.float64]:
@@ -131,6 +141,12 @@ class Nuisances:
 
         return np.asarray(vector - self.factors @ cho_solve((self._cholesky, True), self.factors.T @ vector))
 
+    def solve_all(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """C^-1 of each of the vectors (vector, probe): what the nuisances leave of them."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(vectors - cho_solve((self._cholesky, True), self.factors.T @ vectors.T).T @ self.factors.T)
+
     def fitted(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Most probable nuisances (factor,), in prior standard deviations, for a residual (probe,)."""
         from scipy.linalg import cho_solve
@@ -163,13 +179,15 @@ def _log_mean_exp(values: NDArray[np.float64], axis: int | tuple[int, ...] | Non
 
 
 def _group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> NDArray[np.float64]:
-    """A column a group: the response there times `sd`; groups without response are left out."""
-    columns = []
-    for group in range(int(groups.max()) + 1):
-        column = np.where(groups == group, response, 0.0)
-        if np.sum(column**2) > 1e-4:
-            columns.append(sd * column)
-    return np.stack(columns, axis=1) if columns else np.zeros((len(response), 0))
+    """A column a group: the response there times `sd`; groups in which it would move nothing are left out."""
+    power = np.bincount(groups, weights=response**2)
+    kept = np.nonzero(sd**2 * power > _LEAST_FACTOR)[0]
+    place = np.full(len(power), -1)
+    place[kept] = np.arange(len(kept))
+    rows = np.nonzero(place[groups] >= 0)[0]
+    columns = np.zeros((len(response), len(kept)))
+    columns[rows, place[groups[rows]]] = sd * response[rows]
+    return columns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,16 +245,20 @@ def fit_curve(
     nuisances: Nuisances,
     groups: NDArray[np.intp],
     *,
-    law_error: float = LAW_ERROR,
+    law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
 ) -> CurveFit:
     """Evidence of one curve over none, its strength integrated over the log-uniform plausible range.
 
-    The law's inaccuracy is a random factor a group; its factors are rebuilt at the best strength (two rounds).
+    The law's inaccuracy is a random factor a group and a part of each probe's own, both in proportion to what the
+    nuisances leave of the response at the best strength (found in rounds).
     """
     nodes = curve.responses
+    solved = nuisances.solve_all(nodes)
 
-    def terms(model: Nuisances) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return model.inner(nodes, residual[None, :])[:, 0], model.inner(nodes, nodes)
+    def terms(
+        model: Nuisances, rows: NDArray[np.float64], vector: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return model.inner(rows, vector[None, :])[:, 0], model.inner(rows, rows)
 
     def likelihood(
         strengths: NDArray[np.float64], model: tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -245,7 +267,7 @@ def fit_curve(
         quadratic = np.einsum("si,ij,sj->s", weights, model[1], weights)
         return weights @ model[0] - 0.5 * quadratic, quadratic
 
-    sharp = terms(nuisances)
+    sharp = terms(nuisances, nodes, residual)
     coarse = np.unique(np.concatenate([log_strength_nodes(curve.low, curve.high), [curve.low, curve.high]]))
     strengths = coarse
     value, quadratic = likelihood(strengths, sharp)
@@ -255,33 +277,35 @@ def fit_curve(
         strengths = _refined(coarse, float(strengths[at]), width)
         value, quadratic = likelihood(strengths, sharp)
         at = int(np.argmax(value))
-    sharp_value, sharp_strengths = value, strengths
-    separation = math.sqrt(max(float(quadratic[at]), 0.0))
-    for _ in range(3):
-        best = float(strengths[at])
-        response = curve.weights(np.array([best]))[0] @ nodes
-        extra = _law_factors(curve, best, response, groups, law_error)
-        if extra.shape[1] == 0:
-            break
-        # evidence over none: the residual's own terms change with the covariance
-        moved, moved_nodes, wide, shift = _with_law(
-            residual, nodes, nuisances, extra, [response], LAW_PROBE_SHARE * law_error
-        )
-        wide_terms = (wide.inner(moved_nodes, moved[None, :])[:, 0], wide.inner(moved_nodes, moved_nodes))
-        value, quadratic = likelihood(coarse, wide_terms)
-        # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
-        width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
-        strengths = _refined(coarse, float(coarse[int(np.argmax(value))]), max(width, 0.3 * law_error))
-        value, quadratic = likelihood(strengths, wide_terms)
-        value = value + shift
-        weak = strengths < 0.3 * best
-        value = np.where(weak, likelihood(strengths, sharp)[0], value)
-        at = int(np.argmax(value))
-        separation = math.sqrt(max(float(quadratic[at]), 0.0))
-        if abs(math.log(float(strengths[at]) / best)) < 0.05:
-            break
-    if float(sharp_value.max()) > float(value.max()):
-        strengths, value = sharp_strengths, sharp_value
+    choices = [(0.0, strengths, value, math.sqrt(max(float(quadratic[at]), 0.0)))]
+    start = float(strengths[at])
+    for law_error, share in law_errors:
+        best = start
+        for _ in range(3):
+            effective = curve.weights(np.array([best]))[0] @ solved
+            extra = _law_factors(curve, best, effective, groups, law_error)
+            if extra.shape[1] == 0:
+                break
+            # evidence over none: the residual's own terms change with the covariance
+            moved, moved_nodes, wide, shift = _with_law(
+                residual, nodes, nuisances, extra, [effective], LAW_PROBE_SHARE * law_error
+            )
+            wide_terms = terms(wide, moved_nodes, moved)
+            value, quadratic = likelihood(coarse, wide_terms)
+            width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
+            strengths = _refined(coarse, float(coarse[int(np.argmax(value))]), max(width, 0.3 * law_error))
+            value, quadratic = likelihood(strengths, wide_terms)
+            value = value + shift
+            # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
+            weak = strengths < 0.3 * best
+            value = np.where(weak, likelihood(strengths, sharp)[0], value)
+            at = int(np.argmax(value))
+            choices.append((math.log(share), strengths, value, math.sqrt(max(float(quadratic[at]), 0.0))))
+            moved_on = abs(math.log(float(strengths[at]) / best))
+            best = float(strengths[at])
+            if moved_on < 0.05:
+                break
+    _, strengths, value, separation = max(choices, key=lambda item: item[0] + float(item[2].max()))
     return CurveFit(
         curve=curve,
         log_evidence=_log_integral(strengths, value, curve.low, curve.high),
@@ -333,38 +357,62 @@ def _with_law(
     return moved, moved_nodes, wide, -0.5 * (determinant + quadratic)
 
 
-def _unknown_fits(
+def unknown_evidence(
     residual: NDArray[np.float64], nuisances: Nuisances, groups: NDArray[np.intp], names: Sequence[str]
-) -> list[tuple[str, float]]:
-    """Log evidence over none of an extra variance in each group, tau integrated."""
-    base = nuisances.solve(residual)
-    results = []
-    for group, name in enumerate(names):
-        member = groups == group
-        count = int(member.sum())
-        if count == 0:
-            continue
-        # the block of C^-1 that belongs to the members; by its eigenvectors one tau costs nothing
-        own = nuisances.factors[member]
-        block = np.eye(count) - own @ _solve_inner(nuisances, own.T)
-        values, vectors = np.linalg.eigh(0.5 * (block + block.T))
-        values = np.clip(values, 0.0, None)
-        projected = vectors.T @ base[member]
-        logs = []
-        for tau in _UNKNOWN_TAU:
-            scale = tau**2 / max(count, 1) * 4.0 if count > 4 else tau**2
-            denominator = 1.0 + scale * values
-            logs.append(
-                -0.5 * float(np.sum(np.log(denominator))) + 0.5 * float(np.sum(scale * projected**2 / denominator))
-            )
-        results.append((name, float(_log_mean_exp(np.array(logs)))))
-    return results
+) -> tuple[float, str]:
+    """Log evidence over none of an effect that no catalogue holds, and the group of probes where it is seen most.
 
+    Every group may have an extra variance tau^2, log-uniform over a grid, with probability UNKNOWN_SHARE; the evidence is
+    that of the best combination (each group's tau in turn, several sweeps), its prior in it, of one group at least.
+    """
+    from scipy.linalg import cho_factor, cho_solve
 
-def _solve_inner(nuisances: Nuisances, right: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.linalg import cho_solve
+    count = len(names)
+    sizes = np.bincount(groups, minlength=count)
+    factors = nuisances.factors
+    grams = np.stack([factors[groups == g].T @ factors[groups == g] for g in range(count)])
+    sums = np.stack([factors[groups == g].T @ residual[groups == g] for g in range(count)])
+    squares = np.array([float(np.sum(residual[groups == g] ** 2)) for g in range(count)])
+    grid = np.concatenate([[0.0], _UNKNOWN_TAU])
+    cost = math.log(UNKNOWN_SHARE / len(_UNKNOWN_TAU))
+    tau2 = np.zeros(count)
 
-    return np.asarray(cho_solve((nuisances._cholesky, True), right))
+    def value(weights: NDArray[np.float64], inner: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
+        factor = cho_factor(inner, lower=True, check_finite=False)
+        determinant = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) - float(sizes @ np.log(weights))
+        return -0.5 * (determinant + float(weights @ squares) - float(vector @ cho_solve(factor, vector)))
+
+    one = np.eye(factors.shape[1])
+    base = value(np.ones(count), one + grams.sum(axis=0), sums.sum(axis=0))
+    alone: list[tuple[float, int]] = []
+    best = base
+    for sweep in range(_SWEEPS):
+        changed = False
+        for g in range(count):
+            if sizes[g] == 0:
+                continue
+            weights = 1.0 / (1.0 + tau2)
+            weights[g] = 0.0
+            inner = one + np.tensordot(weights, grams, axes=1)
+            vector = weights @ sums
+            found = []
+            for tau in grid:
+                own = 1.0 / (1.0 + tau**2)
+                weights[g] = own
+                found.append(value(weights, inner + own * grams[g], vector + own * sums[g]) + (cost if tau else 0.0))
+            if sweep == 0 and not np.any(np.delete(tau2, g)):
+                alone.append((max(found[1:]), g))
+            at = int(np.argmax(found))
+            changed |= bool(grid[at] ** 2 != tau2[g])
+            tau2[g] = grid[at] ** 2
+            best = found[at] + cost * float(np.count_nonzero(np.delete(tau2, g)))
+        if not changed:
+            break
+    if not np.any(tau2):
+        best, place = max(alone)
+    else:
+        place = int(np.argmax(tau2 * sizes))
+    return best - base, str(names[place])
 
 
 def weigh_hypotheses(
@@ -379,7 +427,7 @@ def weigh_hypotheses(
     priors: Priors | None = None,
     power: float = 1.0,
     pairs_from: int = 6,
-    law_error: float = LAW_ERROR,
+    law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -392,10 +440,10 @@ def weigh_hypotheses(
         priors: of the kinds of hypothesis.
         power: calibration of confidence: evidences are raised to it.
         pairs_from: pairs are formed of the best so many effects with every other.
-        law_error: relative standard deviation of an effect's law in each group.
+        law_errors: relative errors of an effect's law in each group, and how probable each is.
     """
     priors = priors or Priors()
-    fits = [fit_curve(residual, curve, nuisances, groups, law_error=law_error) for curve in curves]
+    fits = [fit_curve(residual, curve, nuisances, groups, law_errors=law_errors) for curve in curves]
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
         by_effect.setdefault(fit.curve.effect, []).append(fit)
@@ -423,134 +471,225 @@ def weigh_hypotheses(
     ranked = sorted(singles, key=lambda effect: -evidence_of[effect])
     n_pairs = max(n_effects * (n_effects - 1) // 2, 1)
     done: set[tuple[str, str]] = set()
+    table = _NodeTable(curves)
     for first in ranked[:pairs_from]:
         # the second is looked for in what the first leaves, over all its variants
         leading = singles[first]
+        states = _states_of(leading, residual, nuisances, groups, law_errors, table)
         for second, second_fits in by_effect.items():
             key = (min(first, second), max(first, second))
             if second == first or key in done:
                 continue
             done.add(key)
-            best_pair: tuple[float, Any] | None = None
-            variants = []
-            for candidate in second_fits:
-                pair = _fit_pair(residual, leading, candidate, nuisances, groups, law_error)
-                variants.append(pair[0])
-                if best_pair is None or pair[0] > best_pair[0]:
-                    best_pair = pair
+            evidence, strengths, chosen = _fit_pair(
+                residual, leading, second_fits, nuisances, groups, law_errors, states=states, table=table
+            )
             # the first's own variants were averaged above; its best stands for them
-            evidence = float(_log_mean_exp(np.array(variants))) + (evidence_of[first] - leading.log_evidence)
-            if best_pair is None:
-                continue
-            strengths, chosen = best_pair[1]
+            evidence += evidence_of[first] - leading.log_evidence
             raw.append((key, evidence, math.log(priors.pair / n_pairs), strengths, chosen, ""))
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names
-    unknown = _unknown_fits(residual, nuisances, parts, names)
-    for name, evidence in unknown:
-        raw.append(((UNKNOWN,), evidence, math.log(priors.unknown / max(len(unknown), 1)), {}, {}, name))
+    unknown, place = unknown_evidence(residual, nuisances, parts, names)
+    raw.append(((UNKNOWN,), unknown, math.log(priors.unknown), {}, {}, place))
     scores = np.array([power * evidence + prior for _, evidence, prior, *_ in raw])
     probability = np.exp(scores - scores.max())
     probability /= probability.sum()
-    merged: list[Hypothesis] = []
-    unknown_total = 0.0
-    unknown_best: tuple[float, str, float] | None = None
-    for (effects, evidence, _, strengths, chosen, location), p in zip(raw, probability, strict=True):
-        if effects == (UNKNOWN,):
-            unknown_total += float(p)
-            if unknown_best is None or p > unknown_best[0]:
-                unknown_best = (float(p), location, evidence)
-            continue
-        merged.append(
-            Hypothesis(
-                effects=effects, probability=float(p), log_evidence=evidence, strengths=strengths, variants=chosen
-            )
+    return tuple(
+        sorted(
+            (
+                Hypothesis(
+                    effects=effects,
+                    probability=float(p),
+                    log_evidence=evidence,
+                    strengths=strengths,
+                    variants=chosen,
+                    location=location,
+                )
+                for (effects, evidence, _, strengths, chosen, location), p in zip(raw, probability, strict=True)
+            ),
+            key=lambda item: (-item.probability, -item.log_evidence),
         )
-    if unknown_best is not None:
-        merged.append(
-            Hypothesis(
-                effects=(UNKNOWN,),
-                probability=unknown_total,
-                log_evidence=unknown_best[2],
-                location=unknown_best[1],
+    )
+
+
+class _NodeTable:
+    """The responses of all curves one under another (node, probe), and where each curve's are."""
+
+    def __init__(self, curves: Sequence[Curve]) -> None:
+        self.nodes = np.concatenate([curve.responses for curve in curves])
+        self._place = {}
+        position = 0
+        for curve in curves:
+            self._place[id(curve)] = slice(position, position + len(curve.responses))
+            position += len(curve.responses)
+
+    def rows(self, *curves: Curve) -> NDArray[np.intp]:
+        """Rows of some curves."""
+        every = np.arange(len(self.nodes))
+        return np.concatenate([every[self._place[id(curve)]] for curve in curves])
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """What is left to explain when one effect's law may be off by so much: all nodes' terms, and the log prior of it."""
+
+    linear: NDArray[np.float64]
+    gram: NDArray[np.float64]
+    shift: float
+
+
+def _states_of(
+    leading: CurveFit,
+    residual: NDArray[np.float64],
+    nuisances: Nuisances,
+    groups: NDArray[np.intp],
+    law_errors: Sequence[tuple[float, float]],
+    table: _NodeTable,
+) -> list[_State]:
+    def state(model: Nuisances, nodes: NDArray[np.float64], vector: NDArray[np.float64], shift: float) -> _State:
+        # a^T C^-1 b of all with all, by one projection
+        projected, own = model.project(nodes), model.project(vector[None, :])[0]
+        return _State(nodes @ vector - projected @ own, nodes @ nodes.T - projected @ projected.T, shift)
+
+    result = [state(nuisances, table.nodes, residual, 0.0)]
+    curve = leading.curve
+    effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
+    for law_error, probability in law_errors:
+        extra = _law_factors(curve, leading.best, effective, groups, law_error)
+        if extra.shape[1]:
+            moved, nodes, wide, shift = _with_law(
+                residual, table.nodes, nuisances, extra, [effective], LAW_PROBE_SHARE * law_error
             )
-        )
-    return tuple(sorted(merged, key=lambda item: (-item.probability, -item.log_evidence)))
+            result.append(state(wide, nodes, moved, shift + math.log(probability)))
+    return result
 
 
 def _fit_pair(
     residual: NDArray[np.float64],
     first: CurveFit,
-    second: CurveFit,
+    seconds: Sequence[CurveFit],
     nuisances: Nuisances,
     groups: NDArray[np.intp],
-    law_error: float,
-) -> tuple[float, tuple[dict[str, tuple[float, float, float]], dict[str, Curve]]]:
-    """Log evidence of two effects over none and their strengths, on grids of both that close in on the best."""
-    a, b = first.curve, second.curve
-    nodes = np.concatenate([a.responses, b.responses])
-    n_first = len(a.responses)
+    law_errors: Sequence[tuple[float, float]],
+    *,
+    states: Sequence[_State],
+    table: _NodeTable,
+) -> tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]:
+    """Log evidence over none of an effect's best variant with another effect, strengths, and the variants.
 
-    def terms(model: Nuisances) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return model.inner(nodes, residual[None, :])[:, 0], model.inner(nodes, nodes)
+    The other's variants are weighed with the first's law only inexact; where the best of them moves the probes by so much
+    that its own law matters, both may be off.
+    """
+    a = first.curve
+    tried: list[tuple[float, _PairGrid, CurveFit]] = []
+    for second in seconds:
+        rows = table.rows(a, second.curve)
+        grids = [
+            _pair_integral(a, second.curve, (state.linear[rows], state.gram[np.ix_(rows, rows)]), state.shift)
+            for state in states
+        ]
+        grid = max(grids, key=lambda item: item.log_integral)
+        tried.append((grid.log_integral, grid, second))
+    mean = float(_log_mean_exp(np.array([item[0] for item in tried])))
+    value, grid, second = max(tried, key=lambda item: item[0])
+    share = mean - value
+    b = second.curve
+    rows = table.rows(a, b)
+    nodes = table.nodes[rows]
+    best: tuple[float, _PairGrid] = (value, grid)
+    weights_b = b.weights(np.array([grid.best[1]]))[0]
+    gram_b = states[0].gram[np.ix_(rows[len(a.responses) :], rows[len(a.responses) :])]
+    moves = math.sqrt(max(float(weights_b @ gram_b @ weights_b), 0.0))
+    if moves * law_errors[0][0] > _LAW_MATTERS if law_errors else False:
+        solved = nuisances.solve_all(nodes)
+        for law_error, probability in law_errors:
+            start = grid.best
+            for _ in range(2):
+                effective_a = a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)]
+                effective_b = b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :]
+                extra = np.concatenate(
+                    [
+                        _law_factors(a, start[0], effective_a, groups, law_error),
+                        _law_factors(b, start[1], effective_b, groups, law_error),
+                    ],
+                    axis=1,
+                )
+                if not extra.shape[1]:
+                    break
+                moved, moved_nodes, wide, shift = _with_law(
+                    residual, nodes, nuisances, extra, [effective_a, effective_b], LAW_PROBE_SHARE * law_error
+                )
+                again = _pair_integral(a, b, _pair_terms(wide, moved_nodes, moved), shift + math.log(probability))
+                if again.log_integral > best[0]:
+                    best = (again.log_integral, again)
+                moved_on = max(abs(math.log(x / y)) for x, y in zip(again.best, start, strict=True))
+                start = again.best
+                if moved_on < 0.1:
+                    break
+    chosen = best[1]
+    density = np.exp(chosen.log_likelihood - chosen.log_likelihood.max())
+    marginal_a = np.log(np.maximum(np.trapezoid(density, np.log(chosen.second), axis=1), 1e-300))
+    marginal_b = np.log(np.maximum(np.trapezoid(density, np.log(chosen.first), axis=0), 1e-300))
+    strengths = {
+        a.effect: _interval(chosen.first, marginal_a),
+        b.effect: _interval(chosen.second, marginal_b),
+    }
+    return best[0] + share, strengths, {a.effect: a, b.effect: b}
 
-    def grid_of(
-        sa: NDArray[np.float64], sb: NDArray[np.float64], model: tuple[NDArray[np.float64], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PairGrid:
+    """Log likelihood over none (first, second) at strengths of two effects, and log of its mean under the prior."""
+
+    log_integral: float
+    first: NDArray[np.float64]
+    second: NDArray[np.float64]
+    log_likelihood: NDArray[np.float64]
+
+    @property
+    def best(self) -> tuple[float, float]:
+        i, j = np.unravel_index(int(np.argmax(self.log_likelihood)), self.log_likelihood.shape)
+        return float(self.first[i]), float(self.second[j])
+
+
+def _pair_terms(
+    model: Nuisances, nodes: NDArray[np.float64], residual: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return model.inner(nodes, residual[None, :])[:, 0], model.inner(nodes, nodes)
+
+
+def _pair_integral(
+    a: Curve, b: Curve, terms: tuple[NDArray[np.float64], NDArray[np.float64]], shift: float
+) -> _PairGrid:
+    """Mean likelihood of two effects on a grid of both strengths that closes in on the best."""
+    linear, gram = terms
+    count = len(a.responses)
+
+    def grid_of(sa: NDArray[np.float64], sb: NDArray[np.float64]) -> NDArray[np.float64]:
         wa, wb = a.weights(sa), b.weights(sb)
-        linear, gram = model
-        la, lb = wa @ linear[:n_first], wb @ linear[n_first:]
-        qa = np.einsum("si,ij,sj->s", wa, gram[:n_first, :n_first], wa)
-        qb = np.einsum("si,ij,sj->s", wb, gram[n_first:, n_first:], wb)
-        cross = wa @ gram[:n_first, n_first:] @ wb.T
+        la, lb = wa @ linear[:count], wb @ linear[count:]
+        qa = np.einsum("si,ij,sj->s", wa, gram[:count, :count], wa)
+        qb = np.einsum("si,ij,sj->s", wb, gram[count:, count:], wb)
+        cross = wa @ gram[:count, count:] @ wb.T
         return np.asarray(la[:, None] + lb[None, :] - 0.5 * (qa[:, None] + qb[None, :]) - cross)
 
-    def integral(
-        model: tuple[NDArray[np.float64], NDArray[np.float64]], shift: float
-    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        xa = np.linspace(math.log(a.low), math.log(a.high), _PAIR_NODES)
-        xb = np.linspace(math.log(b.low), math.log(b.high), _PAIR_NODES)
-        range_a, range_b = xa[-1] - xa[0], xb[-1] - xb[0]
-        best: tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None = None
-        for _ in range(7):
-            grid = grid_of(np.exp(xa), np.exp(xb), model) + shift
-            top = float(grid.max())
-            inner = np.trapezoid(np.exp(grid - top), xb, axis=1)
-            value = top + math.log(max(float(np.trapezoid(inner, xa)), 1e-300) / (range_a * range_b))
-            best = (value, np.exp(xa), np.exp(xb), grid)
-            near = grid > top - 8.0
-            rows, columns = np.nonzero(near.any(axis=1))[0], np.nonzero(near.any(axis=0))[0]
-            if len(rows) >= 6 and len(columns) >= 6:
-                break
-            # zoom to where the likelihood lies, one node to each side
-            xa = np.linspace(xa[max(rows[0] - 1, 0)], xa[min(rows[-1] + 1, len(xa) - 1)], _PAIR_NODES)
-            xb = np.linspace(xb[max(columns[0] - 1, 0)], xb[min(columns[-1] + 1, len(xb) - 1)], _PAIR_NODES)
-        if best is None:
-            raise RuntimeError("no grid was tried")
-        return best
-
-    value, sa, sb, grid = integral(terms(nuisances), 0.0)
-    i, j = np.unravel_index(int(np.argmax(grid)), grid.shape)
-    response_a = a.weights(sa[i : i + 1])[0] @ a.responses
-    response_b = b.weights(sb[j : j + 1])[0] @ b.responses
-    extra = np.concatenate(
-        [
-            _law_factors(a, float(sa[i]), response_a, groups, law_error),
-            _law_factors(b, float(sb[j]), response_b, groups, law_error),
-        ],
-        axis=1,
-    )
-    if extra.shape[1]:
-        moved, moved_nodes, wide, shift = _with_law(
-            residual, nodes, nuisances, extra, [response_a, response_b], LAW_PROBE_SHARE * law_error
-        )
-        again = integral((wide.inner(moved_nodes, moved[None, :])[:, 0], wide.inner(moved_nodes, moved_nodes)), shift)
-        if again[0] > value:
-            value, sa, sb, grid = again
-    top = grid.max()
-    with np.errstate(under="ignore"):
-        density = np.exp(grid - top)
-    marginal_a = np.log(np.maximum(np.trapezoid(density, np.log(sb), axis=1), 1e-300))
-    marginal_b = np.log(np.maximum(np.trapezoid(density, np.log(sa), axis=0), 1e-300))
-    strengths = {a.effect: _interval(sa, marginal_a), b.effect: _interval(sb, marginal_b)}
-    return value, (strengths, {a.effect: a, b.effect: b})
+    xa = np.linspace(math.log(a.low), math.log(a.high), _PAIR_NODES)
+    xb = np.linspace(math.log(b.low), math.log(b.high), _PAIR_NODES)
+    range_a, range_b = xa[-1] - xa[0], xb[-1] - xb[0]
+    result: _PairGrid | None = None
+    for _ in range(7):
+        grid = grid_of(np.exp(xa), np.exp(xb)) + shift
+        top = float(grid.max())
+        inner = np.trapezoid(np.exp(grid - top), xb, axis=1)
+        value = top + math.log(max(float(np.trapezoid(inner, xa)), 1e-300) / (range_a * range_b))
+        result = _PairGrid(log_integral=value, first=np.exp(xa), second=np.exp(xb), log_likelihood=grid)
+        near = grid > top - 8.0
+        rows, columns = np.nonzero(near.any(axis=1))[0], np.nonzero(near.any(axis=0))[0]
+        if len(rows) >= 6 and len(columns) >= 6:
+            break
+        # zoom to where the likelihood lies, one node to each side
+        xa = np.linspace(xa[max(rows[0] - 1, 0)], xa[min(rows[-1] + 1, len(xa) - 1)], _PAIR_NODES)
+        xb = np.linspace(xb[max(columns[0] - 1, 0)], xb[min(columns[-1] + 1, len(xb) - 1)], _PAIR_NODES)
+    if result is None:
+        raise RuntimeError("no grid was tried")
+    return result

@@ -476,30 +476,30 @@ class MapProjection:
             grown[size, size] = math.sqrt(rest)
             lower = grown
             chosen.append(template)
-            rows.append(flat)
+            rows.append(flat.astype(np.float32))
             spread.append(covered[mask])
-        self.templates = tuple(chosen)
+        # the images are not kept: fifty a series would be most of the memory
+        self._names = tuple(
+            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit) for item in chosen
+        )
         self._lower = lower
-        self._rows = np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
+        self._rows = np.stack(rows) if rows else np.zeros((0, int(mask.sum())), np.float32)
 
     def __len__(self) -> int:
-        return len(self.templates)
+        return len(self._names)
 
     def apply(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
         """Standardised projections (probe,) of a map (row, column), DN."""
-        if not self.templates:
+        if not self._names:
             return np.zeros(0)
         from scipy.linalg import solve_triangular
 
-        q = self._rows @ np.asarray(image, dtype=np.float64)[self.mask]
+        q = (self._rows @ np.asarray(image, dtype=np.float32)[self.mask]).astype(np.float64)
         return np.asarray(solve_triangular(self._lower, q, lower=True))
 
     def names(self) -> list[ProbeName]:
         """One name a probe."""
-        return [
-            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
-            for item in self.templates
-        ]
+        return list(self._names)
 
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:

@@ -10,6 +10,7 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
 from ..generator.series import SeriesRequest
 
+_REMEMBERED = 3  # series before one's own whose trapped charge may still be there
 _GAP_S = 1.0  # between series whose times are not stated
 
 
@@ -134,7 +135,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             belt_axis=instrument.belt_axis or "row",
             panel_rotation_deg=item.panel_rotation_deg,
             after_calibration=after,
-            previous=tuple(replace(before, previous=()) for before in requests[-1:]),
+            previous=tuple(replace(before, previous=()) for before in requests[-_REMEMBERED:]),
         )
         requests.append(request)
         result.append(SessionSeries(series=item, request=request, calibrates=calibrates, after=after))

@@ -190,11 +190,11 @@ def fine_frequencies(length: int) -> FloatArray:
     return np.asarray(np.arange(FINE * length) / (2.0 * length))
 
 
-def kept_cosines(length: int, psf_sigma_px: float) -> int:
-    """Number of cosines of `length` pixels' cells along an axis that a Gaussian spread leaves above 1e-5."""
+def kept_cosines(length: int, psf_sigma_px: float, least: float = 1e-5) -> int:
+    """Number of cosines of `length` pixels' cells along an axis that a Gaussian spread leaves above `least`."""
     if psf_sigma_px <= 0:
         return FINE * length
-    highest = np.sqrt(np.log(1e5) / 2.0) / (np.pi * psf_sigma_px)
+    highest = np.sqrt(np.log(1.0 / least) / 2.0) / (np.pi * psf_sigma_px)
     return int(min(FINE * length, max(np.ceil(2.0 * length * highest), length + 1)))
 
 

@@ -17,10 +17,10 @@ from ._fine_picture import (
     transform_of_cells,
 )
 from .line_state import FinePicture, FloatArray
-from .predict import slope_share, spectral_model_of
 from .projection import project_polychromatic
 from .spectral_signal import REFERENCE_KV, OpenBeam, SpectralModel
 from .twin import Level, Twin
+from .twin_spectrum import slope_share, spectral_model_of
 
 if TYPE_CHECKING:
     from .series import SeriesRequest
@@ -75,15 +75,36 @@ class BeamProjection:
 
 @dataclass(slots=True)
 class ModelCache:
-    """Scenes and projections, kept between calls of the forward model; the oldest go first beyond `budget_bytes`."""
+    """Scenes and projections, kept between calls of the forward model; the oldest go first beyond `budget_bytes`.
+
+    draft: pictures are only compared with each other, and may be drawn with less work (see `_spread.spread_maps`).
+    """
 
     budget_bytes: int = _BUDGET_BYTES
+    draft: bool = False
     _scenes: "OrderedDict[int, _Scene]" = field(default_factory=OrderedDict)
     _maps: "OrderedDict[tuple[object, ...], tuple[FloatArray, FloatArray | None]]" = field(default_factory=OrderedDict)
     _held: int = 0
     _numbers: int = 0
     _levels: dict[tuple[object, ...], tuple[object, float, float]] = field(default_factory=dict)
     _spectra: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
+    _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
+    _lit_held: int = 0
+
+    def lit(self, key: tuple[object, ...]) -> object | None:
+        """What was kept of a series up to the spread of light, or None."""
+        found = self._lit.get(key)
+        if found is None:
+            return None
+        self._lit.move_to_end(key)
+        return found[0]
+
+    def keep_lit(self, key: tuple[object, ...], lit: object, size_bytes: int) -> None:
+        """Keep a series up to the spread of light."""
+        self._lit[key] = (lit, size_bytes)
+        self._lit_held += size_bytes
+        while self._lit_held > self.budget_bytes and len(self._lit) > 1:
+            self._lit_held -= self._lit.popitem(last=False)[1][1]
 
     def model(self, twin: Twin, request: "SeriesRequest") -> SpectralModel | None:
         """The twin's spectral model, or None where it has none."""

@@ -38,6 +38,20 @@ __all__ = [
 
 KINDS = ("dark", "flat", "object", "afterglow")
 _LAGS = 3
+_BEFORE_EXPOSURE = frozenset(("beam", "arrivals", "object_blur", "quanta", "optics"))
+_OF_THE_LIGHT = (
+    "kind",
+    "exposure_ms",
+    "source_object_mm",
+    "source_detector_mm",
+    "belt_speed_mm_s",
+    "belt_axis",
+    "panel_rotation_deg",
+    "open_signal_DN",
+    "product_material",
+    "scene_kind",
+    "displacement_px",
+)
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
 
@@ -187,6 +201,9 @@ class ExpectedSeries:
     frames: int
 
 
+_Active = list[tuple[AppliedEffect, Effect, dict[str, float]]]
+
+
 @dataclass(slots=True, kw_only=True)
 class LineMemory:
     """What the line remembers from one series to the next when frames are sampled: trapped charge and output error.
@@ -208,16 +225,10 @@ class _Choice:
     parameters: NDArray[np.float64] | None
     use_measured_level: bool
 
-    def state(self, twin: Twin, request: SeriesRequest, cache: ModelCache) -> LineState:
-        """The final state of the line for a request."""
-        return final_state(
-            twin,
-            request,
-            effects=self.effects,
-            parameters=self.parameters,
-            cache=cache,
-            use_measured_level=self.use_measured_level,
-        )
+    def line(self, twin: Twin, request: SeriesRequest, cache: ModelCache) -> tuple[LineState, "_Charge"]:
+        """The final state of the line for a request, and what one exposure of it brings."""
+        found = _lit(twin, request, self, cache)
+        return _read_out(twin, request, found), found[0].charge
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,13 +297,33 @@ def final_state(
 
     Args: as in `expected_series`.
     """
-    if effects is None:
-        effects = twin.effects
+    return _read_out(twin, request, _lit(twin, request, _Choice(effects, parameters, use_measured_level), cache))
+
+
+@dataclass(frozen=True, slots=True)
+class _Lit:
+    """A series up to the spread of light: state, projection and the charge that one exposure brings; effects still to act.
+
+    `twin` and `thickness_mm` are held so that their identity stands for them in the cache's keys.
+    """
+
+    twin: Twin
+    thickness_mm: Mapping[str, NDArray[np.floating]] | None
+    state: LineState
+    projection: BeamProjection | None
+    charge: "_Charge"
+
+
+def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCache | None) -> tuple["_Lit", "_Active"]:
+    """The line up to the spread of light, from the cache where the same was asked before, and the effects that act later."""
+    effects = twin.effects if choice.effects is None else choice.effects
     active = [item for item in in_order(effects) if item[0].since == "always" or request.after_calibration]
+    early = [item for item in active if item[1].stage in _BEFORE_EXPOSURE]
+    late = [item for item in active if item[1].stage not in _BEFORE_EXPOSURE]
     cache = ModelCache() if cache is None else cache
     values: NDArray[np.float64] | None = None
     if twin.spectral is not None:
-        given = twin.spectral.best if parameters is None else parameters
+        given = twin.spectral.best if choice.parameters is None else choice.parameters
         values = np.asarray(given, dtype=np.float64)
         if values.shape != twin.spectral.best.shape:
             raise InputError(
@@ -300,6 +331,19 @@ def final_state(
                 received=f"shape {values.shape}",
                 expected=f"{twin.spectral.best.shape}: one value for each of {', '.join(twin.spectral.names)}",
             )
+    key = (
+        id(twin),
+        id(request.thickness_mm),
+        request.setting,
+        None if values is None else values.tobytes(),
+        choice.use_measured_level,
+        # what a series is called and when it was taken does not change the light
+        tuple(getattr(request, name) for name in _OF_THE_LIGHT),
+        tuple((item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early),
+    )
+    kept = cache.lit(key)
+    if isinstance(kept, _Lit) and kept.twin is twin and kept.thickness_mm is request.thickness_mm:
+        return kept, late
     one = np.ones((1, 1))
     state = LineState(
         parameters=values,
@@ -311,7 +355,7 @@ def final_state(
     projection: BeamProjection | None = None
     if request.beam_on:
         model = cache.model(twin, request)
-        for applied, effect, numbers in active:
+        for applied, effect, numbers in early:
             if effect.stage == "beam":
                 context = replace(_context(twin, request, applied, None), model=model)
                 state = effect.change(state, numbers, context)
@@ -322,7 +366,7 @@ def final_state(
             state.parameters,
             state.attenuation_scale,
             kV_factor=state.kV_factor,
-            use_measured_level=use_measured_level,
+            use_measured_level=choice.use_measured_level,
         )
         state = replace(
             state,
@@ -331,26 +375,25 @@ def final_state(
             picture=projection.picture,
             shift_px=request.displacement_px if request.thickness_mm else (0.0, 0.0),
         )
-    return _apply(state, twin, request, active, projection)
+        for applied, effect, numbers in early:
+            if effect.stage != "beam":
+                state = effect.change(state, numbers, _context(twin, request, applied, projection))
+    charge = _charge(twin, request, state, draft=cache.draft)
+    lit = _Lit(twin, request.thickness_mm, state, projection, charge)
+    cache.keep_lit(key, lit, sum(item.nbytes for item in (charge.mean, charge.correlated, charge.white)))
+    return lit, late
 
 
-def _apply(
-    state: LineState,
-    twin: Twin,
-    request: SeriesRequest,
-    active: Sequence[tuple[AppliedEffect, Effect, dict[str, float]]],
-    projection: BeamProjection | None,
-) -> LineState:
-    """All stages after the projection; those that need photons are left out without beam."""
-    with_beam = {"beam", "arrivals", "object_blur", "quanta", "optics"}
-    for applied, effect, numbers in active:
-        if effect.stage == "beam" or (projection is None and effect.stage in with_beam):
-            continue
-        state = effect.change(state, numbers, _context(twin, request, applied, projection))
+def _read_out(twin: Twin, request: SeriesRequest, found: tuple["_Lit", "_Active"]) -> LineState:
+    """All stages from the exposure on."""
+    lit, late = found
+    state = lit.state
+    for applied, effect, numbers in late:
+        state = effect.change(state, numbers, _context(twin, request, applied, lit.projection))
     return state
 
 
-def _charge(twin: Twin, request: SeriesRequest, state: LineState) -> _Charge:
+def _charge(twin: Twin, request: SeriesRequest, state: LineState, *, draft: bool = False) -> _Charge:
     shape, relative = _illumination(twin, request)
     pattern = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
     if not request.beam_on:
@@ -364,6 +407,7 @@ def _charge(twin: Twin, request: SeriesRequest, state: LineState) -> _Charge:
         pattern=pattern,
         psf_model=twin.noise.psf_model,
         psf_sigma_px=twin.noise.psf_sigma_px.value,
+        draft=draft,
     )
     lit = shape * state.flat_factor
     scale = lit * relative
@@ -404,7 +448,7 @@ def _trapped_before(
         left = decay**exposures
         trapped = trapped * left
         if earlier.beam_on:
-            brought = _charge(twin, earlier, choice.state(twin, earlier, cache)).mean
+            brought = choice.line(twin, earlier, cache)[1].mean
             trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
         clock = earlier.start_s + exposures * interval
     if clock is None:
@@ -502,8 +546,7 @@ def expected_series(
     """
     cache = ModelCache() if cache is None else cache
     choice = _Choice(effects, parameters, use_measured_level)
-    state = choice.state(twin, request, cache)
-    charge = _charge(twin, request, state)
+    state, charge = choice.line(twin, request, cache)
     averaged = request.exposures_per_frame
     exposures = request.frames * averaged
     interval = request.interval_s(twin.instrument.readout_ms)
@@ -642,8 +685,7 @@ def sample_series(
     """
     cache = ModelCache() if cache is None else cache
     choice = _Choice(effects, parameters, use_measured_level)
-    state = choice.state(twin, request, cache)
-    charge = _charge(twin, request, state)
+    state, charge = choice.line(twin, request, cache)
     shape = twin.maps.shape
     interval = request.interval_s(twin.instrument.readout_ms)
     averaged = request.exposures_per_frame

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis.inference import UNKNOWN, Curve, Nuisances, Priors, fit_curve, weigh_hypotheses
-from raytwin.diagnosis.whitening import whiten
+from raytwin.diagnosis.whitening import Whitening
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)
@@ -70,16 +70,34 @@ def test_whitening_local_nuisances_leaves_the_likelihood_as_it_was(setup):
         local[blocks == block, 2 * block : 2 * block + 2] = 3.0 * rng.standard_normal((100, 2))
     everything = np.concatenate([factors, local], axis=1)
     residual = noise(rng, everything)
-    white = whiten(residual, everything, chosen, blocks)
+    white = Whitening(everything, blocks)
     assert white.factors.shape == factors.shape
     whole, part = Nuisances(everything), Nuisances(white.factors)
-    for before, after in zip(chosen, white.curves, strict=True):
-        assert part.inner(after.responses, white.residual[None]) == pytest.approx(
+    left = white.apply(residual[None])
+    for before, after in zip(chosen, white.curves(chosen), strict=True):
+        assert part.inner(after.responses, left) == pytest.approx(
             whole.inner(before.responses, residual[None]), rel=1e-6, abs=1e-6
         )
         assert part.inner(after.responses, after.responses) == pytest.approx(
             whole.inner(before.responses, before.responses), rel=1e-6, abs=1e-8
         )
+
+
+def test_an_effect_of_no_catalogue_that_shows_in_many_places_is_unknown_rather_than_the_nearest_name(setup):
+    rng, factors, chosen = setup
+    for _ in range(5):
+        strange = 30.0 * rng.standard_normal(PROBES) * (GROUPS % 3 == 0)
+        leading = weigh(noise(rng, factors) + strange, factors, chosen)[0]
+        assert leading.effects == (UNKNOWN,)
+        assert leading.probability > 0.99
+
+
+def test_an_effect_whose_law_is_a_fifth_off_is_still_named(setup):
+    rng, factors, chosen = setup
+    for curve in chosen[:6]:
+        bent = curve.response(60.0) * (1.0 + 0.2 * rng.standard_normal(PROBES))
+        leading = weigh(noise(rng, factors) + bent, factors, chosen)[0]
+        assert curve.effect in leading.effects
 
 
 def test_curve_passes_through_its_nodes_and_through_zero(setup):

@@ -121,8 +121,7 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         wrong_names=every["wrong_names"],
         sets=every["confusion_by_set"],
         unknown_effects=every["unknown"]["by_effect"],
-        reduced=scores["reduced_measurement_set"],
-        reduced_rows=[
+        session_rows=[
             {
                 "name": name,
                 "n": entry["cases"]["all"],
@@ -130,7 +129,10 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
                 "all": share_text(entry["exact"]["all"]),
                 "false": share_text(entry["none"]["false_alarms"]),
             }
-            for name, entry in scores["reduced_measurement_set"]["by_protocol"].items()
+            for name, entry in [
+                *((f"full, {geometry} pixels", part) for geometry, part in scores["by_geometry"].items()),
+                *scores["reduced_measurement_set"]["by_protocol"].items(),
+            ]
         ],
         withheld=scores["leave_one_out"],
         share_text=share_text,

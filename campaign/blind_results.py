@@ -78,6 +78,10 @@ def score_check(check: OpenedCheck) -> CheckResult:
         "scores": compute_scores(outcomes, effects),
         "full_measurement_set": compute_scores(full, effects),
         "reduced_measurement_set": compute_scores(reduced, effects) | {"by_protocol": _by_protocol(reduced, effects)},
+        "by_geometry": {
+            name: _few(compute_scores([item for item in full if item.geometry == name], effects))
+            for name in ("fine", "coarse")
+        },
         "leave_one_out": withheld_scores(outcomes) if check.options.leave_one_out else None,
         "baselines": baseline_scores(baselines, effects),
     }
@@ -113,14 +117,17 @@ def _misfit(statistics: SessionStatistics | None) -> float | None:
     return (statistics.chi_square - statistics.probes) / math.sqrt(2.0 * statistics.probes)
 
 
+def _few(scores: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: scores[key] for key in ("cases", "top1", "exact", "none", "leading_hypothesis")}
+
+
 def _by_protocol(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[str, Any]:
     result = {}
     for name in ("full", "short", "products"):
         own = [item for item in outcomes if item.protocol == name]
         label = "full, series left out" if name == "full" else name
         if own:
-            scores = compute_scores(own, effects)
-            result[label] = {key: scores[key] for key in ("cases", "top1", "exact", "none", "leading_hypothesis")}
+            result[label] = _few(compute_scores(own, effects))
     return result
 
 

@@ -1,4 +1,9 @@
-"""What effects change in a flatfield, long after the beam was switched on."""
+"""What effects change in a flatfield, long after the beam was switched on.
+
+A flat that calibrated the twin held what was always there, and so do the twin's levels and maps: the spread of light in slope and
+width, rows and lost bits in the read noise, lag in the variance. Such effects change nothing a second time; a response that was
+always bent does so only in so far as the level differs from those that calibrated.
+"""
 
 import math
 from collections.abc import Sequence
@@ -24,6 +29,8 @@ _NOTHING_IN_FLATS = (
     "bad_pixels",
     "gain_map_error",
 )
+# calibration takes these in as a whole
+ABSORBED = ("mtf_tail", "veiling_glare", "k_fluorescence", "image_lag", "row_noise", "quantisation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +42,16 @@ class FlatChange:
     gain: float
     photons: float
     warnings: tuple[str, ...]
+
+    def over(self, other: "FlatChange") -> "FlatChange":
+        """Factors of this change over those of another."""
+        return FlatChange(
+            mean=self.mean / other.mean,
+            sd=self.sd / other.sd,
+            gain=self.gain / other.gain,
+            photons=self.photons / other.photons,
+            warnings=self.warnings,
+        )
 
 
 def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) -> FlatChange:
@@ -52,23 +69,54 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
     if setting.binning > 1:
         warnings.append("the effects' part of the noise is that of pixels that are not binned")
     cache = ModelCache()
-    before = _flat(twin, (), setting, cache)
     usable: list[AppliedEffect] = []
     for item in effects:
-        if item.id in _NOTHING_IN_FLATS:
+        if item.id in _NOTHING_IN_FLATS or (item.since == "always" and item.id in ABSORBED):
             continue
         try:
             _flat(twin, (item,), setting, cache)
             usable.append(item)
         except InputError as error:
             warnings.append(f"effect {item.id} is left out: {error}")
+    found = _change(twin, usable, setting, cache)
+    bent = [item for item in usable if item.id == "nonlinearity" and item.since == "always"]
+    calibrated_DN = _calibrated_signal_DN(twin, setting)
+    if bent and calibrated_DN is not None:
+        there = _change(twin, bent, _at_signal(setting, calibrated_DN / _level(_flat(twin, (), setting, cache))), cache)
+        found = found.over(there)
+    elif bent:
+        found = _change(twin, [item for item in usable if item not in bent], setting, cache)
+    return replace(found, warnings=tuple(warnings))
+
+
+def _at_signal(setting: Setting, factor: float) -> Setting:
+    """The setting with another tube load, all else equal."""
+    return replace(
+        setting,
+        current_mA=None if setting.current_mA is None else factor * setting.current_mA,
+        power_W=None if setting.power_W is None else factor * setting.power_W,
+    )
+
+
+def _calibrated_signal_DN(twin: Twin, setting: Setting) -> float | None:
+    """Median signal of the flats that calibrated: of the setting's own level where it was measured, else of all, DN."""
+    own = twin.level_at(setting)
+    known = [
+        float(point["signal_DN"])
+        for point in twin.evidence.get("photon_transfer", ())
+        if point.get("used") and (own is None or point.get("series") in own.series)
+    ]
+    return float(np.median(known)) if known else None
+
+
+def _change(twin: Twin, usable: Sequence[AppliedEffect], setting: Setting, cache: ModelCache) -> FlatChange:
     if not usable:
-        return FlatChange(mean=1.0, sd=1.0, gain=1.0, photons=1.0, warnings=tuple(warnings))
-    after = _flat(twin, usable, setting, cache)
+        return FlatChange(mean=1.0, sd=1.0, gain=1.0, photons=1.0, warnings=())
+    before, after = _flat(twin, (), setting, cache), _flat(twin, usable, setting, cache)
+    level = _level(before)
     arriving = [item for item in usable if effect_of(item).stage == "arrivals"]
     # neither light nor memory: what is left changes variance over signal, not its share in one pixel
     gain_like = [item for item in usable if effect_of(item).stage not in ("optics", "lag", "exposure", "electronics")]
-    level = _level(before)
     arrived, gained = _flat(twin, arriving, setting, cache), _flat(twin, gain_like, setting, cache)
     mean = _level(after) / level
     return FlatChange(
@@ -76,7 +124,7 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
         sd=math.sqrt(_variance(after) / _variance(before)),
         gain=_quantum(gained) / _quantum(before) / (_level(gained) / level),
         photons=_level(arrived) / level,
-        warnings=tuple(warnings),
+        warnings=(),
     )
 
 

@@ -240,14 +240,15 @@ class ChannelModel:
                 quiet = self._quiet(straight, reference)
                 straight = straight + effects.picture_change(quiet, self.thickness_behind(quiet))
             gain = self.gain_behind(straight)
+            quanta = effects.gain_factor * np.maximum(gain - self.secondary_DN, 1e-3 * gain)
             charge = topped_up_charge(
                 straight,
                 plan,
-                open_signal_DN=self.open_signal_DN,
-                gain_DN=gain,
+                open_signal_DN=effects.open_charge_DN,
+                gain_DN=quanta + self.secondary_DN,
                 gain_relative=self.twin.maps.gain_relative,
-                white_fraction=self.white_behind(gain),
-                read_variance_DN2=self.read_variance_DN2,
+                white_fraction=self.secondary_DN / quanta,
+                read_variance_DN2=effects.read_variance_DN2,
                 psf_model=noise.psf_model,
                 psf_sigma_px=noise.psf_sigma_px.value,
                 quantised=noise.quantised,

@@ -19,6 +19,7 @@ from ..errors import InputError
 from ._fine_picture import pixel_means, transform_of_cells
 from ._spread import NoisePattern, base_transfer_1d, blurred_object, noise_pattern, optical_transfer, spread_maps
 from .effects import AppliedEffect, effect_of, in_order
+from .flat_change import ABSORBED
 from .line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
 from .projection import project_polychromatic
 from .series import SeriesRequest, _new_bad_pixels, _pattern
@@ -62,8 +63,11 @@ class ImageEffects:
     Fields: twin (without effects); effects; setting; open_signal_DN (row, column) and open_level_DN (its level under even
     illumination) of one exposure; gain_DN of the open beam and secondary_DN, what secondary quanta add to it; dark_DN,
     read_variance_DN2 (row, column); product_material; instrument: distances and pitch where a description states others than
-    the twin's; flat_DN (row, column): open field of the line as it is, above dark, with all that a correction's flat would
-    hold: gain and pixels that changed are not in it; warnings: effects that are left out, one line each.
+    the twin's. What follows from them: flat_DN (row, column): open field of the line as it is, above dark, with all that a
+    correction's flat would hold: gain and pixels that changed are not in it; open_charge_DN (row, column): open field
+    before a response that was always bent; gain_factor: on the quantum variance, where light that was always spread
+    further leaves less of it in a pixel than the calibrated spread, although the slope was measured with it; pattern:
+    correlation of the noise; warnings: effects that are left out, one line each.
     """
 
     twin: Twin
@@ -78,6 +82,8 @@ class ImageEffects:
     product_material: str
     instrument: Instrument | None = None
     flat_DN: FloatArray = field(init=False)
+    open_charge_DN: FloatArray = field(init=False)
+    gain_factor: float = field(init=False)
     pattern: NoisePattern = field(init=False)
     warnings: tuple[str, ...] = field(init=False)
     _model: SpectralModel | None = field(init=False)
@@ -96,7 +102,13 @@ class ImageEffects:
         open_beam = self._through(self._open_state(), self.effects, None)
         self._end = open_beam
         self.pattern = noise_pattern(self.twin.noise.psf_model, self.twin.noise.psf_sigma_px.value, open_beam)
-        lit = self.open_signal_DN * (open_beam.signal_DN / self.open_level_DN) * open_beam.flat_factor
+        self.open_charge_DN = self._unbent(self.open_signal_DN)
+        spread = [item for item in self.effects if item.id in ABSORBED and item.since == "always"]
+        model, sigma_px = self.twin.noise.psf_model, self.twin.noise.psf_sigma_px.value
+        left = noise_pattern(model, sigma_px, self._through(self._open_state(), spread, None)).share
+        self.gain_factor = noise_pattern(model, sigma_px, self._open_state()).share / left
+        self.read_variance_DN2 = self._without_absorbed(self.read_variance_DN2, spread)
+        lit = self.open_charge_DN * (open_beam.signal_DN / self.open_level_DN) * open_beam.flat_factor
         self.flat_DN = lit * (1.0 - open_beam.bend_per_DN * lit)
 
     def _usable(self) -> tuple[tuple[AppliedEffect, ...], tuple[str, ...]]:
@@ -114,6 +126,27 @@ class ImageEffects:
                 except InputError as error:
                     told.append(f"effect {item.id} is not in the images: {error}")
         return tuple(usable), tuple(told)
+
+    def _unbent(self, measured_DN: FloatArray) -> FloatArray:
+        """Charge that a response that was always bent shows as `measured_DN`."""
+        always = [item for item in self.effects if item.id == "nonlinearity" and item.since == "always"]
+        if not always:
+            return measured_DN
+        bend = self._through(self._open_state(), always, None).bend_per_DN
+        root = np.sqrt(np.maximum(1.0 - 4.0 * bend * measured_DN, 0.0))
+        return np.asarray(2.0 * measured_DN / (1.0 + root))
+
+    def _without_absorbed(
+        self, read_variance_DN2: NDArray[np.float32], always: Sequence[AppliedEffect]
+    ) -> NDArray[np.float32]:
+        """Read variance without the rows, columns and lost bits that the darks of the calibration held."""
+        state = self._through(self._open_state(), always, None)
+        held = state.row_variance_DN2 + state.column_variance_DN2
+        rounding = 1.0 / 12.0 if self.twin.noise.quantised else 0.0
+        held += max(state.step_DN**2 / 12.0 - rounding, 0.0)
+        if held <= 0:
+            return read_variance_DN2
+        return np.asarray(np.maximum(read_variance_DN2 - np.float32(held), np.float32(rounding)))
 
     def _open_state(self) -> LineState:
         one = np.ones((1, 1))
@@ -225,7 +258,7 @@ class ImageEffects:
         noise = self.twin.noise
         # secondary quanta follow the signal, whatever the spectrum
         white = np.minimum(self.secondary_DN * np.maximum(state.signal_DN, 0.0), 0.9 * state.variance_DN2)
-        state = replace(state, variance_DN2=state.variance_DN2 - white)
+        state = replace(state, variance_DN2=self.gain_factor * (state.variance_DN2 - white))
         picture, _ = spread_maps(
             state.signal_DN,
             state.variance_DN2,
@@ -234,7 +267,7 @@ class ImageEffects:
             psf_model=noise.psf_model,
             psf_sigma_px=noise.psf_sigma_px.value,
         )
-        lit = self.open_signal_DN / self.open_level_DN * state.flat_factor
+        lit = self.open_charge_DN / self.open_level_DN * state.flat_factor
         charge = lit * picture
         scale = lit * self.twin.maps.gain_relative
         before, variance = blurred_object(state)
@@ -274,16 +307,10 @@ class ImageEffects:
 
         Args:
             transmission: I / I0 of the reference.
-            open_signal_DN: (row, column) of one of its frames.
+            open_signal_DN: (row, column) of one of its frames, as measured.
         """
         values = np.asarray(transmission, dtype=np.float64)
-        always = [item for item in self.effects if item.id == "nonlinearity" and item.since == "always"]
-        if not always:
-            return values
-        bend = self._through(self._open_state(), always, None).bend_per_DN
-        measured = values * open_signal_DN * (1.0 - bend * open_signal_DN)
-        root = np.sqrt(np.maximum(1.0 - 4.0 * bend * measured, 0.0))
-        return np.asarray(2.0 * measured / (1.0 + root) / open_signal_DN)
+        return np.asarray(self._unbent(values * open_signal_DN) / self._unbent(open_signal_DN))
 
     def changes_picture(self) -> bool:
         """Whether reference images, taken when the twin was calibrated, would look otherwise now."""

@@ -127,6 +127,31 @@ def test_the_noise_of_images_with_an_effect_is_that_of_the_series_model(series_l
     assert neighbours[0] == pytest.approx(neighbours[1], abs=0.015 + few)
 
 
+@pytest.mark.parametrize("effect", ["mtf_tail", "row_noise", "quantisation", "veiling_glare"])
+def test_what_was_always_there_correlates_noise_and_leaves_the_variance_as_calibrated(series_line, effect):
+    parameters = {"strength": 1.0} if effect == "row_noise" else {"strength": 20.0}
+    applied = AppliedEffect(id=effect, parameters=parameters, since="always")
+    thickness = np.zeros(SHAPE)
+    variances, rows = {}, {}
+    for name, effects in (
+        ("effect", (applied,)),
+        ("plain", (AppliedEffect(id="row_noise", parameters={"strength": 0}),)),
+    ):
+        model = channel(series_line, effects, LOW)
+        drawn = model.image_effects.image(
+            *fine_moments(series_line, LOW, thickness), {"water_liquid": thickness}, focal_blur_px=0.0
+        )
+        rng = np.random.default_rng(5)
+        frames = np.stack([model.image_effects.sample(drawn, rng) for _ in range(200)]).astype(np.float64)
+        variances[name] = frames.var(ddof=1, axis=0).mean()
+        rows[name] = frames.mean(axis=2).var(ddof=1, axis=0).mean()
+    # the spread of 200 frames of 1600 pixels, a few of which share their noise; a row's noise counts 8000 times
+    few = 0.05 if effect == "row_noise" else 0.03
+    assert variances["effect"] / variances["plain"] == pytest.approx(1.0, abs=few)
+    if effect == "row_noise":
+        assert rows["effect"] > 1.5 * rows["plain"]
+
+
 # ------------------------------------------------------------------------------------------------ described scenes
 
 
@@ -295,12 +320,15 @@ def test_quantisation_gain_pattern_bad_pixels_and_drift_show_in_images_from_refe
 def test_a_bent_response_that_was_always_there_is_not_bent_twice(series_line, references):
     twin = with_effect(series_line, "nonlinearity", since="always", strength=5.0)
     model = channel(series_line, twin.effects)
-    opened = model.open_signal_DN
+    charge = model.open_signal_DN
     true = np.full(SHAPE, 0.4)
     bend = model.image_effects._end.bend_per_DN
-    measured = 0.4 * opened * (1 - bend * 0.4 * opened) / (opened * (1 - bend * opened))
+    opened = charge * (1 - bend * charge)
+    measured = 0.4 * charge * (1 - bend * 0.4 * charge) / opened
     np.testing.assert_allclose(model.image_effects.straightened(measured, open_signal_DN=opened), true, rtol=1e-9)
     assert np.abs(measured - true).max() > 1e-3
+    # and the open field is the measured one
+    np.testing.assert_allclose(model.image_effects.flat_DN, model.open_signal_DN, rtol=1e-9)
 
 
 @pytest.mark.parametrize("effect", ["filtration_error", "kv_error"])

@@ -98,6 +98,26 @@ def test_before_calibration_only_effects_that_were_always_there_are_predicted(se
     assert predict_flatfield(always, UNMEASURED, after_calibration=False).mean_DN.value > 1.02 * plain.mean_DN.value
 
 
+@pytest.mark.parametrize("effect", ["mtf_tail", "veiling_glare", "image_lag", "row_noise", "quantisation"])
+def test_what_calibration_took_in_is_not_counted_twice(series_line, effect):
+    always = with_effect(series_line, effect, since="always")
+    assert predict_flatfield(always, UNMEASURED) == predict_flatfield(series_line, UNMEASURED)
+
+
+def test_a_response_that_was_always_bent_changes_levels_away_from_those_that_calibrated(series_line):
+    signal = predict_flatfield(series_line, MEASURED).mean_DN.value
+    points = [{"used": True, "series": "flat_90", "signal_DN": factor * signal} for factor in (0.5, 1.0, 4.0)]
+    bent = replace(
+        with_effect(series_line, "nonlinearity", since="always", strength=5.0), evidence={"photon_transfer": points}
+    )
+    plain = replace(bent, effects=())
+    assert predict_flatfield(bent, MEASURED).mean_DN.value == pytest.approx(signal, rel=1e-5)
+    bright = replace(MEASURED, exposure_ms=200.0)
+    found, straight = (predict_flatfield(one, bright).mean_DN.value for one in (bent, plain))
+    bend = 0.05 / (0.5 * (2**16 - 1 - 1200))
+    assert found / straight == pytest.approx((1 - bend * straight) / (1 - bend * signal), rel=1e-4)
+
+
 def test_levels_of_many_settings_hold_the_effects_on_the_beam(series_line):
     late = with_effect(series_line, "filtration_error", strength=0.3)
     for setting in (MEASURED, UNMEASURED):

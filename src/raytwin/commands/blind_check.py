@@ -7,7 +7,9 @@ cases.csv and report.html into the folder; a run that was stopped goes on where 
 
 import argparse
 import json
+import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +66,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the scores as JSON")
 
 
+def _interrupt(number: int, frame: object) -> None:
+    """End as a key press does: processes are stopped, nothing half done is recorded."""
+    raise KeyboardInterrupt
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin blind-check`."""
     from tqdm import tqdm
@@ -109,6 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
     def advance() -> None:
         bar.update()
 
+    previous = signal.signal(signal.SIGTERM, _interrupt) if _in_main_thread() else None
     try:
         if unanswered(folder, cases):
             with frozen_code(folder) as code:
@@ -123,6 +135,8 @@ def run(arguments: argparse.Namespace) -> int:
                     advance=advance,
                 )
     finally:
+        if previous is not None:
+            signal.signal(signal.SIGTERM, previous)
         if bar is not None:
             bar.close()
     check = open_check(folder, options, cases)

@@ -67,17 +67,18 @@ def test_excess_noise_raises_the_quantum_variance_by_its_strength_and_leaves_the
 
 @pytest.mark.parametrize("effect", sorted(EFFECTS))
 @pytest.mark.parametrize("setting", [MEASURED, UNMEASURED], ids=["measured", "unmeasured"])
-def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(series_line, effect, setting):
+def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(make_model_twin, effect, setting):
+    twin = make_model_twin((24, 24), readout_ms=2.0)
     applied = AppliedEffect(id=effect, parameters={}, since="calibration")
-    found = predict_flatfield(replace(series_line, effects=(applied,)), setting)
-    plain = predict_flatfield(series_line, setting)
+    found = predict_flatfield(replace(twin, effects=(applied,)), setting)
+    plain = predict_flatfield(twin, setting)
     asked = SeriesRequest(kind="flat", setting=setting, frames=1, exposure_ms=setting.exposure_ms)
     # lag has filled after an hour of beam
-    interval = asked.interval_s(series_line.instrument.readout_ms)
+    interval = asked.interval_s(twin.instrument.readout_ms)
     exposed = math.ceil(3600.0 / interval)
     asked = replace(asked, start_s=exposed * interval, previous=(replace(asked, frames=exposed),))
-    with_it = expected_series(series_line, asked, effects=(applied,))
-    without = expected_series(series_line, asked, effects=())
+    with_it = expected_series(twin, asked, effects=(applied,))
+    without = expected_series(twin, asked, effects=())
 
     def noise(flat):
         common = flat.row_variance_DN2 + flat.column_variance_DN2

@@ -16,7 +16,8 @@ lab's own (1: nobody can tell); beside it the same for another session of the la
 
 Classifiers: log image pairs of products at the three exposures, patches of 16 x 16 and 64 x 64, half of the objects to
 learn from and the others to be tested on; lab against generated beside lab against another session of the lab, AUC and the
-difference of the two with its 95 % interval (bootstrap over test objects). `published` is the paper's recipe.
+difference of the two with its 95 % interval (bootstrap over test objects). `statistics` is logistic regression on statistics of a
+patch, `network` a small convolutional network that sees fine detail apart from the picture, `pictures` one that sees log images only. `published` is the paper's recipe.
 """
 
 import argparse
@@ -381,9 +382,10 @@ def classify(
             )
         }
         if network:
-            ways["network"] = lambda train=train, test=test: network_scores(  # type: ignore[misc]
-                train, test, epochs=size.epochs if patch <= 16 else 2 * size.epochs, seed=seed
-            )
+            for way, detail in (("network", True), ("pictures", False)):
+                ways[way] = lambda train=train, test=test, detail=detail: network_scores(  # type: ignore[misc]
+                    train, test, epochs=size.epochs if patch <= 16 else 2 * size.epochs, seed=seed, detail=detail
+                )
         for way, run in ways.items():
             first, second = run()
             ends = np.cumsum(lengths)[:-1]

@@ -97,7 +97,7 @@ def logistic_scores(
 
 
 def _layers_of(patches: Patches) -> Patches:
-    """What the network sees (patch, layer, size, size): log images, their fine detail over its rms, and that rms."""
+    """What a network sees (patch, layer, size, size): log images, their fine detail over its rms, and that rms."""
     from scipy.ndimage import uniform_filter
 
     detail = patches - uniform_filter(patches, (0, 0, 5, 5), mode="nearest")
@@ -106,15 +106,26 @@ def _layers_of(patches: Patches) -> Patches:
 
 
 def network_scores(
-    train: tuple[Patches, Patches], test: tuple[Patches, Patches], *, epochs: int, seed: int, device: str = "cpu"
+    train: tuple[Patches, Patches],
+    test: tuple[Patches, Patches],
+    *,
+    epochs: int,
+    seed: int,
+    detail: bool = True,
+    device: str = "cpu",
 ) -> tuple[Array, Array]:
-    """Scores of the two kinds of test patches (patch, channel, size, size) by a small convolutional network."""
+    """Scores of the two kinds of test patches (patch, channel, size, size) by a small convolutional network.
+
+    With `detail` it sees, besides the log images, their fine detail over its rms, and that rms; without, the log images alone,
+    in which it finds the relation of both channels more easily and noise hardly.
+    """
     import torch
     from torch import nn
 
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    whole = _layers_of(np.concatenate(train))
+    see = _layers_of if detail else np.asarray
+    whole = see(np.concatenate(train))
     middle, scale = whole.mean(axis=(0, 2, 3), keepdims=True), whole.std(axis=(0, 2, 3), keepdims=True) + 1e-6
     label = np.concatenate([np.zeros(len(train[0])), np.ones(len(train[1]))]).astype(np.float32)
     size = whole.shape[-1]
@@ -150,7 +161,7 @@ def network_scores(
         found = []
         with torch.no_grad():
             for start in range(0, len(values), 256):
-                piece = np.ascontiguousarray((_layers_of(values[start : start + 256]) - middle) / scale)
+                piece = np.ascontiguousarray((see(values[start : start + 256]) - middle) / scale)
                 found.append(network(torch.from_numpy(piece).to(device))[:, 0].cpu().numpy())
         return np.concatenate(found).astype(np.float64)
 

@@ -16,8 +16,9 @@ lab's own (1: nobody can tell); beside it the same for another session of the la
 
 Classifiers: log image pairs of products at the three exposures, patches of 16 x 16 and 64 x 64, half of the objects to
 learn from and the others to be tested on; lab against generated beside lab against another session of the lab, AUC and the
-difference of the two with its 95 % interval (bootstrap over test objects). `statistics` is logistic regression on statistics of a
-patch, `network` a small convolutional network that sees fine detail apart from the picture, `pictures` one that sees log images only. `published` is the paper's recipe.
+difference of the two with its 95 % interval (bootstrap over test objects). `statistics` is logistic regression on statistics
+of a patch, `network` a small convolutional network that sees fine detail apart from the picture, `pictures` one that sees log
+images only. `as published` is the paper's recipe.
 """
 
 import argparse

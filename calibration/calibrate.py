@@ -84,10 +84,17 @@ def calibrate_twin(
         transmissions = [value for item in wedges for value in item.transmissions]
         try:
             fit = fit_spectrum(
-                transfer.levels, acquisition.instrument, rng=rng, spectra=spectra, transmissions=transmissions
+                transfer.levels,
+                acquisition.instrument,
+                rng=rng,
+                spectra=spectra,
+                transmissions=transmissions,
+                noise=transfer.noise,
             )
             if transmissions and _contradicts(fit):
-                without = fit_spectrum(transfer.levels, acquisition.instrument, rng=rng, spectra=spectra)
+                without = fit_spectrum(
+                    transfer.levels, acquisition.instrument, rng=rng, spectra=spectra, noise=transfer.noise
+                )
                 if not _contradicts(without):
                     fit = without
                     evidence["wedges"] = [{**row, "used": False} for row in evidence["wedges"]]

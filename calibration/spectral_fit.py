@@ -24,7 +24,8 @@ from ..generator.spectral_signal import (
     SpectrumCorrection,
     attenuation_scale_name,
 )
-from ..generator.twin import Level, SpectralPosterior
+from ..generator.twin import Level, NoiseModel, SpectralPosterior
+from ..generator.twin_spectrum import slope_over_gain
 from ..spectra import BIN_WIDTH_KEV, Spectrum
 from .priors import (
     ATTENUATION_SCALE,
@@ -224,6 +225,7 @@ def fit_spectrum(
     spectra: Sequence[Spectrum] = (),
     correction: SpectrumCorrection | None = None,
     model_name: str = "casim",
+    noise: NoiseModel | None = None,
 ) -> SpectralFit:
     """Posterior of the spectral parameters from measured levels, gains and transmissions.
 
@@ -238,6 +240,8 @@ def fit_spectrum(
             dependence on kV is kept (`SpectrumCorrection`).
         correction: the same, where it is known already.
         model_name: SpekPy's physics model.
+        noise: the detector's spread, which says how much of the levels' slopes is white; None: their ratio to the gain is
+            taken as the same in all beams.
 
     Raises:
         FitError: no level with a kV, or the posterior cannot be sampled.
@@ -262,7 +266,7 @@ def fit_spectrum(
         geometry_declared=instrument.pixel_mm is not None and all(level.source_detector_mm for level in known),
     )
     beams: dict[OpenBeam, int] = {}
-    data = _data(known, transmissions, instrument, beams)
+    data = _data(known, transmissions, instrument, noise, beams)
     posterior = _Posterior(model, priors, tuple(beams), data, {"level": level_discrepancy, "gain": gain_discrepancy})
     best, samples, discrepancies, effective = posterior.sample(rng)
     names = model.names
@@ -298,25 +302,38 @@ def fit_spectrum(
     )
 
 
+def _shares(levels: Sequence[Level], noise: NoiseModel | None) -> list[float]:
+    """Photon-transfer slope over gain of each level, from all of them together."""
+    gains = np.array([max(level.gain_DN.value, 1e-300) for level in levels])
+    if noise is not None:
+        # of the levels' own gains the mean is well known, and the ratio of one to another nearly enough
+        found = slope_over_gain(levels, noise, gains)
+        if found is not None:
+            return [float(value) for value in found]
+    known = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
+    ratios = [math.log(level.photon_transfer_slope_DN.value / level.gain_DN.value) for level in known]
+    return [math.exp(float(np.mean(ratios)))] * len(levels)
+
+
 def _data(
     levels: Sequence[Level],
     transmissions: Sequence[Transmission],
     instrument: Instrument,
+    noise: NoiseModel | None,
     beams: dict[OpenBeam, int],
 ) -> list[_Datum]:
     def number(kV: float, filters: tuple[Filter, ...]) -> int:
         return beams.setdefault(OpenBeam(kV=kV, filters=filters), len(beams))
 
-    # The slope of a photon-transfer line is known better than the gain, which also wants the spread; their ratio is one
-    # for all levels, so that slopes carry the gains' dependence on the spectrum.
+    # The slope of a photon-transfer line is known better than the gain, which also wants the spread; their ratio is nearly
+    # one for all levels, so that slopes carry the gains' dependence on the spectrum.
     sloped = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
-    share = None
+    share: dict[int, float] = {}
     if sloped:
         slope_sd = np.median([_relative_sd(level.photon_transfer_slope_DN) for level in sloped])
         gain_sd = np.median([_relative_sd(level.gain_DN) for level in sloped])
         if slope_sd < gain_sd:
-            ratios = [math.log(level.photon_transfer_slope_DN.value / level.gain_DN.value) for level in sloped]
-            share = math.exp(float(np.mean(ratios)))
+            share = dict(zip(map(id, levels), _shares(levels, noise), strict=True))
     data = []
     for level in levels:
         beam = number(level.kV or 0.0, level.filters)
@@ -324,8 +341,8 @@ def _data(
         if rate is not None and rate.value > 0:
             factor = geometry_factor(source_detector_mm=level.source_detector_mm, pixel_mm=instrument.pixel_mm)
             data.append(_Datum("rate", beam, -1, math.log(rate.value / factor), _relative_sd(rate)))
-        gain = level.gain_DN if share is None else level.photon_transfer_slope_DN
-        value = gain.value / (share or 1.0)
+        gain = level.photon_transfer_slope_DN if share else level.gain_DN
+        value = gain.value / share.get(id(level), 1.0)
         data.append(_Datum("gain", beam, -1, math.log(max(value, 1e-12)), _relative_sd(gain)))
     for item in transmissions:
         data.append(

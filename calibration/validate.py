@@ -327,6 +327,7 @@ def leave_one_out(
             others,
             twin.instrument,
             rng=rng,
+            noise=twin.noise,
             transmissions=kept,
             correction=twin.spectral.correction,
             model_name=twin.spectral.model,

@@ -16,7 +16,7 @@ from .present_line import PresentLine, present_line
 from .psf import blur_variance_share
 from .spectral_signal import OpenBeam
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
-from .twin_spectrum import slope_share, spectral_model_of
+from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
 
 __all__ = [
     "Prediction",
@@ -236,7 +236,8 @@ def _without_effects(twin: Twin, setting: Setting) -> Prediction:
         gain = _estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, share_relative_sd))
         photons = _estimate_from_draws(signal.absorbed_per_mAs * load * factor, level_sd)
         # level and gain are known together, not one by one: their product draw by draw
-        quantum_draws = signal.gain_DN * share * rate_draws
+        own_share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN)
+        quantum_draws = signal.gain_DN * (share if own_share is None else own_share) * rate_draws
         quantum_sd = math.hypot(level_sd, gain_sd)
         at_object = instrument.source_object_mm
         if setting.source_detector_mm is not None or at_object is None:

@@ -10,7 +10,7 @@ from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from .present_line import present_line
 from .twin import Twin
-from .twin_spectrum import slope_share, spectral_model_of
+from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,11 +80,10 @@ def predict_levels(
     stack_of = np.array([stacks.setdefault(tuple(stack), len(stacks)) for stack in filters], dtype=np.intp)
     every_stack = tuple(stacks)
     unique_kV, kV_of = np.unique(volts, return_inverse=True)
-    share = slope_share(twin)
     for position, voltage in enumerate(unique_kV):
         there = np.flatnonzero(kV_of == position)
         wanted, entry = np.unique(stack_of[there], return_inverse=True)
-        columns = _levels_of_kV(twin, float(voltage), [every_stack[one] for one in wanted], share, source_detector_mm)
+        columns = _levels_of_kV(twin, float(voltage), [every_stack[one] for one in wanted], source_detector_mm)
         for target, column in zip((rate_DN_per_mAs, gain_DN, slope_DN, measured), columns, strict=True):
             target[there] = column[entry]
     mean_DN = rate_DN_per_mAs * load
@@ -104,7 +103,7 @@ def _one_each(name: str, values: ArrayLike, settings: int) -> NDArray[np.float64
 
 
 def _levels_of_kV(
-    twin: Twin, kV: float, stacks: list[tuple[Filter, ...]], share: float, source_detector_mm: float | None
+    twin: Twin, kV: float, stacks: list[tuple[Filter, ...]], source_detector_mm: float | None
 ) -> NDArray[np.float64]:
     """Rate (DN / mAs at the detector), gain, photon-transfer slope and whether measured (4, stack) at one kV."""
     answer = np.zeros((4, len(stacks)))
@@ -136,5 +135,6 @@ def _levels_of_kV(
         factor = (1000.0 / (distance or 1000.0)) ** 2 * (twin.instrument.pixel_mm or 1.0) ** 2
         answer[0, unmeasured] = signal.rate_DN_per_mAs[1:] * factor
         answer[1, unmeasured] = signal.gain_DN[1:]
-        answer[2, unmeasured] = signal.gain_DN[1:] * share
+        share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN[1:])
+        answer[2, unmeasured] = signal.gain_DN[1:] * (slope_share(twin) if share is None else share)
     return answer

@@ -1,14 +1,20 @@
 """What a twin's posterior and levels amount to: its spectral model, and the share of the noise that its spread leaves."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from .psf import blur_variance_share
 from .spectral_signal import SpectralModel, attenuation_scale_name
-from .twin import Twin
+from .twin import Level, NoiseModel, Twin
+
+_LARGEST_SECONDARY = 0.06  # of the gain
 
 
 @lru_cache(maxsize=8)
@@ -75,6 +81,32 @@ def slope_share(twin: Twin) -> float:
     share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
     white = twin.noise.white_fraction
     return (share + white) / (1.0 + white)
+
+
+def slope_over_gain(
+    levels: Sequence[Level], noise: NoiseModel, gain_DN: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Photon-transfer slope over gain (draw,) at gains (draw,), no unit; None without usable levels.
+
+    slope = h (gain - w) + w: the spread leaves a share h of the quantum noise in one pixel, while what secondary quanta
+    add, w for each DN of signal, is white and the same in every beam (`secondary_gain_DN`). Softer beams, of lower gain,
+    hold more of it. At the levels' mean gain the ratio is the levels' own.
+    """
+    known = [
+        (level.photon_transfer_slope_DN.value, level.gain_DN.value)
+        for level in levels
+        if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0
+    ]
+    if not known:
+        return None
+    slopes, gains = np.log(np.array(known)).mean(axis=0)
+    share, mean_gain = math.exp(slopes - gains), math.exp(gains)
+    left = blur_variance_share(noise.psf_model, noise.psf_sigma_px.value)
+    white = (share - left) / (1.0 - left) if left < 0.999 else 0.0
+    if not 0.0 <= white <= _LARGEST_SECONDARY:
+        white = 0.0  # no noise of secondary quanta, but a spread that is not Gaussian
+    constant = (1.0 - left) * white / share  # of the slope at the mean gain: does not grow with the gain
+    return np.asarray(share * (1.0 + constant * (mean_gain / np.asarray(gain_DN) - 1.0)))
 
 
 def secondary_gain_DN(twin: Twin, setting: Setting | None = None) -> float | None:

@@ -174,6 +174,7 @@ class ImageEffects:
             thickness_mm=thickness_mm,
             product_material=self.product_material,
             scene_kind=None if thickness_mm is None else "product",
+            belt_speed_mm_s=self.setting.belt_speed_mm_s,
             belt_axis=self.twin.instrument.belt_axis or "row",
         )
         for applied, effect, numbers in in_order(effects):

@@ -82,7 +82,8 @@ class Problem:
     """Everything that inference needs; probes are standardised.
 
     Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
-    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; blocks (probe,):
+    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
+    noise's share of each probe's standard deviation; blocks (probe,):
     series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
     part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
     calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
@@ -97,6 +98,7 @@ class Problem:
     names: tuple[ProbeName, ...]
     series_of: NDArray[np.intp]
     sd: NDArray[np.float64]
+    noise: NDArray[np.float64]
     groups: NDArray[np.intp]
     group_names: tuple[str, ...]
     parts: NDArray[np.intp]
@@ -674,6 +676,7 @@ def build_problem(
                 maps,
                 scalars,
                 thicker,
+                frozenset(index for index, change in enumerate(all_changes) if change.label == "dark_drift"),
                 shape,
             )
         )
@@ -795,6 +798,7 @@ def _displacement_probes(placement: Placement) -> list[Scalar]:
             unit="px",
             value=value,
             sd=math.hypot(sd, scales.POSITION_SD_PX),
+            sampling_sd=sd,
         )
         for name, value, sd in (
             ("rows", placement.row_px, placement.row_sd_px),
@@ -962,6 +966,7 @@ def _block(
     maps: Sequence[Map | None],
     scalars: Sequence[dict[str, float] | None],
     thicker: dict[str, tuple[Map, dict[str, float]]],
+    uneven: frozenset[int],
     shape: tuple[int, int],
 ) -> dict[str, Any]:
     names = projection.names() + [
@@ -990,12 +995,28 @@ def _block(
         "local": {key: column * shrink for key, column in local.items()},
         "sd": np.concatenate([np.ones(len(projection)), [probe.sd for probe in scalar_probes]]),
         "maps": len(projection),
+        "noise": np.concatenate([np.ones(len(projection)), [probe.sampling_sd / probe.sd for probe in scalar_probes]])
+        * shrink,
     }
     responses = np.zeros((len(maps), len(residual)))
     for index, (image, values) in enumerate(zip(maps, scalars, strict=True)):
         if image is not None and values is not None:
             responses[index] = _standardised(block, base_scalars, image, values, shape)
     block["responses"] = responses
+    # a panel seldom warms evenly: what drifts may drift more on one side
+    rows, columns = shape
+    ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
+    block["uneven"] = {
+        index: np.stack(
+            [
+                np.concatenate([projection.apply(np.broadcast_to(image * ramp, shape)), np.zeros(len(scalar_probes))])
+                * shrink
+                for ramp in ramps
+            ]
+        )
+        for index, image in enumerate(maps)
+        if index in uneven and image is not None
+    }
     return block
 
 
@@ -1181,7 +1202,7 @@ def _join(
                 strengths=np.array(variant.strengths),
                 responses=block_responses,
                 since=variant.since,
-                spread=_spread(variant, blocks, starts, len(residual)),
+                spread=_spread(variant, blocks, starts, len(residual), rows[0]),
             )
         )
         chosen.append(variant)
@@ -1215,6 +1236,7 @@ def _join(
         names=names,
         series_of=series_of,
         sd=np.concatenate([block["sd"] for block in blocks]),
+        noise=np.concatenate([block["noise"] for block in blocks]),
         groups=groups,
         group_names=tuple(group_keys),
         parts=parts,
@@ -1232,9 +1254,18 @@ def _join(
 
 
 def _spread(
-    variant: Variant, blocks: Sequence[dict[str, Any]], starts: NDArray[np.intp], size: int
+    variant: Variant, blocks: Sequence[dict[str, Any]], starts: NDArray[np.intp], size: int, row: int
 ) -> NDArray[np.float64] | None:
-    """Random responses a unit of strength: a drifting output moves each lit series' level and trend by chance."""
+    """Random responses (probe, factor) a unit of strength.
+
+    A drifting output moves each lit series' level and trend by chance; a dark that drifts may do so unevenly over the panel.
+    """
+    if variant.effect == "dark_drift":
+        uneven = np.zeros((size, 2))
+        for number, block in enumerate(blocks):
+            if row in block["uneven"]:
+                uneven[starts[number] : starts[number + 1]] = block["uneven"][row].T
+        return uneven * (scales.UNEVEN_SHARE / variant.strengths[0])
     if variant.effect != "output_drift":
         return None
     columns = []

@@ -24,6 +24,8 @@ VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
 POWER = 1.0
 _WORST_PLACES = 30
+_MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
+_VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
 
@@ -213,6 +215,16 @@ def judge(
             verdict = "explained"
     tell("held-out data")
     gap, held_out, shares = _held_out(problem, leading, rng)
+    if leading.effects and leading.effects != (UNKNOWN,) and _leaves_too_much(gap):
+        # the best of the wrong ones: it takes out less of the gap than a law that is off by a third would
+        verdict = "unknown_effect"
+        moved = _VETO * (1.0 - none - unknown)
+        unknown += moved
+        marginal = {effect: (1.0 - _VETO) * probability for effect, probability in marginal.items()}
+        hypotheses = _vetoed(hypotheses)
+        leading = hypotheses[0]
+        tied = []
+        gap, held_out, shares = _held_out(problem, leading, rng)
     named = leading.effects if leading.effects and leading.effects != (UNKNOWN,) else ()
     order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
     listed = set(named) | {effect for item in tied for effect in item.effects}
@@ -286,6 +298,29 @@ def judge(
 def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
     return with_conditions(variant.applied(strength), problem.conditions)
+
+
+def _leaves_too_much(gap: Gap) -> bool:
+    """Whether an explanation leaves more of a clear gap than laws that are off by a third would."""
+    null = max(gap.floor, 1.0)
+    if gap.before < 1.3 * null:
+        return False
+    left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
+    return left > _MOST_LEFT
+
+
+def _vetoed(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Hypotheses with nearly all of the effects' probability moved to an unknown effect."""
+    named = sum(item.probability for item in hypotheses if item.effects and item.effects != (UNKNOWN,))
+    result = []
+    for item in hypotheses:
+        if item.effects == (UNKNOWN,):
+            result.append(replace(item, probability=item.probability + _VETO * named))
+        elif item.effects:
+            result.append(replace(item, probability=(1.0 - _VETO) * item.probability))
+        else:
+            result.append(item)
+    return tuple(sorted(result, key=lambda item: -item.probability))
 
 
 def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:
@@ -371,11 +406,13 @@ def _held_out(
         use = values / sd if chosen is None else (values / sd)[chosen]
         return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
 
-    floor = 1.0
+    # what a repeat of the same measurement would show: counting noise without all that the twin's nuisances allow
+    noise = problem.noise[known]
+    floor = rms(noise)
     rows = []
     for axis in dict.fromkeys(axes):
         chosen = axes == axis
-        rows.append((str(axis), rms(before, chosen), rms(after, chosen), floor))
+        rows.append((str(axis), rms(before, chosen), rms(after, chosen), rms(noise, chosen)))
 
     def share(values: NDArray[np.float64]) -> tuple[float, float, float] | None:
         scale = 1.0 / math.sqrt(2.0 * before.size)
@@ -418,7 +455,11 @@ def _strengths_on(
                 (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
                 np.zeros(len(problem.residual)),
             )
-            part = replace(curve, responses=curve.responses[:, fit], spread=None)
+            part = replace(
+                curve,
+                responses=curve.responses[:, fit],
+                spread=None,
+            )
             result = fit_curve((problem.residual - others)[fit], part, inner, problem.groups[fit])
             strengths[effect] = result.best
     return strengths

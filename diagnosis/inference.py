@@ -284,12 +284,11 @@ def fit_curve(
         for _ in range(3):
             effective = curve.weights(np.array([best]))[0] @ solved
             extra = _law_factors(curve, best, effective, groups, law_error)
-            if extra.shape[1] == 0:
+            own = _inexact(effective, law_error)
+            if extra.shape[1] == 0 and float(own.max()) < _LEAST_FACTOR:
                 break
             # evidence over none: the residual's own terms change with the covariance
-            moved, moved_nodes, wide, shift = _with_law(
-                residual, nodes, nuisances, extra, [effective], LAW_PROBE_SHARE * law_error
-            )
+            moved, moved_nodes, wide, shift = _with_law(residual, nodes, nuisances, extra, own)
             wide_terms = terms(wide, moved_nodes, moved)
             value, quadratic = likelihood(coarse, wide_terms)
             width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
@@ -327,25 +326,26 @@ def _law_factors(
     return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
 
 
+def _inexact(effective: NDArray[np.float64], law_error: float) -> NDArray[np.float64]:
+    """Variance (probe,) that a law's relative error gives each probe of its own."""
+    return np.asarray((LAW_PROBE_SHARE * law_error * effective) ** 2)
+
+
 def _with_law(
     residual: NDArray[np.float64],
     nodes: NDArray[np.float64],
     base: Nuisances,
     factors: NDArray[np.float64],
-    responses: Sequence[NDArray[np.float64]],
-    probe_error: float,
+    inexact: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Nuisances, float]:
     """Residual, nodes and nuisances once an effect's law may be off, and the bare residual's change of log likelihood.
 
     Args:
         residual, nodes, base: as they were.
         factors: what is random in groups (probe, factor).
-        responses: of the effects at their strengths; each probe's own part may be off by `probe_error`.
-        probe_error: relative.
+        inexact: variance of each probe's own (probe,).
     """
-    scale = np.ones(len(residual))
-    for response in responses:
-        scale = scale + (probe_error * response) ** 2
+    scale = 1.0 + inexact
     root = np.sqrt(scale)
     moved, moved_nodes = residual / root, nodes / root
     wide = Nuisances(np.concatenate([base.factors, factors], axis=1) / root[:, None])
@@ -556,10 +556,9 @@ def _states_of(
     effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
     for law_error, probability in law_errors:
         extra = _law_factors(curve, leading.best, effective, groups, law_error)
-        if extra.shape[1]:
-            moved, nodes, wide, shift = _with_law(
-                residual, table.nodes, nuisances, extra, [effective], LAW_PROBE_SHARE * law_error
-            )
+        own = _inexact(effective, law_error)
+        if extra.shape[1] or float(own.max()) >= _LEAST_FACTOR:
+            moved, nodes, wide, shift = _with_law(residual, table.nodes, nuisances, extra, own)
             result.append(state(wide, nodes, moved, shift + math.log(probability)))
     return result
 
@@ -616,9 +615,8 @@ def _fit_pair(
                 )
                 if not extra.shape[1]:
                     break
-                moved, moved_nodes, wide, shift = _with_law(
-                    residual, nodes, nuisances, extra, [effective_a, effective_b], LAW_PROBE_SHARE * law_error
-                )
+                own = _inexact(effective_a, law_error) + _inexact(effective_b, law_error)
+                moved, moved_nodes, wide, shift = _with_law(residual, nodes, nuisances, extra, own)
                 again = _pair_integral(a, b, _pair_terms(wide, moved_nodes, moved), shift + math.log(probability))
                 if again.log_integral > best[0]:
                     best = (again.log_integral, again)

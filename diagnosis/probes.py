@@ -55,13 +55,14 @@ class Template:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scalar:
-    """A scalar probe: axis, name, unit, measured value, its standard deviation."""
+    """A scalar probe: axis, name, unit, measured value, its standard deviation, and the counting noise's part of it."""
 
     axis: str
     name: str
     unit: str
     value: float
     sd: float
+    sampling_sd: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -267,7 +268,8 @@ def measured_scalars(
 
     def add(axis: str, name: str, unit: str, value: float, sampling: float, floor: str) -> None:
         if math.isfinite(value) and math.isfinite(sampling):
-            result.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=math.hypot(sampling, FLOORS[floor])))
+            sd = math.hypot(sampling, FLOORS[floor])
+            result.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=sd, sampling_sd=sampling))
 
     mean_q, mean_w = quantum_mean(base, good)
     if frames > 2:

@@ -101,7 +101,7 @@ def _refined(
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fit_curve(residual, _curve(item, whitener.apply(answer[0])), nuisances, groups)
+        return fit_curve(residual, _curve(item, whitener.apply(answer[0]), fit.curve), nuisances, groups)
 
     inner = [item for item in EFFECTS[variant.effect].parameters[1:] if item.fitted and item.name in variant.parameters]
     here = tried(near(best.parameters, (1.0,)))
@@ -124,16 +124,18 @@ def _refined(
     return (final, answer[0]) if 0 in answer else None
 
 
-def _curve(variant: Variant, responses: NDArray[np.float64]) -> Curve:
+def _curve(variant: Variant, responses: NDArray[np.float64], like: Curve) -> Curve:
+    strengths = np.array(variant.strengths)
     return Curve(
         effect=variant.effect,
         variant=variant.name,
         parameters=dict(variant.parameters),
         low=variant.low,
         high=variant.high,
-        strengths=np.array(variant.strengths),
+        strengths=strengths,
         responses=responses,
         since=variant.since,
+        spread=like.spread,
     )
 
 

@@ -1,8 +1,10 @@
 """Radiation scattered by the object: a broad floor in its shadow, wider the further the detector stands behind it.
 
-    S = c [P (-ln T)] * K,    sum K = 1
+    S = c [a P (-ln T)] * K,    sum K = 1
 
 P is the primary signal and T = P / P_open; photons that the object takes out of the primary beam reappear elsewhere.
+a is the share of its materials' attenuation that is scattering, over that of water, at the beam's mean energy: metal
+absorbs. A pixel that a sharp border cuts scatters as its two sides do.
 K is the picture of a point that scatters into all directions alike, seen on a plane at distance h:
 K(R) = h / (2 pi (h^2 + R^2)^(3/2)), half as high at R = 0.77 h. One law for the air gap: h grows in proportion to the
 gap plus 10 mm (half of a product), and the scattered light in all stays, so that what a field of finite size
@@ -16,11 +18,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...materials import mass_attenuation_cm2_g, mass_photoelectric_cm2_g, material_from_name
+from .._fine_picture import find_borders
 from ..line_state import LineContext, LineState, needed
 from .effect import Effect, Parameter
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0
+_BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a pixel cannot be told by its mean
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
 
 
@@ -76,6 +81,52 @@ def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) 
     return row_back @ spread @ column_back.T, centre
 
 
+def _mean_energy_keV(context: LineContext) -> float:
+    """Mean energy of the open beam's signal, keV."""
+    if context.weights is None or context.energies_keV is None:
+        return 30.0
+    weights = context.weights[0]
+    return float(weights @ context.energies_keV[: weights.size] / weights.sum())
+
+
+def _scattering_share(context: LineContext) -> NDArray[np.float64]:
+    """Scattering's share of attenuation (row, column), or (1, 1), over that of water, at the beam's mean energy."""
+    thickness = context.request.thickness_mm
+    if not thickness or context.weights is None or context.energies_keV is None or context.model is None:
+        return np.ones((1, 1))
+    energy_keV = _mean_energy_keV(context)
+    water = _albedo("water_liquid", energy_keV)
+    at = int(np.searchsorted(context.energies_keV, energy_keV))
+    whole, scattered = 0.0 * np.ones(context.shape), 0.0 * np.ones(context.shape)
+    for name, length_mm in thickness.items():
+        depth = float(context.model.mu(name)[at]) * np.asarray(length_mm, dtype=np.float64)
+        whole = whole + depth
+        scattered = scattered + _albedo(name, energy_keV) / water * depth
+    return np.where(whole > 0, scattered / np.maximum(whole, 1e-30), 1.0)
+
+
+@lru_cache(maxsize=256)
+def _albedo(name: str, energy_keV: float) -> float:
+    """Share of a material's attenuation that is scattering (Compton and Rayleigh)."""
+    material = material_from_name(name)
+    total = float(mass_attenuation_cm2_g(material, energy_keV))
+    return 1.0 - float(mass_photoelectric_cm2_g(material, energy_keV)) / total
+
+
+def _shared_at_borders(
+    field: NDArray[np.float64], signal: NDArray[np.float64], depth: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The field (k, row, column) with pixels that a sharp border cuts shared between the values on either side."""
+    borders = find_borders(depth, least_depth=_BORDER_DEPTH)
+    if not borders.pixel.size:
+        return field
+    flat, bright = field.reshape(len(field), -1).copy(), signal.ravel()
+    thick, thin = bright[borders.thick], bright[borders.thin]
+    covered = np.clip((thin - bright[borders.pixel]) / np.maximum(thin - thick, 1e-30), 0.0, 1.0)
+    flat[:, borders.pixel] = covered * flat[:, borders.thick] + (1.0 - covered) * flat[:, borders.thin]
+    return flat.reshape(field.shape)
+
+
 def _add_scatter(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if not context.has_scene or parameters["strength"] == 0 or context.weights is None or context.model is None:
         return state
@@ -93,9 +144,11 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     shape = np.broadcast_shapes(state.signal_DN.shape, context.shape)
     signal = np.broadcast_to(state.signal_DN, shape)
     depth = -np.log(np.maximum(signal / context.open_signal_DN, 1e-12))
-    field = np.stack([signal * depth, np.broadcast_to(state.variance_DN2, shape) * depth])
+    source = depth * _scattering_share(context)
+    field = np.stack([signal * source, np.broadcast_to(state.variance_DN2, shape) * source])
+    field = _shared_at_borders(field, signal, depth)
     scattered, _ = _spread(field, pitch, half_height)
-    _, centre = _spread(field[:1, :, :], pitch, at_usual_gap)
+    _, centre = _spread(field[:1], pitch, at_usual_gap)
     weights = context.weights[0]
     top = weights.size
     water = context.model.mu("water_liquid")[:top]

@@ -12,7 +12,9 @@ from raytwin.calibration.noise_covariance import compute_noise_covariance, fit_s
 from raytwin.calibration.photon_transfer import median_variance
 from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
-from raytwin.generator.twin import Level, estimate_from_sd
+from raytwin.generator.psf import blur_variance_share
+from raytwin.generator.twin import Estimate, Level, NoiseModel, estimate_from_sd
+from raytwin.generator.twin_spectrum import slope_over_gain
 
 SMALL = (24, 24)
 
@@ -96,3 +98,51 @@ def test_shares_of_two_other_tables_exclude_each_other():
     # 512 draws: 0.033 for a correlation of -0.5, 3 % for a standard deviation
     assert np.corrcoef(first, second)[0, 1] == pytest.approx(SHARES_CORRELATION, abs=0.12)
     assert [first.std(), second.std()] == pytest.approx([TABLE_SHARE.sd] * 2, rel=0.15)
+
+
+def levels_with(slope_of_gain, gains):
+    return [
+        Level(
+            kV=40.0 + 10.0 * number,
+            filters=(),
+            gain_DN=estimate_from_sd(gain, 0.01),
+            photon_transfer_slope_DN=estimate_from_sd(slope_of_gain(gain), 0.01),
+            rate_DN_per_mAs=None,
+            source_detector_mm=None,
+            saturation_DN=None,
+            flat_shape=np.ones((1, 1), dtype=np.float32),
+            series=(f"{number}",),
+            role="calibration",
+        )
+        for number, gain in enumerate(gains)
+    ]
+
+
+def noise_of(sigma_px):
+    return NoiseModel(
+        psf_model="aperture",
+        psf_sigma_px=Estimate(value=sigma_px, low=sigma_px, high=sigma_px),
+        white_fraction=0.01,
+        read_noise_DN=estimate_from_sd(1.0, 0.01),
+        quantised=True,
+    )
+
+
+def test_white_noise_of_secondary_quanta_is_the_same_in_every_beam():
+    share = blur_variance_share("aperture", 0.7)
+    secondary = 0.02
+
+    def slope(gain):
+        return share * (gain - secondary) + secondary
+
+    found = slope_over_gain(levels_with(slope, [4.0, 6.0]), noise_of(0.7), np.array([3.5, 4.9, 8.0]))
+    assert found is not None
+    # the mean of the levels' ratios stands for that at their mean gain: right to second order in 1 % of white noise
+    assert found == pytest.approx([slope(gain) / gain for gain in (3.5, 4.9, 8.0)], rel=1e-3)
+    assert found[0] > found[2]
+
+
+def test_a_slope_that_no_secondary_quanta_explain_keeps_one_ratio_to_the_gain():
+    found = slope_over_gain(levels_with(lambda gain: 0.5 * gain, [4.0, 6.0]), noise_of(0.9), np.array([3.0, 9.0]))
+    assert found == pytest.approx([0.5, 0.5])
+    assert slope_over_gain([], noise_of(0.9), np.array([3.0])) is None

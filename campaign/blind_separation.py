@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..diagnosis.inference import node_weights
 from .blind_statistics import CurveKey, SessionStatistics
 
 _GRID = 61  # strengths of a competitor, evenly in the logarithm
@@ -119,18 +120,8 @@ def matched_filter(statistics: SessionStatistics, *, bare: bool) -> dict[str, fl
 
 
 def _weights(curve: CurveKey, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights (strength, node) of a curve's nodes at strengths: a parabola through zero and the two nearest nodes."""
-    nodes = np.array(curve.strengths)
-    result = np.zeros((len(strengths), len(nodes)))
-    if len(nodes) == 1:
-        result[:, 0] = strengths / nodes[0]
-        return result
-    right = np.clip(np.searchsorted(nodes, strengths), 1, len(nodes) - 1)
-    a, b = nodes[right - 1], nodes[right]
-    row = np.arange(len(strengths))
-    result[row, right - 1] = strengths * (strengths - b) / (a * (a - b))
-    result[row, right] = strengths * (strengths - a) / (b * (b - a))
-    return result
+    """Weights (strength, node) of a curve's nodes at strengths."""
+    return node_weights(np.array(curve.strengths), strengths)
 
 
 def _tangent(statistics: SessionStatistics, curve: CurveKey, strength: float) -> NDArray[np.float64]:

@@ -676,7 +676,7 @@ def build_problem(
                 maps,
                 scalars,
                 thicker,
-                frozenset(index for index, change in enumerate(all_changes) if change.label == "dark_drift"),
+                frozenset(index for index, change in enumerate(all_changes) if change.label in scales.UNEVEN),
                 shape,
             )
         )
@@ -884,6 +884,32 @@ def _pattern_noise(
     return max(pixel, 1e-12), max(block, 1e-12)
 
 
+def _smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Cubic surface (row, column) through the medians of blocks: what map probes hold, and what is no pixel's own."""
+    rows, columns = residual.shape
+    if min(rows, columns) < 5 * BLOCK_PX:
+        return np.zeros(residual.shape)
+    whole = residual[: rows - rows % BLOCK_PX, : columns - columns % BLOCK_PX]
+    inside = mask[: whole.shape[0], : whole.shape[1]]
+    part = np.where(inside, whole, np.nan).reshape(
+        whole.shape[0] // BLOCK_PX, BLOCK_PX, whole.shape[1] // BLOCK_PX, BLOCK_PX
+    )
+    filled = np.moveaxis(part, 1, 2).reshape(part.shape[0], part.shape[2], -1)
+    known = np.count_nonzero(np.isfinite(filled), axis=-1) > BLOCK_PX**2 // 2
+    if np.count_nonzero(known) < 16:
+        return np.zeros(residual.shape)
+    medians = np.nanmedian(filled[known], axis=-1)
+
+    def terms(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, x**3, y**3], axis=-1)
+
+    centre = 0.5 * (BLOCK_PX - 1)
+    block_y, block_x = (np.asarray(index * BLOCK_PX + centre, dtype=np.float64) for index in np.nonzero(known))
+    solved = np.linalg.lstsq(terms(2.0 * block_y / rows - 1.0, 2.0 * block_x / columns - 1.0), medians, rcond=None)[0]
+    y, x = np.meshgrid(2.0 * np.arange(rows) / rows - 1.0, 2.0 * np.arange(columns) / columns - 1.0, indexing="ij")
+    return np.asarray(terms(y, x) @ solved)
+
+
 def _pattern_statistics(
     residual: NDArray[np.float64],
     projection: MapProjection,
@@ -895,6 +921,7 @@ def _pattern_statistics(
     """Pixel-to-pixel and block variance of a flat's or dark's residual map, and how many good pixels stand out."""
     if kind not in ("flat", "dark"):
         return None, None, None
+    residual = residual - _smooth_part(residual, clean)
     pair = clean[:, 1:] & clean[:, :-1]
     step = (residual[:, 1:] - residual[:, :-1])[pair]
     pixel = float(np.mean(step**2)) / 2.0
@@ -933,6 +960,7 @@ def _new_outliers(
             signal = np.broadcast_to(expected[item.name].signal_DN, shape)
             residual = residual / np.where(good, gain, 1.0)
             residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
+        residual = residual - _smooth_part(residual, good)
         centre = float(np.median(residual[good]))
         spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
         outlying |= np.abs(residual - centre) > 8.0 * max(spread, 1e-9)
@@ -1003,7 +1031,7 @@ def _block(
         if image is not None and values is not None:
             responses[index] = _standardised(block, base_scalars, image, values, shape)
     block["responses"] = responses
-    # a panel seldom warms evenly: what drifts may drift more on one side
+    # a panel seldom warms evenly, and no anode's heel is a straight line
     rows, columns = shape
     ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
     block["uneven"] = {
@@ -1258,9 +1286,9 @@ def _spread(
 ) -> NDArray[np.float64] | None:
     """Random responses (probe, factor) a unit of strength.
 
-    A drifting output moves each lit series' level and trend by chance; a dark that drifts may do so unevenly over the panel.
+    A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel.
     """
-    if variant.effect == "dark_drift":
+    if variant.effect in scales.UNEVEN:
         uneven = np.zeros((size, 2))
         for number, block in enumerate(blocks):
             if row in block["uneven"]:

@@ -74,7 +74,8 @@ SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken
 READ_NOISE_SD = 0.005
 TILT_SD = 0.0005  # of the field's gradient between series
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
-UNEVEN_SHARE = 0.3  # of a dark's drift: how much more of it there may be on one side of the panel
+UNEVEN = frozenset(("dark_drift", "heel"))
+UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
 DARK_SD_DN = 0.05  # of the dark between series
 
 

@@ -16,6 +16,7 @@ from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
+from .plan import best_repeat
 from .refine import refine
 from .session import calibrating_names
 from .whitening import Whitening
@@ -286,7 +287,7 @@ def judge(
         gap=gap,
         held_out=held_out,
         ambiguous_with=tuple(pairs) if verdict == "ambiguous" else (),
-        next_measurement=None,
+        next_measurement=_next_measurement(problem, tied) if verdict == "ambiguous" else None,
         twin=improved,
         added=added,
         named=tuple(named),
@@ -298,6 +299,29 @@ def judge(
 def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
     return with_conditions(variant.applied(strength), problem.conditions)
+
+
+def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[str, Any] | None:
+    """Which series to take again to tell the two likeliest explanations apart, found from the forward model and its noise."""
+    if len(tied) < 2:
+        return None
+    first, second = (
+        {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
+    )
+    found = best_repeat(problem, first, second)
+    if found is None:
+        return None
+    names = [" and ".join(item.effects) for item in tied[:2]]
+    return {
+        "text": (
+            f"take {found.series} again with {found.times} times as many frames: {names[0]} and {names[1]} would lie"
+            f" {found.separation_then:.1f} standard deviations apart instead of {found.separation:.1f}"
+        ),
+        "separates": sorted({effect for item in tied[:2] for effect in item.effects}),
+        "series": found.series,
+        "separation": found.separation,
+        "separation_then": found.separation_then,
+    }
 
 
 def _leaves_too_much(gap: Gap) -> bool:

@@ -28,10 +28,31 @@ LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
+PAIR_DOUBT = 2e-3  # share of the stronger effect's log evidence that a second effect must bring
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
 UNKNOWN_SHARE = 0.1  # of the groups of probes in which an effect outside the catalogue shows
 _SWEEPS = 4
+
+
+def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
+    points = np.concatenate([[0.0], nodes])
+    result = np.zeros((len(strengths), len(nodes)))
+    used = min(len(points), 4)
+    # the interval's two points and their neighbours; the point 0 adds nothing
+    first = np.clip(np.searchsorted(points, strengths) - used // 2, 0, len(points) - used)
+    row = np.arange(len(strengths))
+    for i in range(used):
+        at = first + i
+        weight = np.ones(len(strengths))
+        for j in range(used):
+            if j != i:
+                other = points[first + j]
+                weight *= (strengths - other) / (points[at] - other)
+        inner = at > 0
+        result[row[inner], at[inner] - 1] = weight[inner]
+    return result
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,24 +79,7 @@ class Curve:
 
     def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights (strength, node) with which the nodes' responses add up at given strengths."""
-        nodes = self.strengths
-        s = np.atleast_1d(np.asarray(strength, dtype=np.float64))
-        points = np.concatenate([[0.0], nodes])
-        result = np.zeros((len(s), len(nodes)))
-        used = min(len(points), 4)
-        # the interval's two points and their neighbours; the point 0 adds nothing
-        first = np.clip(np.searchsorted(points, s) - used // 2, 0, len(points) - used)
-        row = np.arange(len(s))
-        for i in range(used):
-            at = first + i
-            weight = np.ones(len(s))
-            for j in range(used):
-                if j != i:
-                    other = points[first + j]
-                    weight *= (s - other) / (points[at] - other)
-            inner = at > 0
-            result[row[inner], at[inner] - 1] = weight[inner]
-        return result
+        return node_weights(self.strengths, np.atleast_1d(np.asarray(strength, dtype=np.float64)))
 
     def response(self, strength: float) -> NDArray[np.float64]:
         """Response (probe,) at one strength."""
@@ -486,6 +490,8 @@ def weigh_hypotheses(
             )
             # the first's own variants were averaged above; its best stands for them
             evidence += evidence_of[first] - leading.log_evidence
+            # what a law that is slightly off leaves of a strong effect, any second effect can take up a little of
+            evidence -= PAIR_DOUBT * max(evidence_of[first], evidence_of[second], 0.0)
             raw.append((key, evidence, math.log(priors.pair / n_pairs), strengths, chosen, ""))
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names

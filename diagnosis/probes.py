@@ -39,6 +39,7 @@ FLOORS: Mapping[str, float] = {
     "afterglow": 2e-5,
     "codes": 0.03,
     "fixed_pattern": 0.05,
+    "fixed_pattern blocks": 1.0,  # a pattern's grain is its own: white in the model, coarser in some panels
     "outliers": 0.3,
 }
 
@@ -408,7 +409,7 @@ def measured_scalars(
                 "1",
                 math.log(max(block_pattern_DN2, 1e-12) / context.block_noise_DN2),
                 math.sqrt(3.0 * BLOCK_PX**2 / n_good),
-                "fixed_pattern",
+                "fixed_pattern blocks",
             )
     if outliers is not None and not context.calibrates:
         add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")

@@ -32,6 +32,7 @@ NONLINEARITY = Effect(
             default=1.0,
             source="departure from the initial line at half of the highest level",
             log=False,
+            signed=True,
         ),
         Parameter(
             name="highest_signal_DN",

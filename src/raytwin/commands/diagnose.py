@@ -7,12 +7,17 @@ diagnosis.json, report.html and twin.h5 (the twin with the effect added) into th
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ._answer import answer, jsonable, say
+
+if TYPE_CHECKING:
+    from ..generator.twin import Twin
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol full --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o diagnosis
+  raytwin diagnose session.h5 -o plan --plan
 """
 
 
@@ -25,6 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="folder of the answer")
     parser.add_argument(
         "--without", metavar="ID", action="append", default=[], help="leave an effect out of the catalogue; repeatable"
+    )
+    parser.add_argument(
+        "--plan",
+        action="store_true",
+        help="say which effects these series could tell apart, whatever the frames show, and write no diagnosis",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random draws (default 0)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -51,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output.exists() and not arguments.output.is_dir():
         raise InputError("-o", received=f"{arguments.output}, a file", expected="a folder, which may not exist yet")
     twin = None if arguments.twin is None else read_twin(arguments.twin)
+    if arguments.plan:
+        return _plan(arguments, twin)
     with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         result = diagnose(
             acquisition,
@@ -75,4 +87,41 @@ def run(arguments: argparse.Namespace) -> int:
     with whole_file(arguments.output / "diagnosis.json") as temporary:
         temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     answer(data, as_json=arguments.json, text=f"{paragraph(result)}\nreport: {arguments.output / 'report.html'}")
+    return 0
+
+
+def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
+    """`--plan`: the distinguishability matrix of the session's series."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from ..acquisition import open_acquisition
+    from ..diagnosis.assemble import build_problem
+    from ..diagnosis.changes import catalogue_variants
+    from ..diagnosis.diagnose import calibrated_twin
+    from ..diagnosis.plan import distinguishability, table_text
+    from ..files import whole_file
+
+    with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
+        known = twin or calibrated_twin(acquisition, rng=np.random.default_rng(arguments.seed))
+        problem = build_problem(
+            acquisition,
+            known,
+            variants=catalogue_variants(without=arguments.without),
+            calibrated_elsewhere=twin is not None,
+            progress=bar.set_description_str,
+        )
+    found = distinguishability(problem)
+    data = {
+        "effects": list(found.effects),
+        "strengths": found.strengths.tolist(),
+        "from_none": found.from_none.tolist(),
+        "between": found.between.tolist(),
+        "cannot_be_judged": dict(problem.missing_effects),
+    }
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    with whole_file(arguments.output / "plan.json") as temporary:
+        temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    missing = [f"{effect} cannot be judged: {reason}" for effect, reason in problem.missing_effects.items()]
+    answer(data, as_json=arguments.json, text="\n".join([table_text(found), *missing]))
     return 0

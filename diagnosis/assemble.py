@@ -38,7 +38,7 @@ from .probes import (
 )
 from .registration import Placement, gradient, register, render_variance
 from .session import SessionSeries, read_session
-from .summaries import BLOCK_PX, SeriesSummary, summarise_series
+from .summaries import BLOCK_PX, LAGS, SeriesSummary, summarise_series
 
 Map = NDArray[np.float32]
 _CACHE_BYTES = 200_000_000
@@ -1103,6 +1103,19 @@ def _local_nuisances(
     result[f"gain of {beam}"] = of_scalars(
         lambda probe: scales.GAIN_OF_BEAM_SD if probe.name.startswith("log_variance") else 0.0
     )
+
+    def texture(lag: tuple[int, int]) -> NDArray[np.float64]:
+        ending = f"({lag[0]},{lag[1]})"
+        return of_scalars(
+            lambda probe: (
+                scales.TEXTURE_SD if probe.name.startswith("correlation") and probe.name.endswith(ending) else 0.0
+            )
+        )
+
+    for lag in LAGS:
+        # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
+        result[f"texture {lag}"] = texture(lag)
+        result[f"texture {lag} at {series.kV:g} kV"] = scales.TEXTURE_OF_BEAM_SHARE * texture(lag)
     if series.kind == "object":
         dy, dx = gradient(signal)
         scene = series.scene

@@ -15,6 +15,7 @@ from .inference import Curve, Nuisances
 from .whitening import Whitening
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm
+_CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
 
@@ -124,13 +125,18 @@ def best_repeat(
 
 
 def table_text(found: Distinguishability) -> str:
-    """The matrix as text, one row an effect: detection, and the effects from which it is less than 5 sd away."""
-    lines = [f"{'effect':<18}{'strength':>9}{'from none':>11}   not told apart (separation below 5)"]
+    """The matrix as text, one row an effect: detection, and the effects from which it is not clearly apart."""
+    lines = [f"{'effect':<18}{'strength':>9}{'from none':>11}   not told apart (separation below {_CLEAR:g})"]
     for row, effect in enumerate(found.effects):
+        if found.from_none[row] < _CLEAR:
+            lines.append(
+                f"{effect:<18}{found.strengths[row]:>9.3g}{found.from_none[row]:>11.1f}   not seen at this strength"
+            )
+            continue
         near = [
             f"{other} {found.between[row, column]:.1f}"
             for column, other in enumerate(found.effects)
-            if column != row and found.between[row, column] < 5.0
+            if column != row and found.between[row, column] < _CLEAR
         ]
         lines.append(
             f"{effect:<18}{found.strengths[row]:>9.3g}{found.from_none[row]:>11.1f}   {', '.join(near) or '-'}"

@@ -17,7 +17,7 @@ from ..generator.effects.effect import Parameter
 from .changes import Variant
 from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve
 
-REFINED_FROM = 6.0  # separation from none from which the grid's coarseness matters
+REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
 _ROUNDS = 3
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
@@ -69,7 +69,8 @@ def refine(
             curve = hypothesis.variants[effect]
             fit = fit_curve(rest, curve, nuisances, groups)
             done.add(effect)
-            if fit.separation < REFINED_FROM:
+            response = curve.response(fit.best)
+            if float(response @ nuisances.solve(response)) < REFINED_FROM**2:
                 continue
             found = _refined(variants[effect, curve.variant], fit, rest, nuisances, groups, respond, whitener)
             if found is not None:

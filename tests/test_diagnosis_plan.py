@@ -1,0 +1,140 @@
+"""What a measurement set can tell apart, refinement and veto, on problems whose truth is planted."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.diagnose import Gap, _leaves_too_much
+from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
+from raytwin.diagnosis.plan import best_repeat, distinguishability, table_text
+from raytwin.diagnosis.refine import refine
+
+PROBES = 60
+
+
+def curve(effect, direction, *, low=1.0, high=100.0):
+    return Curve(
+        effect=effect,
+        variant="",
+        parameters={},
+        low=low,
+        high=high,
+        strengths=np.array([10.0]),
+        responses=10.0 * np.asarray(direction)[None, :],
+    )
+
+
+def axis(*places):
+    result = np.zeros(PROBES)
+    result[list(places)] = 1.0
+    return result
+
+
+def problem(curves, *, factors=None, noise=1.0):
+    return SimpleNamespace(
+        residual=np.zeros(PROBES),
+        factors=np.zeros((PROBES, 1)) if factors is None else factors,
+        blocks=np.repeat([0, 1, 2], PROBES // 3),
+        series_of=np.repeat([0, 1, 2], PROBES // 3),
+        noise=np.full(PROBES, noise),
+        curves=tuple(curves),
+        views=[SimpleNamespace(session=SimpleNamespace(name=f"series {number}")) for number in range(3)],
+    )
+
+
+def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_ones_not_at_all():
+    found = distinguishability(
+        problem([curve("glare", axis(0)), curve("scatter", axis(1)), curve("drift", 2.0 * axis(0), high=1000.0)])
+    )
+    assert found.from_none == pytest.approx([10.0, 10.0, 2.0 * np.sqrt(1000.0)])
+    assert found.between[0, 1] == pytest.approx(10.0, rel=0.01)
+    # at another strength the parallel effect comes as near as the grid of strengths allows
+    assert found.between[0, 2] < 1.0
+    text = table_text(found)
+    assert "drift" in text.splitlines()[1]
+    assert text.splitlines()[2].endswith("-")
+
+
+def test_a_nuisance_along_an_effect_takes_its_separation():
+    bare = distinguishability(problem([curve("glare", axis(0)), curve("scatter", axis(1))]))
+    held = distinguishability(
+        problem([curve("glare", axis(0)), curve("scatter", axis(1))], factors=7.0 * axis(0)[:, None])
+    )
+    assert held.from_none[0] == pytest.approx(bare.from_none[0] / np.sqrt(50.0), rel=1e-6)
+    assert held.from_none[1] == pytest.approx(bare.from_none[1], rel=1e-6)
+
+
+def test_the_series_that_holds_the_difference_is_the_one_to_repeat():
+    first, second = curve("glare", axis(0, 25)), curve("scatter", axis(0))
+    found = best_repeat(problem([first, second]), {"glare": (first, 10.0)}, {"scatter": (second, 10.0)})
+    assert found is not None
+    assert found.series == "series 1"
+    assert found.separation == pytest.approx(10.0)
+    # four times the frames halve a standard deviation that is all counting noise
+    assert found.separation_then == pytest.approx(20.0)
+    stiff = best_repeat(problem([first, second], noise=0.0), {"glare": (first, 10.0)}, {"scatter": (second, 10.0)})
+    assert stiff is not None
+    assert stiff.separation_then == pytest.approx(stiff.separation)
+    assert best_repeat(problem([first]), {"glare": (first, 10.0)}, {"glare": (first, 10.0)}) is None
+
+
+def test_nodes_are_joined_by_cubics():
+    nodes = np.array([0.5, 1.0, 2.0, 4.0])
+    at = np.array([0.2, 0.7, 1.5, 3.0, 4.5])
+    assert node_weights(nodes, at) @ (nodes**3 - nodes) == pytest.approx(at**3 - at)
+
+
+def test_refinement_finds_an_inner_parameter_between_the_grid_s():
+    x = np.linspace(0.0, 3.0, PROBES)
+
+    def law(length_mm, strength):
+        return 40.0 * strength * np.exp(-((x - np.log(length_mm)) ** 2))
+
+    def answer(asked):
+        return {
+            number: np.stack([law(item.parameters["length_mm"], strength) for strength in item.strengths])
+            for number, item in enumerate(asked)
+        }
+
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    lengths = [item.parameters["length_mm"] for item in variants]
+    true = float(np.sqrt(lengths[0] * lengths[-1]))
+    residual = law(true, 2.0) + np.random.default_rng(1).standard_normal(PROBES)
+    curves = [
+        Curve(
+            effect=item.effect,
+            variant=item.name,
+            parameters=item.parameters,
+            low=item.low,
+            high=item.high,
+            strengths=np.array(item.strengths),
+            responses=answer([item])[0],
+        )
+        for item in variants
+    ]
+    nuisances = Nuisances(np.zeros((PROBES, 1)))
+    groups = np.zeros(PROBES, dtype=np.intp)
+    hypotheses = weigh_hypotheses(residual, curves=curves, nuisances=nuisances, groups=groups, group_names=("all",))
+    found = refine(
+        hypotheses,
+        variants={(item.effect, item.name): item for item in variants},
+        residual=residual,
+        nuisances=nuisances,
+        groups=groups,
+        respond=answer,
+        whitener=SimpleNamespace(apply=lambda vectors: vectors),
+    )
+    assert len(found) == 1
+    closer, responses = found[0]
+    assert abs(np.log(closer.parameters["length_mm"] / true)) < 0.5 * abs(np.log(lengths[0] / true))
+    assert responses.shape == (3, PROBES)
+    assert closer.strengths[1] == pytest.approx(2.0, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "vetoed"), [(30.0, 16.0, True), (30.0, 4.0, False), (1.1, 1.05, False), (2.5, 1.0, False)]
+)
+def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
+    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None)) is vetoed

@@ -284,6 +284,36 @@ def test_there_is_no_scatter_without_an_object(series_line):
     np.testing.assert_array_equal(found.mean_DN, expect(series_line, asked).mean_DN)
 
 
+def test_an_opaque_plate_scatters_next_to_nothing_whatever_its_border_s_pixels_let_through(series_line):
+    plate = np.zeros(SHAPE)
+    plate[:, 20:] = 5.0
+    plate[:, 19] = 2.0  # the border cuts these pixels
+    asked = request(kind="object", thickness_mm={"W": plate})
+    extra = expect(series_line, asked, applied("object_scatter", 20.0)).signal_DN
+    extra = extra - expect(series_line, asked).signal_DN
+    open_DN = float(np.max(expect(series_line, request()).signal_DN))
+    slab = request(kind="object", thickness_mm={"water_liquid": np.full(SHAPE, 20.0)})
+    of_water = (
+        expect(series_line, slab, applied("object_scatter", 20.0)).signal_DN - expect(series_line, slab).signal_DN
+    )
+    assert float(of_water.min()) > 0.003 * open_DN
+    assert float(np.abs(extra).max()) < 1e-3 * float(of_water.max())
+
+
+def test_a_metal_scatters_less_than_water_that_attenuates_as_much(series_line):
+    beam = expect(series_line, request()).signal_DN
+
+    def behind(material, length_mm):
+        asked = request(kind="object", thickness_mm={material: np.full(SHAPE, length_mm)})
+        primary = expect(series_line, asked).signal_DN
+        more = expect(series_line, asked, applied("object_scatter", 20.0)).signal_DN - primary
+        return float(-np.log(primary / beam).mean()), float((more / primary).mean())
+
+    water_depth, of_water = behind("water_liquid", 20.0)
+    steel_depth, of_steel = behind("Fe", 0.3)
+    assert of_steel / steel_depth < 0.3 * of_water / water_depth
+
+
 def test_scatter_without_a_known_gap_is_refused(series_line):
     nowhere = replace(series_line, instrument=replace(series_line.instrument, source_object_mm=None))
     asked = request(**BEHIND, source_object_mm=None)

@@ -70,10 +70,10 @@ def paragraph(diagnosis: Diagnosis) -> str:
             text += f" To tell them apart: {diagnosis.next_measurement['text']}."
         return text
     leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
-    named = " and ".join(
-        f"{title_of(cause.effect)} of {strength_text(cause)} (probability {cause.probability:.2f})" for cause in leading
+    named = "; ".join(
+        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}" for cause in leading
     )
-    text = f"{where} {named[:1].upper()}{named[1:]} explain{'s' if len(leading) == 1 else ''} it. {figures}"
+    text = f"{where} It is explained by: {named}. {figures}"
     if gap.shrinks_by is not None:
         text += (
             f" and falls to {gap.after:.2f} once that is added, by {_percent(gap.shrinks_by)} of what is above noise."

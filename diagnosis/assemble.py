@@ -1132,6 +1132,9 @@ def _local_nuisances(
             result[f"edges, {label}, of {place}"] = column_of
             # the pixels that an edge cuts are not rendered quite alike for different beams
             result[f"edges, {label}, of {series.name}"] = scales.EDGE_OF_SERIES * column_of
+            # nor quite truly anywhere, and not the same where a pixel is another size in the object
+            result[f"edges, {label}"] = scales.EDGE_OF_ALL * column_of
+            result[f"edges, {label}, at {series.source_object_mm or 0:g}"] = scales.EDGE_OF_ALL * column_of
         for number, field in enumerate(_rough_edges(dy, dx, place)):
             result[f"rough edge {number} of {place}"] = of_map(field)
         for material, (moved, values) in thicker.items():

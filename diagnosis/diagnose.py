@@ -23,7 +23,7 @@ from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
-POWER = 1.0
+POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more

@@ -41,16 +41,16 @@ def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(signal_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True) -> NDArray[np.float64]:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
-    In the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
+    far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
     else: a share of the range within some pixels stays open.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
     result = np.zeros(signal_DN.shape)
-    for size, share in ((3, RENDER_SHARE), *_FAR_SHARES):
+    for size, share in ((3, RENDER_SHARE), *(_FAR_SHARES if far else ())):
         local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
         result = np.maximum(result, share * local)
     return np.asarray(result**2, dtype=np.float64)
@@ -106,7 +106,7 @@ def register(
         for image, model, noise in zip(filled, expected, variance, strict=True):
             moved = resample(image, placement)
             dy, dx = gradient(model)
-            doubt = render_variance(model) * (caution / RENDER_SHARE) ** 2
+            doubt = render_variance(model, far=False) * (caution / RENDER_SHARE) ** 2
             weight = (inner / (noise + doubt))[inner] * share
             design = np.stack([dy[inner], dx[inner]])
             level = np.asarray(model, dtype=np.float64)[inner]

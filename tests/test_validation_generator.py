@@ -49,7 +49,7 @@ def test_classifiers_see_a_change_of_texture_and_nothing_where_there_is_none(cla
         if way == "statistics":
             train, test = ([classifiers.statistics_of(one) for one in part] for part in (train, test))
             return classifiers.auc(*classifiers.logistic_scores(train, test))
-        return classifiers.auc(*classifiers.network_scores(train, test, epochs=4, seed=1))
+        return classifiers.auc(*classifiers.network_scores(train, test, epochs=12, seed=1))
 
     assert auc_of((False, True)) > 0.9
     # 300 against 300 without difference: standard error 0.024

@@ -25,6 +25,7 @@ VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
 POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
+_STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
@@ -240,7 +241,7 @@ def judge(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
-                strength=best.strengths[effect],
+                strength=_with_law_error(best.strengths[effect]),
                 unit=EFFECTS[effect].strength.unit,
                 parameters=dict(curve.parameters),
                 sign=variant.sign,
@@ -299,6 +300,13 @@ def judge(
 def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
     return with_conditions(variant.applied(strength), problem.conditions)
+
+
+def _with_law_error(strength: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength."""
+    value, low, high = strength
+    below, above = (math.hypot(math.log(one / value), 1.96 * _STRENGTH_LAW_SD) for one in (low, high))
+    return value, value * math.exp(-below), value * math.exp(above)
 
 
 def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[str, Any] | None:

@@ -8,7 +8,6 @@ residuals of series that the nuisances' fit did not see, both ways round, as the
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import Problem, build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
+from ..diagnosis.diagnose import folds_of
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 
@@ -58,7 +58,7 @@ def shrinkage(problem: Problem, response: NDArray[np.float64]) -> dict[str, floa
 
     None where the gap is no more than three standard errors above noise.
     """
-    folds = _folds(problem)[problem.series_of]
+    folds = folds_of(problem)[problem.series_of]
     squares = np.full((2, len(problem.residual)), np.nan)
     for fold in (0, 1):
         fit = folds != fold
@@ -103,18 +103,6 @@ def _variant(item: AppliedEffect) -> Variant:
         strengths=(size,),
         options=dict(item.options),
     )
-
-
-def _folds(problem: Problem) -> NDArray[np.intp]:
-    """Fold 0 or 1 of each series: alternating in time within each kind, scene and tube voltage."""
-    counts: dict[tuple[Any, ...], int] = {}
-    folds = []
-    for view in problem.views:
-        series = view.session.series
-        key = (series.kind, series.scene.rstrip("0123456789"), series.kV if series.kind != "dark" else None)
-        counts[key] = counts.get(key, -1) + 1
-        folds.append(counts[key] % 2)
-    return np.array(folds, dtype=np.intp)
 
 
 def _left_over(problem: Problem, residual: NDArray[np.float64], fit: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -123,20 +123,8 @@ class Problem:
 
     def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
-        curves = [
-            Curve(
-                effect=variant.effect,
-                variant=variant.name,
-                parameters=dict(variant.parameters),
-                low=variant.low,
-                high=variant.high,
-                strengths=np.array(variant.strengths),
-                responses=responses,
-                since=variant.since,
-                spread=next((item.spread for item in self.curves if item.effect == variant.effect), None),
-            )
-            for variant, responses in more
-        ]
+        spreads = {item.effect: item.spread for item in reversed(self.curves)}
+        curves = [variant.curve(responses, spreads.get(variant.effect)) for variant, responses in more]
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
         )
@@ -1236,19 +1224,7 @@ def _join(
         if not float(np.max(np.abs(block_responses))) > 1e-3:
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
-        curves.append(
-            Curve(
-                effect=variant.effect,
-                variant=variant.name,
-                parameters=dict(variant.parameters),
-                low=variant.low,
-                high=variant.high,
-                strengths=np.array(variant.strengths),
-                responses=block_responses,
-                since=variant.since,
-                spread=_spread(variant, blocks, starts, len(residual), rows[0]),
-            )
-        )
+        curves.append(variant.curve(block_responses, _spread(variant, blocks, starts, len(residual), rows[0])))
         chosen.append(variant)
     for curve in curves:
         missing.pop(curve.effect, None)

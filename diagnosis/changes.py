@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..calibration.priors import ATTENUATION_SCALE, PRIORS, UNDECLARED_SCINTILLATOR
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.twin import Estimate, Twin
+from .inference import Curve
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 # where the mean is linear in the strength one is enough, where it nearly is two
@@ -99,6 +100,20 @@ class Variant:
     high: float
     strengths: tuple[float, ...]
     options: Mapping[str, str] = field(default_factory=dict)
+
+    def curve(self, responses: NDArray[np.float64], spread: NDArray[np.float64] | None = None) -> Curve:
+        """The curve through responses (strength, probe) at this variant's strengths; spread as in `Curve`."""
+        return Curve(
+            effect=self.effect,
+            variant=self.name,
+            parameters=dict(self.parameters),
+            low=self.low,
+            high=self.high,
+            strengths=np.array(self.strengths),
+            responses=responses,
+            since=self.since,
+            spread=spread,
+        )
 
     def applied(self, strength: float) -> AppliedEffect:
         """The effect at a strength, as the forward model takes it."""

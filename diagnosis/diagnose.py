@@ -218,7 +218,7 @@ def judge(
     tell("held-out data")
     gap, held_out, shares = _held_out(problem, leading, rng)
     if leading.effects and leading.effects != (UNKNOWN,) and _leaves_too_much(gap):
-        # the best of the wrong ones: it takes out less of the gap than a law that is off by a third would
+        # the best of the wrong ones
         verdict = "unknown_effect"
         moved = _VETO * (1.0 - none - unknown)
         unknown += moved
@@ -333,7 +333,7 @@ def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[s
 
 
 def _leaves_too_much(gap: Gap) -> bool:
-    """Whether an explanation leaves more of a clear gap than laws that are off by a third would."""
+    """Whether an explanation leaves more than _MOST_LEFT of a clear gap."""
     null = max(gap.floor, 1.0)
     if gap.before < 1.3 * null:
         return False
@@ -378,7 +378,7 @@ def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator)
     return float(np.quantile(np.max(np.abs(solved / diagonal), axis=1), 0.95))
 
 
-def _folds(problem: Problem) -> NDArray[np.intp]:
+def folds_of(problem: Problem) -> NDArray[np.intp]:
     """Fold 0 or 1 of each series: alternating in time within each kind, scene and beam."""
     counts: dict[tuple[Any, ...], int] = {}
     folds = []
@@ -409,7 +409,7 @@ def _held_out(
     problem: Problem, leading: Hypothesis, rng: np.random.Generator
 ) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
     """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
-    folds = _folds(problem)[problem.series_of]
+    folds = folds_of(problem)[problem.series_of]
     size = len(problem.residual)
     before, after = np.full(size, np.nan), np.full(size, np.nan)
     alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}

@@ -281,7 +281,7 @@ def fit_curve(
         strengths = _refined(coarse, float(strengths[at]), width)
         value, quadratic = likelihood(strengths, sharp)
         at = int(np.argmax(value))
-    choices = [(0.0, strengths, value, math.sqrt(max(float(quadratic[at]), 0.0)))]
+    choices = [(strengths, value, math.sqrt(max(float(quadratic[at]), 0.0)))]
     start = float(strengths[at])
     for law_error, share in law_errors:
         best = start
@@ -298,17 +298,17 @@ def fit_curve(
             width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
             strengths = _refined(coarse, float(coarse[int(np.argmax(value))]), max(width, 0.3 * law_error))
             value, quadratic = likelihood(strengths, wide_terms)
-            value = value + shift
+            value = value + shift + math.log(share)
             # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
             weak = strengths < 0.3 * best
             value = np.where(weak, likelihood(strengths, sharp)[0], value)
             at = int(np.argmax(value))
-            choices.append((math.log(share), strengths, value, math.sqrt(max(float(quadratic[at]), 0.0))))
+            choices.append((strengths, value, math.sqrt(max(float(quadratic[at]), 0.0))))
             moved_on = abs(math.log(float(strengths[at]) / best))
             best = float(strengths[at])
             if moved_on < 0.05:
                 break
-    _, strengths, value, separation = max(choices, key=lambda item: item[0] + float(item[2].max()))
+    strengths, value, separation = max(choices, key=lambda item: float(item[1].max()))
     return CurveFit(
         curve=curve,
         log_evidence=_log_integral(strengths, value, curve.low, curve.high),

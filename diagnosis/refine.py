@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.effects.effect import Parameter
 from .changes import Variant
-from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve
+from .inference import UNKNOWN, CurveFit, Hypothesis, Nuisances, fit_curve
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
@@ -102,7 +102,7 @@ def _refined(
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fit_curve(residual, _curve(item, whitener.apply(answer[0]), fit.curve), nuisances, groups)
+        return fit_curve(residual, item.curve(whitener.apply(answer[0]), fit.curve.spread), nuisances, groups)
 
     inner = [item for item in EFFECTS[variant.effect].parameters[1:] if item.fitted and item.name in variant.parameters]
     here = tried(near(best.parameters, (1.0,)))
@@ -123,21 +123,6 @@ def _refined(
     final = near(best.parameters, _NEAR)
     answer = respond([final])
     return (final, answer[0]) if 0 in answer else None
-
-
-def _curve(variant: Variant, responses: NDArray[np.float64], like: Curve) -> Curve:
-    strengths = np.array(variant.strengths)
-    return Curve(
-        effect=variant.effect,
-        variant=variant.name,
-        parameters=dict(variant.parameters),
-        low=variant.low,
-        high=variant.high,
-        strengths=strengths,
-        responses=responses,
-        since=variant.since,
-        spread=like.spread,
-    )
 
 
 def _beside(item: Parameter, value: float, share: float) -> list[float]:

@@ -81,23 +81,16 @@ def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) 
     return row_back @ spread @ column_back.T, centre
 
 
-def _mean_energy_keV(context: LineContext) -> float:
-    """Mean energy of the open beam's signal, keV."""
-    if context.weights is None or context.energies_keV is None:
-        return 30.0
-    weights = context.weights[0]
-    return float(weights @ context.energies_keV[: weights.size] / weights.sum())
-
-
 def _scattering_share(context: LineContext) -> NDArray[np.float64]:
     """Scattering's share of attenuation (row, column), or (1, 1), over that of water, at the beam's mean energy."""
     thickness = context.request.thickness_mm
     if not thickness or context.weights is None or context.energies_keV is None or context.model is None:
         return np.ones((1, 1))
-    energy_keV = _mean_energy_keV(context)
+    weights = context.weights[0]
+    energy_keV = float(weights @ context.energies_keV[: weights.size] / weights.sum())
     water = _albedo("water_liquid", energy_keV)
     at = int(np.searchsorted(context.energies_keV, energy_keV))
-    whole, scattered = 0.0 * np.ones(context.shape), 0.0 * np.ones(context.shape)
+    whole, scattered = np.zeros(context.shape), np.zeros(context.shape)
     for name, length_mm in thickness.items():
         depth = float(context.model.mu(name)[at]) * np.asarray(length_mm, dtype=np.float64)
         whole = whole + depth

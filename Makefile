@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation validation-generator validation-prediction blind-check benchmark check format clean
+.PHONY: demo test test-slow validation validation-generator validation-prediction blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -54,6 +54,10 @@ benchmark: $(READY)
 	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/project_polychromatic.py
 	$(BIN)/python benchmarks/cost_table.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/pod_bootstrap.py
+
+# peak memory of calibrate at full size, 500 and 5000 frames: 7.3 GB of disk for a while, five minutes
+benchmark-memory: $(READY)
+	$(BIN)/python benchmarks/calibrate_memory.py
 
 # mypy sees the rooms as raytwin.<room> through a folder of links, without an install
 check: $(READY)

@@ -20,7 +20,7 @@ from .line_state import FinePicture, FloatArray
 from .projection import project_polychromatic
 from .spectral_signal import REFERENCE_KV, OpenBeam, SpectralModel
 from .twin import Level, Twin
-from .twin_spectrum import slope_share, spectral_model_of
+from .twin_spectrum import gain_of_slope, spectral_model_of, white_gain_DN
 
 if TYPE_CHECKING:
     from .series import SeriesRequest
@@ -52,7 +52,10 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class BeamProjection:
-    """One beam behind one scene: signal and variance of an exposure, and further moments on demand."""
+    """One beam behind one scene: signal and variance of an exposure, and further moments on demand.
+
+    secondary_DN: of the variance, what secondary quanta add for each DN of signal, white and the same behind any object.
+    """
 
     model: SpectralModel | None
     weights: FloatArray | None
@@ -60,6 +63,7 @@ class BeamProjection:
     open_signal_DN: float
     signal_DN: FloatArray
     variance_DN2: FloatArray
+    secondary_DN: float
     picture: FinePicture | None
     _cache: "ModelCache"
     _key: tuple[object, ...]
@@ -86,7 +90,7 @@ class ModelCache:
     _maps: "OrderedDict[tuple[object, ...], tuple[FloatArray, FloatArray | None]]" = field(default_factory=OrderedDict)
     _held: int = 0
     _numbers: int = 0
-    _levels: dict[tuple[object, ...], tuple[object, float, float]] = field(default_factory=dict)
+    _levels: dict[tuple[object, ...], tuple[object, float, float, float]] = field(default_factory=dict)
     _spectra: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
     _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
     _lit_held: int = 0
@@ -133,7 +137,7 @@ class ModelCache:
         true_beam = beam if kV_factor == 1.0 else OpenBeam(kV=beam.kV * kV_factor, filters=beam.filters)
         key = (id(model), true_beam, shape.tobytes(), tuple(sorted(attenuation_scale.items())))
         weights = self._shape_weights(model, shape, true_beam)
-        signal_scale, gain_scale = self._level(twin, request, model, beam, level, scales)
+        signal_scale, gain_scale, secondary = self._level(twin, request, model, beam, level, scales)
         scene = None
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
@@ -149,6 +153,7 @@ class ModelCache:
             open_signal_DN=signal_scale * float(weights[0].sum()),
             signal_DN=signal,
             variance_DN2=signal_scale * gain_scale * maps[1],
+            secondary_DN=secondary,
             picture=picture,
             _cache=self,
             _key=key,
@@ -174,7 +179,7 @@ class ModelCache:
         if open_signal is None or not twin.levels:
             raise _no_level(request)
         level = level or twin.levels[0]
-        gain = level.photon_transfer_slope_DN.value / slope_share(twin)
+        gain, secondary = gain_of_slope(twin, level.photon_transfer_slope_DN.value)
         one = np.ones((1, 1))
         return BeamProjection(
             model=None,
@@ -183,6 +188,7 @@ class ModelCache:
             open_signal_DN=open_signal,
             signal_DN=open_signal * one,
             variance_DN2=gain * open_signal * one,
+            secondary_DN=secondary,
             picture=None,
             _cache=self,
             _key=(),
@@ -197,8 +203,10 @@ class ModelCache:
         return request.source_detector_mm or setting or twin.instrument.source_detector_mm or measured or 1000.0
 
     @staticmethod
-    def _split(model: SpectralModel, parameters: FloatArray, beam: OpenBeam) -> tuple[FloatArray, tuple[float, float]]:
-        """Parameters with the scales taken out, and (signal, variance over signal) that the scales amount to."""
+    def _split(
+        model: SpectralModel, parameters: FloatArray, beam: OpenBeam
+    ) -> tuple[FloatArray, tuple[float, float, float]]:
+        """Parameters with the scales taken out, and (signal, variance over signal, DN a keV) that the scales amount to."""
         shape = parameters.copy()
         values = {}
         for name in _SCALES:
@@ -207,7 +215,7 @@ class ModelCache:
             shape[index] = 0.0
         gamma = values["log_DN_per_keV"]
         signal = values["log_output"] + values["yield_exponent"] * math.log(beam.kV / REFERENCE_KV) + gamma
-        return shape, (math.exp(signal), math.exp(gamma - values["log_swank"]))
+        return shape, (math.exp(signal), math.exp(gamma - values["log_swank"]), math.exp(gamma))
 
     def _shape_weights(self, model: SpectralModel, shape: FloatArray, beam: OpenBeam) -> FloatArray:
         """Weights (2, energy) of signal and variance with all scales at 1."""
@@ -228,9 +236,9 @@ class ModelCache:
         model: SpectralModel,
         beam: OpenBeam,
         level: Level | None,
-        scales: tuple[float, float],
-    ) -> tuple[float, float]:
-        """Factors on the projected signal, and on variance over signal, of one exposure."""
+        scales: tuple[float, float, float],
+    ) -> tuple[float, float, float]:
+        """Factors on the projected signal, and on variance over signal, of one exposure; secondary quanta's part, DN."""
         posterior = twin.spectral
         if posterior is None or request.setting is None:
             raise _no_level(request)
@@ -248,23 +256,28 @@ class ModelCache:
                 posterior,
                 best_scales[0] * float(sums[0]),
                 best_scales[1] * float(sums[1]) / float(sums[0]),
+                best_scales[2],
             )
-        _, best_rate, best_gain = self._levels[key]
+        _, best_rate, best_gain, best_gamma = self._levels[key]
         distance = self._distance_mm(twin, request, level)
         load = request.setting.tube_load_mAs
         pitch = twin.instrument.pixel_mm or 1.0
         gain_scale = scales[1]
+        secondary = white_gain_DN(twin, best_gain)
         if level is not None:
-            gain_scale *= level.photon_transfer_slope_DN.value / slope_share(twin) / best_gain
+            gain, secondary = gain_of_slope(twin, level.photon_transfer_slope_DN.value)
+            gain_scale *= gain / best_gain
+        # electronics that give more DN for a keV give more for a secondary quantum too
+        secondary *= scales[2] / best_gamma
         if request.open_signal_DN is not None:
-            return scales[0] * request.open_signal_DN / best_rate, gain_scale
+            return scales[0] * request.open_signal_DN / best_rate, gain_scale, secondary
         if load is None:
             raise _no_level(request)
         if level is not None and level.rate_DN_per_mAs is not None:
             there = level.source_detector_mm or distance
             measured = level.rate_DN_per_mAs.value * load * (there / distance) ** 2
-            return scales[0] * measured / best_rate, gain_scale
-        return scales[0] * load * (1000.0 / distance) ** 2 * pitch**2, gain_scale
+            return scales[0] * measured / best_rate, gain_scale, secondary
+        return scales[0] * load * (1000.0 / distance) ** 2 * pitch**2, gain_scale, secondary
 
     def _scene(
         self, thickness_mm: Mapping[str, NDArray[np.floating]], model: SpectralModel, shape: tuple[int, int]

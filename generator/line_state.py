@@ -86,6 +86,7 @@ class LineState:
         attenuation_scale: material of the scene -> factor on its attenuation.
         signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
             even illumination, before any spread.
+        secondary_DN: of the variance, what secondary quanta add for each DN of signal.
         picture: the signal as it was projected, finer than pixels, where it has sharp borders; what effects have made of
             `signal_DN` since is their difference.
         shift_px: of the object against its thickness maps, along rows and columns.
@@ -109,6 +110,7 @@ class LineState:
     attenuation_scale: Mapping[str, float] = field(default_factory=dict)
     signal_DN: FloatArray
     variance_DN2: FloatArray
+    secondary_DN: float = 0.0
     picture: FinePicture | None = None
     shift_px: tuple[float, float] = (0.0, 0.0)
     object_transfers: tuple[Transfer, ...] = ()

@@ -372,6 +372,7 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
             state,
             signal_DN=projection.signal_DN,
             variance_DN2=projection.variance_DN2,
+            secondary_DN=projection.secondary_DN,
             picture=projection.picture,
             shift_px=request.displacement_px if request.thickness_mm else (0.0, 0.0),
         )
@@ -393,17 +394,23 @@ def _read_out(twin: Twin, request: SeriesRequest, found: tuple["_Lit", "_Active"
     return state
 
 
+def _quanta(state: LineState) -> LineState:
+    """The state with the variance of quanta alone; secondary quanta follow the signal, whatever the spectrum."""
+    white = np.minimum(state.secondary_DN * np.maximum(state.signal_DN, 0.0), 0.9 * state.variance_DN2)
+    return replace(state, variance_DN2=state.variance_DN2 - white)
+
+
 def _charge(twin: Twin, request: SeriesRequest, state: LineState, *, draft: bool = False) -> _Charge:
     shape, relative = _illumination(twin, request)
     pattern = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
     if not request.beam_on:
         nothing = np.zeros(twin.maps.shape)
         return _Charge(state, nothing, nothing, nothing, shape, relative, pattern)
-    secondary = twin.noise.white_fraction
+    quanta = _quanta(state)
     picture, power = spread_maps(
-        state.signal_DN,
-        state.variance_DN2 / (1.0 + secondary),
-        state=state,
+        quanta.signal_DN,
+        quanta.variance_DN2,
+        state=quanta,
         pattern=pattern,
         psf_model=twin.noise.psf_model,
         psf_sigma_px=twin.noise.psf_sigma_px.value,
@@ -415,7 +422,7 @@ def _charge(twin: Twin, request: SeriesRequest, state: LineState, *, draft: bool
         state=state,
         mean=lit * picture,
         correlated=scale * power,
-        white=scale * power * (secondary / pattern.share),
+        white=scale * state.secondary_DN * np.maximum(picture, 0.0),
         shape=lit,
         relative=relative,
         pattern=pattern,
@@ -708,9 +715,9 @@ def sample_series(
     lowest = 0.0 if twin.noise.quantised else -math.inf
     scale = np.sqrt(charge.shape * charge.relative)
     white = np.sqrt(charge.white)
-    before, variance = blurred_object(state)
+    before, variance = blurred_object(_quanta(state))
     # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
-    quantum = variance / (1.0 + twin.noise.white_fraction) / np.maximum(before, 1e-300)
+    quantum = variance / np.maximum(before, 1e-300)
     quantum = np.maximum(quantum, 1e-9 * float(np.max(quantum)) + 1e-300)
     number = 0
     for _ in range(request.frames):

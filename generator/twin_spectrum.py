@@ -109,6 +109,28 @@ def slope_over_gain(
     return np.asarray(share * (1.0 + constant * (mean_gain / np.asarray(gain_DN) - 1.0)))
 
 
+def white_gain_DN(twin: Twin, gain_DN: float) -> float:
+    """Variance per signal that secondary quanta add in every beam, DN: the spread's white share of the levels' mean gain.
+
+    Args:
+        twin: the calibrated line.
+        gain_DN: of the beam, whose own share counts where the twin has no levels.
+    """
+    white = twin.noise.white_fraction / (1.0 + twin.noise.white_fraction)
+    known = [math.log(level.gain_DN.value) for level in twin.levels if level.gain_DN.value > 0]
+    return white * (math.exp(sum(known) / len(known)) if known else gain_DN)
+
+
+def gain_of_slope(twin: Twin, slope_DN: float) -> tuple[float, float]:
+    """Gain, and what secondary quanta add to it (`white_gain_DN`), of a beam with this photon-transfer slope, DN.
+
+    gain = (slope - w) / h + w: after the spread, which leaves a share h of the quanta's variance, one pixel has the slope.
+    """
+    left = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    white = min(white_gain_DN(twin, slope_DN / slope_share(twin)), 0.9 * max(slope_DN, 0.0))
+    return (slope_DN - white) / left + white, white
+
+
 def secondary_gain_DN(twin: Twin, setting: Setting | None = None) -> float | None:
     """Variance per signal of what secondary quanta add, white and without regard to the spectrum, DN.
 

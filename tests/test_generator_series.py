@@ -14,11 +14,12 @@ from raytwin.generator._fine_picture import cell_coverage, find_borders, sampled
 from raytwin.generator._spread import noise_pattern
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.line_state import LineState
-from raytwin.generator.predict import predict_flatfield, slope_share, spectral_model_of
+from raytwin.generator.predict import predict_flatfield, spectral_model_of
 from raytwin.generator.psf import noise_autocovariance_1d
 from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
 from raytwin.generator.spectral_signal import OpenBeam
 from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.generator.twin_spectrum import slope_over_gain, white_gain_DN
 
 SHAPE = (40, 40)
 MEASURED = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"
@@ -80,8 +81,35 @@ def test_an_unmeasured_beam_is_the_spectral_model_at_its_best(series_line):
         exact.rate_DN_per_mAs[0] * factor * np.median(series_line.levels[0].flat_shape), rel=1e-6
     )
     both = found.quantum_variance_DN2 + found.white_variance_DN2 - series_line.noise.read_variance_DN2
-    expected = exact.gain_DN[0] * slope_share(series_line) * found.signal_DN * series_line.maps.gain_relative
+    share = slope_over_gain(series_line.levels, series_line.noise, exact.gain_DN)[0]
+    expected = exact.gain_DN[0] * share * found.signal_DN * series_line.maps.gain_relative
     np.testing.assert_allclose(both, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "text", ["kv=50,current_ma=1,exposure_ms=20", "kv=120,current_ma=1,exposure_ms=20,filter=Cu:0.5"]
+)
+def test_noise_of_an_unmeasured_beam_is_as_predicted(make_model_twin, text):
+    """Secondary quanta add the same for each DN of signal in every beam, here as in `predict_flatfield`."""
+    twin = make_model_twin((24, 24))
+    found = expected_series(twin, request(setting=text))
+    predicted = predict_flatfield(twin, setting_from_text(text))
+    variance = float(np.median(found.quantum_variance_DN2 + found.white_variance_DN2))
+    assert variance == pytest.approx(predicted.sd_DN.value**2, rel=1e-4)
+    white = (found.white_variance_DN2 - twin.noise.read_variance_DN2) / found.signal_DN
+    np.testing.assert_allclose(white, white_gain_DN(twin, 0.0), rtol=1e-3)
+
+
+def test_noise_of_secondary_quanta_follows_the_signal_behind_a_hardening_slab(make_model_twin):
+    twin = make_model_twin((24, 24))
+    behind = {"Al": np.full((24, 24), 10.0)}
+    slab, flat = (
+        expected_series(twin, request(kind, thickness_mm=maps)) for kind, maps in (("object", behind), ("flat", {}))
+    )
+    white = [(one.white_variance_DN2 - twin.noise.read_variance_DN2) / one.signal_DN for one in (slab, flat)]
+    np.testing.assert_allclose(white[0], white[1], rtol=1e-2)
+    quantum = [float(np.median(one.quantum_variance_DN2 / one.signal_DN)) for one in (slab, flat)]
+    assert quantum[0] > 1.03 * quantum[1]
 
 
 def test_a_slab_attenuates_as_the_exact_sum_over_energies(series_line):

@@ -93,7 +93,8 @@ GAIN_MAP_ERROR = Effect(
 
 
 def _add_excess(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    return replace(state, variance_DN2=state.variance_DN2 * (1.0 + parameters["strength"] / 100.0))
+    factor = 1.0 + parameters["strength"] / 100.0
+    return replace(state, variance_DN2=factor * state.variance_DN2, secondary_DN=factor * state.secondary_DN)
 
 
 EXCESS_NOISE = Effect(

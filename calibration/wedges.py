@@ -12,11 +12,11 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, filters_from_text, text_from_filters
 from ..errors import InputError
 from ..generator.predict import estimate_from_log_draws, spectral_model_of
-from ..generator.spectral_signal import OpenBeam, attenuation_scale_name
+from ..generator.spectral_signal import OTHER_TABLES, OpenBeam, attenuation_scale_name
 from ..generator.twin import DetectorMaps, Estimate, SpectralPosterior, Twin
 from ..materials import material_from_name, optical_depth
 from .frame_sums import sum_frames
-from .priors import ATTENUATION_SCALE, TABLE_SHARE
+from .priors import ATTENUATION_SCALE, SHARES_CORRELATION, TABLE_SHARE
 from .spectral_fit import Transmission
 
 KINDS = ("wedge", "slab")
@@ -201,7 +201,8 @@ def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], la
     """Transmission of layers behind filters at a kV, no unit, with its 95 % interval.
 
     T = sum(N T_layers m1) / sum(N m1) over the posterior's draws; scales cancel. Thicknesses are taken as exact. A
-    material whose attenuation the calibration did not carry adds the differences between its tables and its density's.
+    material whose attenuation the calibration did not carry has the mean of the three tables, one of which is right for all
+    its plates, and adds their differences and its density's error.
 
     Raises:
         InputError: a twin without spectral part, or an unknown material.
@@ -212,19 +213,21 @@ def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], la
     behind = model.signal(draws, OpenBeam(kV=kV, filters=(*filters, *layers))).rate_DN_per_mAs
     before = model.signal(draws, OpenBeam(kV=kV, filters=tuple(filters))).rate_DN_per_mAs
     extra = [posterior.level_discrepancy]
-    for layer in layers:
-        if attenuation_scale_name(layer.material) in model.names:
+    moved = 0.0
+    weight = model.moment_weights(posterior.best, OpenBeam(kV=kV, filters=(*filters, *layers)))[0]
+    energies = model.energies_keV[: weight.size]
+    # plates of one material share its table and its density
+    for material in dict.fromkeys(layer.material for layer in layers):
+        if attenuation_scale_name(material) in model.names:
             continue
-        energies = model.energies_keV
-        weight = model.moment_weights(posterior.best, OpenBeam(kV=kV, filters=(*filters, *layers)))[0]
-        used = energies[: weight.size]
-        depth = optical_depth([layer], used)
-        mean_depth = float(np.sum(weight * depth) / np.sum(weight))
-        extra.append(ATTENUATION_SCALE.sd * mean_depth)
-        for table in ("chantler", "penelope"):
-            moved = optical_depth([layer], used, table=table) - depth
-            extra.append(TABLE_SHARE.sd * float(np.sum(weight * moved) / np.sum(weight)))
-    return estimate_from_log_draws(np.log(behind / before), math.hypot(*extra))
+        plates = [layer for layer in layers if layer.material == material]
+        depth = optical_depth(plates, energies)
+        other = [optical_depth(plates, energies, table=table) - depth for table in OTHER_TABLES]
+        own, first, second = (float(np.sum(weight * row) / np.sum(weight)) for row in (depth, *other))
+        moved += TABLE_SHARE.centre * (first + second)
+        both = first**2 + second**2 + 2.0 * SHARES_CORRELATION * first * second
+        extra += [ATTENUATION_SCALE.sd * own, TABLE_SHARE.sd * math.sqrt(both)]
+    return estimate_from_log_draws(np.log(behind / before) - moved, math.hypot(*extra))
 
 
 def transmissions_of_evidence(twin: Twin) -> tuple[Transmission, ...]:

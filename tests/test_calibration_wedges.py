@@ -15,8 +15,10 @@ from raytwin.calibration.validate import leave_one_out, plot_validation, validat
 from raytwin.calibration.wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 from raytwin.cli import main
 from raytwin.errors import InputError
+from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.materials import optical_depth
 
 SHAPE = (40, 60)
 STEPS_MM = (0.0, 1.0, 3.0, 6.0)
@@ -154,6 +156,35 @@ def test_predicted_transmissions_hold_the_truth_and_widen_for_unknown_materials(
     assert found.high / found.low < 1.05
     other = predict_transmission(twin, kV=70.0, filters=(), layers=filters_from_text("pmma:60"))
     assert math.log(other.high / other.low) > 0.02
+
+
+def test_plates_of_one_material_share_its_table_and_its_density(measured):
+    _, twin = measured
+    one, parted = (
+        predict_transmission(twin, kV=70.0, filters=(), layers=filters_from_text(text))
+        for text in ("pmma:60", "pmma:20+pmma:40")
+    )
+    assert parted.value == pytest.approx(one.value, rel=1e-9)
+    assert math.log(parted.high / parted.low) == pytest.approx(math.log(one.high / one.low), rel=1e-6)
+
+
+def test_an_unknown_material_lies_between_the_tables(measured):
+    """The value is that of the tables' mean; sd of three equally likely tables, and 1 % of density."""
+    _, twin = measured
+    model = spectral_model_of(twin)
+    best = twin.spectral.best
+    layers = filters_from_text("water_liquid:40")
+    weight = model.moment_weights(best, OpenBeam(kV=70.0, filters=layers))[0]
+    energies = model.energies_keV[: weight.size]
+    tables = ("xraylib", "chantler", "penelope")
+    depths = [float(weight @ optical_depth(layers, energies, table=table) / weight.sum()) for table in tables]
+    found = predict_transmission(twin, kV=70.0, filters=(), layers=layers)
+    before = model.signal(twin.spectral.samples, OpenBeam(kV=70.0, filters=())).rate_DN_per_mAs
+    behind = model.signal(twin.spectral.samples, OpenBeam(kV=70.0, filters=layers)).rate_DN_per_mAs
+    by_tables = float(np.median(behind / before)) * math.exp(depths[0] - np.mean(depths))
+    assert found.value == pytest.approx(by_tables, rel=2e-3)
+    half_width = math.log(found.high / found.low) / 2
+    assert half_width > 1.95 * math.hypot(np.std(depths), 0.01 * depths[0])
 
 
 def test_validation_shows_wedges_and_levels_left_out(measured, tmp_path, capsys):

@@ -388,7 +388,6 @@ def run_protocol(
             pixel_mm=pixel_mm,
             source_detector_mm=source_detector_mm,
             product_mm=product_mm,
-            bones_mm=bones_mm,
         )
         return _run_session(
             path,
@@ -399,6 +398,7 @@ def run_protocol(
             geometry=geometry or "coarse",
             frames=frames,
             products=products,
+            bones_mm=bones_mm,
             session=session,
             system=system,
             effects=tuple(effects),
@@ -482,6 +482,7 @@ def _run_session(
     geometry: str,
     frames: int | None,
     products: int | None,
+    bones_mm: tuple[float, ...] | None,
     session: int,
     system: LabSystem | None,
     effects: tuple["EffectRequest", ...],
@@ -509,6 +510,7 @@ def _run_session(
         rng=plan_rng,
         frames=frames,
         products=products,
+        bones_mm=bones_mm,
         leave_out=leave_out,
         only=only,
     )

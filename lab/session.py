@@ -269,8 +269,16 @@ class _Planner:
         pixels = min(self.system.rows, self.system.columns)
         return 0.5 * pixels * self.system.pixel_mm * self.geometry.far_mm / self.system.source_detector_mm
 
-    def add_products(self, count: int, *, exposures_ms: Sequence[float], frames: int, role: str | None) -> None:
-        geometry = self.geometry
+    def add_products(
+        self,
+        count: int,
+        *,
+        exposures_ms: Sequence[float],
+        frames: int,
+        role: str | None,
+        bones_mm: Sequence[float] = (),
+    ) -> None:
+        geometry, with_bone = self.geometry, 0
         height_mm, width_mm = clear_field_mm(self.system)
         reach_mm = 0.45 * min(height_mm, width_mm)
         turns = np.radians([-TURN_DEGREES, 0.0, TURN_DEGREES])
@@ -289,6 +297,9 @@ class _Planner:
             bone = None
             if number % 4 != 3:
                 length_mm = float(self.rng.uniform(0.15, 0.4)) * min(half_mm, 12.0)
+                if bones_mm:
+                    length_mm = bones_mm[with_bone % len(bones_mm)]
+                with_bone += 1
                 bone = sample_bone(self.rng, name=f"bone{number + 1:02d}", size_mm=round(length_mm, 2))
                 product = place_bone(self.rng, product=product, bone=bone)
             name = self.scene(
@@ -314,7 +325,7 @@ class _Planner:
                     )
 
 
-def _plan_full(plan: _Planner, products: int) -> None:
+def _plan_full(plan: _Planner, products: int, bones_mm: Sequence[float]) -> None:
     geometry, frames = plan.geometry, plan.frames
     some, few = max(2, round(0.4 * frames)), max(2, round(0.2 * frames))
     low_kV, high_kV = geometry.kVs
@@ -403,12 +414,14 @@ def _plan_full(plan: _Planner, products: int) -> None:
             spread_percent=0.0,
         )
         objects(name, usual, geometry.far_mm, some)
-    plan.add_products(products, exposures_ms=(25.0, 100.0), frames=max(2, frames // 10), role="evaluation")
+    plan.add_products(
+        products, exposures_ms=(25.0, 100.0), frames=max(2, frames // 10), role="evaluation", bones_mm=bones_mm
+    )
     for exposure_ms in EVALUATION_EXPOSURES_MS:
         plan.dark(exposure_ms, some, role="evaluation")
 
 
-def _plan_short(plan: _Planner, products: int) -> None:
+def _plan_short(plan: _Planner, products: int, bones_mm: Sequence[float]) -> None:
     frames = plan.frames
     some = max(2, round(0.4 * frames))
     for exposure_ms in EVALUATION_EXPOSURES_MS:
@@ -417,23 +430,33 @@ def _plan_short(plan: _Planner, products: int) -> None:
         for kV in plan.geometry.kVs:
             for exposure_ms in EVALUATION_EXPOSURES_MS:
                 plan.flat(plan.setting(kV, exposure_ms, filtered=True), frames, role=role)
-    plan.add_products(products, exposures_ms=EVALUATION_EXPOSURES_MS, frames=max(2, frames // 10), role="evaluation")
+    plan.add_products(
+        products,
+        exposures_ms=EVALUATION_EXPOSURES_MS,
+        frames=max(2, frames // 10),
+        role="evaluation",
+        bones_mm=bones_mm,
+    )
     for exposure_ms in EVALUATION_EXPOSURES_MS:
         plan.dark(exposure_ms, some, role="evaluation")
 
 
-def _plan_products(plan: _Planner, products: int) -> None:
+def _plan_products(plan: _Planner, products: int, bones_mm: Sequence[float]) -> None:
     for exposure_ms in EVALUATION_EXPOSURES_MS:
         plan.dark(exposure_ms, 1, role="calibration", averaged=AVERAGED)
         for kV in plan.geometry.kVs:
             setting = plan.setting(kV, exposure_ms, filtered=True, averaged=AVERAGED)
             plan.flat(setting, 1, role="calibration")
     plan.add_products(
-        products, exposures_ms=EVALUATION_EXPOSURES_MS, frames=max(2, plan.frames // 10), role="evaluation"
+        products,
+        exposures_ms=EVALUATION_EXPOSURES_MS,
+        frames=max(2, plan.frames // 10),
+        role="evaluation",
+        bones_mm=bones_mm,
     )
 
 
-SESSIONS: dict[str, Callable[[_Planner, int], None]] = {
+SESSIONS: dict[str, Callable[[_Planner, int, Sequence[float]], None]] = {
     "full": _plan_full,
     "short": _plan_short,
     "products": _plan_products,
@@ -472,6 +495,7 @@ def make_session(
     rng: np.random.Generator,
     frames: int | None = None,
     products: int | None = None,
+    bones_mm: Sequence[float] | None = None,
     leave_out: Sequence[str] = (),
     only: Sequence[str] | None = None,
 ) -> SessionPlan:
@@ -483,6 +507,7 @@ def make_session(
         rng: draws products and poses; what is left out does not change what else is drawn.
         frames: per series (50); objects have fewer.
         products: how many.
+        bones_mm: lengths of their bones, in turn; None: drawn, a few mm.
         leave_out: groups of series that are not taken, of `GROUPS`.
         only: groups of series to take alone, with the darks; None: all.
 
@@ -497,6 +522,8 @@ def make_session(
         raise InputError("frames", received=frames, expected="4 or more")
     if products < 1:
         raise InputError("products", received=products, expected="1 or more")
+    if bones_mm is not None and not (bones_mm and all(0.2 <= size_mm <= 100.0 for size_mm in bones_mm)):
+        raise InputError("bones_mm", received=bones_mm, expected="lengths of 0.2 to 100 mm")
     if min(system.rows, system.columns) < 48:
         raise InputError(
             "size of the lab's detector",
@@ -504,7 +531,7 @@ def make_session(
             expected=f"48x48 pixels or more for the protocol {protocol}",
         )
     planner = _Planner(rng, system, geometry, frames)
-    SESSIONS[protocol](planner, products)
+    SESSIONS[protocol](planner, products, bones_mm or ())
     for name in (*leave_out, *(only or ())):
         if name not in GROUPS:
             raise InputError("group of series", received=repr(name), expected="one of " + ", ".join(GROUPS))

@@ -41,7 +41,6 @@ from ._plain import plain
 if TYPE_CHECKING:
     from ..generator.known_scenes import KnownScene
     from ..generator.twin import Twin
-    from ..pod import PodFit
     from ..segmentation import EpochResult, Recipe
 
 Tell = Callable[[str], None]
@@ -179,7 +178,6 @@ def run_task(
     _joined(starts, directory / "start.h5")
     runs = _train(directory, arms, measured.path, plan, device=device, tell=tell)
     sizes = source.sizes()
-    curves: dict[str, PodFit | None] = {}
     answers: dict[str, Any] = {}
     for networks, images in TRIALS:
         if networks not in arms:
@@ -189,11 +187,10 @@ def run_task(
         table = directory / f"hits_{name}.csv"
         tell(f"networks of {networks} on images of {images}")
         _detect(runs[networks], dataset, table, sizes, device=device)
-        curves[name], answers[name] = _curve(table, plan.size)
+        answers[name] = _curve(table, plan.size)
     if same:
         for images in ("after", "measured"):
             told = "before" if images == "after" else images
-            curves[f"after_on_{images}"] = curves[f"before_on_{told}"]
             answers[f"after_on_{images}"] = answers[f"before_on_{told}"]
     real = "measured_on_measured" if "measured" in arms else "after_on_measured"
     result: dict[str, Any] = {}
@@ -217,6 +214,32 @@ def run_task(
         "warnings": list(dict.fromkeys(warnings)),
     }
     return dict(plain(result))
+
+
+def check_task(brought: TaskInput) -> None:
+    """Refuse what cannot be tried before anything long is begun.
+
+    Raises:
+        InputError: a file that is not there or is neither acquisition nor dataset, or knows of no foreign object.
+    """
+    for name, path in (("--task", brought.measured), ("--task-products", brought.products)):
+        if path is not None and not path.is_file():
+            raise InputError(name, received=f"{path}, which is not there", expected="a file")
+    if (brought.low is None) != (brought.high is None):
+        raise InputError("--task-low and --task-high", received="one of the two", expected="both or neither")
+    try:
+        with read_dataset(brought.measured) as dataset:
+            found = any(row.foreign_object for row in dataset.rows)
+    except FileFormatError:
+        with open_acquisition(brought.measured) as acquisition:
+            masks = (acquisition.scenes[pair.scene].foreign_object_mask for pair in _usable_pairs(acquisition))
+            found = any(mask is not None and bool(mask.any()) for mask in masks)
+    if not found:
+        raise InputError(
+            "--task",
+            received=f"{brought.measured}, which holds no product with a foreign object of known mask",
+            expected="measured images of products with and without known foreign objects",
+        )
 
 
 def _claim(directory: Path, before: "Twin", after: "Twin", brought: TaskInput, plan: TaskPlan) -> None:
@@ -726,9 +749,9 @@ def _detect(runs_path: Path, dataset_path: Path, out: Path, contrast: Mapping[st
         write_detections(out, rows(dataset, dataset.indices(split="test")))
 
 
-def _curve(table_path: Path, size: str) -> "tuple[PodFit | None, dict[str, Any]]":
-    """POD curve of a hit table with what an answer says of it; None where no size can be fitted."""
-    from ..pod import false_alarm_rate, fit_pod, read_pod_table
+def _curve(table_path: Path, size: str) -> dict[str, Any]:
+    """What an answer says of a hit table: counts, a90 with its interval, the curve; null where the data support none."""
+    from ..pod import curve_rows, false_alarm_rate, fit_pod, read_pod_table
 
     table = read_pod_table(table_path, size=size)
     objects = len(set(table.image or ()))
@@ -745,17 +768,19 @@ def _curve(table_path: Path, size: str) -> "tuple[PodFit | None, dict[str, Any]]
         "a90": None,
         "a90_95_interval": {"low": None, "high": None},
         "false_alarms": alarms,
+        "points": _hits_by_size(table.size, table.hits),
+        "line": None,
         "table": table_path.name,
         "warnings": [],
     }
     if objects < _FEWEST_TO_TRY or table.hits is None:
         told["warnings"] = [f"{objects} foreign objects of known {size}: too few for a curve"]
-        return None, told
+        return told
     try:
         fit = fit_pod(table.size, table.hits, repeats="crossed", network=table.network, image=table.image)
     except FitError as error:
         told["warnings"] = [str(error)]
-        return None, told
+        return told
     low, high = (
         bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
         for bounds in (fit.a90_low_two_sided, fit.a90_95_two_sided)
@@ -764,13 +789,32 @@ def _curve(table_path: Path, size: str) -> "tuple[PodFit | None, dict[str, Any]]
         "a50": fit.a50,
         "a90": fit.a90,
         "a90_95_interval": {"low": low, "high": high},
-        "c0": fit.c0,
-        "c1": fit.c1,
+        "line": None
+        if fit.curve is None
+        else {key: value.tolist() for key, value in curve_rows(fit, points=41).items()},
         "link": fit.link,
         "repeats": fit.repeats,
         "warnings": list(fit.warnings),
     }
-    return fit, told
+    return told
+
+
+def _hits_by_size(size: NDArray[np.float64], hits: NDArray[np.float64] | None) -> list[dict[str, float]]:
+    """Share of hits in up to eight groups of like size."""
+    if hits is None or not len(size):
+        return []
+    groups = np.unique(size)
+    edges = groups if len(groups) <= 8 else np.unique(np.quantile(size, np.linspace(0.0, 1.0, 9)[:-1]))
+    place = np.searchsorted(edges, size, side="right") - 1
+    return [
+        {
+            "size": float(size[place == number].mean()),
+            "hits": int(hits[place == number].sum()),
+            "n": int((place == number).sum()),
+        }
+        for number in range(len(edges))
+        if (place == number).any()
+    ]
 
 
 def _comparisons(directory: Path, real: str, plan: TaskPlan, *, same: bool) -> dict[str, Any]:

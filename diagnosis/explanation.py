@@ -1,7 +1,8 @@
 """The diagnosis in plain words: one paragraph that can be read once."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..generator.effects import EFFECTS
 from .diagnose import Cause, Diagnosis, Place
@@ -81,3 +82,21 @@ def paragraph(diagnosis: Diagnosis) -> str:
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
     return text
+
+
+def task_text(task: Mapping[str, Any]) -> str:
+    """What the gap means for detection: a90 as the twin had it, as the improved twin has it, as measured."""
+    unit = f" {task['unit']}" if task["unit"] else ""
+
+    def told(name: str) -> str:
+        value, interval = task[name], task[f"{name}_95"]
+        if value is None:
+            return "none that the data support"
+        low, high = ("?" if end is None else f"{end:.3g}" for end in (interval["low"], interval["high"]))
+        return f"{value:.3g}{unit} ({low} to {high})"
+
+    what = "the size" if task["size"] == "size_mm" else "the contrast"
+    start = f"In detection, {what} found in nine of ten cases (a90)"
+    if not task["effects"]:
+        return f"{start} is {told('a90_before')} by the twin; measured: {told('a90_real')}."
+    return f"{start} moves from {told('a90_before')} to {told('a90_after')}; measured: {told('a90_real')}."

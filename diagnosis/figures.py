@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -191,3 +191,48 @@ def rms(values: NDArray[np.floating]) -> float:
     """Root mean square of finite values."""
     finite = values[np.isfinite(values)]
     return math.sqrt(float(np.mean(finite**2))) if finite.size else float("nan")
+
+
+def plot_task(task: Mapping[str, Any]) -> bytes:
+    """Share of objects detected against their size: the two twins' networks on their own images, and measured ones."""
+    real = "measured_on_measured" if task["real_networks"] == "measured" else "after_on_measured"
+    figure, axes = _figure(9.0, 3.6, 1, 2, sharey=True)
+    left = (
+        ("before_on_before", "twin before", _BEFORE),
+        ("after_on_after", "twin after", _AFTER),
+        (real, "measured", "#1b7f3b"),
+    )
+    right = (
+        ("before_on_measured", "learnt from the twin before", _BEFORE),
+        ("after_on_measured", "learnt from the twin after", _AFTER),
+        ("measured_on_measured", "learnt from measured images", "#1b7f3b"),
+    )
+    for axis, which, title in (
+        (axes[0][0], left, "As expected, and as measured"),
+        (axes[0][1], right, "Tried on measured images"),
+    ):
+        for name, label, colour in which:
+            curve = task["curves"].get(name)
+            if curve is None:
+                continue
+            points = curve["points"]
+            axis.plot(
+                [one["size"] for one in points],
+                [one["hits"] / one["n"] for one in points],
+                "o",
+                color=colour,
+                markersize=4,
+            )
+            if curve["line"] is not None:
+                line = curve["line"]
+                axis.plot(line["size"], line["pod"], color=colour, label=label)
+                axis.fill_between(line["size"], line["low"], line["high"], color=colour, alpha=0.12, linewidth=0)
+            else:
+                axis.plot([], [], "o", color=colour, label=f"{label} (no curve)")
+        axis.axhline(0.9, color=_FLOOR, linewidth=0.7, linestyle=":")
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("longest side, mm" if task["size"] == "size_mm" else "contrast")
+        axis.set_ylim(-0.03, 1.03)
+        axis.legend(fontsize=8, loc="lower right")
+    axes[0][0].set_ylabel("share detected")
+    return _png(figure)

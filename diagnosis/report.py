@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..files import whole_file
 from .assemble import map_changes
 from .diagnose import Diagnosis
-from .explanation import paragraph, strength_text, title_of
-from .figures import plot_by_axis, plot_gap_maps, plot_hypotheses, plot_places, plot_transmission_curves
+from .explanation import paragraph, strength_text, task_text, title_of
+from .figures import plot_by_axis, plot_gap_maps, plot_hypotheses, plot_places, plot_task, plot_transmission_curves
 from .inference import UNKNOWN
 
 _VERDICTS = {
@@ -47,11 +47,17 @@ def write_report(diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *,
         "maps": plot_gap_maps(diagnosis, after),
         "curves": plot_transmission_curves(diagnosis, after),
     }
+    task = answer.get("task")
+    if task is not None:
+        figures["task"] = plot_task(task)
     template = jinja2.Template((Path(__file__).parent / "report.html").read_text(encoding="utf-8"), autoescape=True)
     page = template.render(
         version=version,
         verdict=_VERDICTS[diagnosis.verdict],
-        paragraph=paragraph(diagnosis),
+        paragraph=paragraph(diagnosis) + ("" if task is None else f" {task_text(task)}"),
+        task=None if task is None else _task_rows(task),
+        task_warnings=[] if task is None else task["warnings"],
+        task_setting="" if task is None else task["setting"],
         causes=[
             {
                 "title": title_of(cause.effect),
@@ -89,3 +95,26 @@ def write_report(diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *,
     with whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
+
+
+def _task_rows(task: Mapping[str, Any]) -> list[dict[str, str]]:
+    """One line for each kind of networks and of images that they were tried on."""
+    names = {"before": "twin before", "after": "twin after", "measured": "measured images"}
+
+    def shown(value: float | None) -> str:
+        return "none" if value is None else f"{value:.3g}"
+
+    rows = []
+    for name, curve in task["curves"].items():
+        networks, _, images = name.partition("_on_")
+        interval, alarms = curve["a90_95_interval"], curve["false_alarms"]
+        rows.append(
+            {
+                "networks": names[networks],
+                "images": names[images],
+                "hits": f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
+                "a90": f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
+                "false_alarms": "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
+            }
+        )
+    return rows

@@ -1,7 +1,9 @@
 """Where the gap between measured and simulated lies, which effect causes it, and how far it shrinks with that effect added.
 
 Any acquisition file will do, from darks and two flats to the full protocol; what it does not allow is said. Writes
-diagnosis.json, report.html and twin.h5 (the twin with the effect added) into the folder.
+diagnosis.json, report.html and twin.h5 (the twin with the effect added) into the folder. With --task the gap is followed to
+detection: POD of networks trained on the twin's images before and after, against measured images (docs/diagnosis.md). What
+the task made stands in DIR/task, and a run that was stopped goes on there.
 """
 
 import argparse
@@ -12,12 +14,17 @@ from typing import TYPE_CHECKING
 from ._answer import answer, jsonable, say
 
 if TYPE_CHECKING:
+    from ..campaign.task import TaskInput, TaskPlan
+    from ..diagnosis.diagnose import Diagnosis
     from ..generator.twin import Twin
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol full --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o diagnosis
   raytwin diagnose session.h5 -o plan --plan
+  raytwin lab -o products.h5 --protocol products --session 1 --products 96 --bones-mm 0.7,1,1.4,2,2.8,4 \\
+    --effect object_scatter=10 --seed 1
+  raytwin diagnose session.h5 -o with_pod --task products.h5
 """
 
 
@@ -36,6 +43,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="say which effects these series could tell apart, whatever the frames show, and write no diagnosis",
     )
+    task = parser.add_argument_group(
+        "POD before and after",
+        "networks are trained on images of the twin without and with what was found, and on measured ones; all are tried on"
+        " the same objects",
+    )
+    task.add_argument(
+        "--task",
+        metavar="MEASURED",
+        type=Path,
+        help="acquisition or dataset: images of the line as it is now, of products with and without known foreign objects",
+    )
+    task.add_argument(
+        "--task-products",
+        metavar="SOURCE",
+        type=Path,
+        help="what the twins' images are made from: a description (.toml), an acquisition with thickness maps, or a dataset"
+        " of reference images (default: the thickness maps in MEASURED)",
+    )
+    task.add_argument("--task-low", metavar="SETTING", help="setting at the low kV (default: the shortest exposure)")
+    task.add_argument("--task-high", metavar="SETTING", help="setting at the high kV")
+    task.add_argument("--task-networks", type=int, help="networks of each kind (default 3)")
+    task.add_argument("--task-start-steps", type=int, help="training steps of the network that all start from (240)")
+    task.add_argument("--task-steps", type=int, help="training steps of each network after that (60)")
+    task.add_argument("--task-crop-px", type=int, help="side of the squares they learn from, 0: whole images (64)")
+    task.add_argument("--task-draws", type=int, help="images of each known product, each with its own noise (2)")
+    task.add_argument(
+        "--task-images", type=int, help="images from a description or references, to learn and to try (120)"
+    )
+    task.add_argument("--task-size", choices=("size_mm", "contrast"), help="what a90 is a size of (size_mm)")
+    task.add_argument("--device", default="auto", help="of the networks: auto, cpu, cuda, mps (default auto)")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws (default 0)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
@@ -48,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     from .. import __version__
     from ..acquisition import open_acquisition
     from ..diagnosis.diagnose import diagnose, diagnosis_answer
-    from ..diagnosis.explanation import paragraph
+    from ..diagnosis.explanation import paragraph, task_text
     from ..diagnosis.report import write_report
     from ..errors import InputError
     from ..files import sha256_of_file, whole_file
@@ -63,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     twin = None if arguments.twin is None else read_twin(arguments.twin)
     if arguments.plan:
         return _plan(arguments, twin)
+    task = _task_of(arguments)
     with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         result = diagnose(
             acquisition,
@@ -83,11 +121,73 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.output.mkdir(parents=True, exist_ok=True)
     with whole_file(arguments.output / "twin.h5") as temporary:
         write_twin(temporary, result.twin)
-    write_report(result, data, arguments.output / "report.html", version=__version__)
-    with whole_file(arguments.output / "diagnosis.json") as temporary:
-        temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    answer(data, as_json=arguments.json, text=f"{paragraph(result)}\nreport: {arguments.output / 'report.html'}")
+
+    def write() -> None:
+        write_report(result, data, arguments.output / "report.html", version=__version__)
+        with whole_file(arguments.output / "diagnosis.json") as temporary:
+            temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    write()
+    text = paragraph(result)
+    if task is not None:
+        data["task"] = _run_task(arguments, task, result)
+        write()
+        text += f" {task_text(data['task'])}"
+    answer(data, as_json=arguments.json, text=f"{text}\nreport: {arguments.output / 'report.html'}")
     return 0
+
+
+def _task_of(arguments: argparse.Namespace) -> "tuple[TaskInput, TaskPlan] | None":
+    """What `--task` and its companions ask for, checked before the diagnosis begins."""
+    from ..errors import InputError
+
+    given = {name: value for name, value in vars(arguments).items() if name.startswith("task_") and value is not None}
+    if arguments.task is None:
+        if given:
+            option = "--" + min(given).replace("_", "-")
+            raise InputError(
+                option, received="without --task", expected="--task MEASURED, the images to try networks on"
+            )
+        return None
+    from ..acquisition import setting_from_text
+    from ..campaign.task import TaskInput, TaskPlan, check_task
+    from ..segmentation import choose_device
+
+    settings = {
+        side: setting_from_text(given.pop(f"task_{side}")) for side in ("low", "high") if f"task_{side}" in given
+    }
+    brought = TaskInput(measured=arguments.task, products=given.pop("task_products", None), **settings)
+    plan = TaskPlan(**{name.removeprefix("task_"): value for name, value in given.items()}, seed=arguments.seed)
+    check_task(brought)
+    choose_device(arguments.device)  # says at once how to install torch where it is missing
+    return brought, plan
+
+
+def _run_task(
+    arguments: argparse.Namespace, task: "tuple[TaskInput, TaskPlan]", result: "Diagnosis"
+) -> dict[str, object]:
+    from dataclasses import replace
+
+    from tqdm import tqdm
+
+    from ..campaign.task import run_task
+    from ..segmentation import choose_device
+
+    brought, plan = task
+    before = replace(result.twin, effects=tuple(item for item in result.twin.effects if item not in result.added))
+    with tqdm(disable=None, bar_format="{desc}") as bar:
+        found = run_task(
+            before,
+            result.twin,
+            brought,
+            arguments.output / "task",
+            plan=plan,
+            device=choose_device(arguments.device),
+            tell=bar.set_description_str,
+        )
+    for line in found["warnings"]:
+        say(f"warning: {line}")
+    return found
 
 
 def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:

@@ -126,7 +126,9 @@ def tube_fluence_interpolated(
     Raises:
         InputError: an argument outside its range.
 
-    Checked against: SpekPy called at the kV itself with a fine grid; see tests/test_spectra_tube.py for the bounds.
+    Checked against: SpekPy called at the kV itself with a fine grid; see tests/test_spectra_tube.py for the bounds. Below
+        30 kV copper without aluminium passes the tube's L lines below its edge at 9 keV, where its transmission changes
+        up to threefold within a bin: sums are 0.5 % off behind 0.05 mm at 20 kV, 7 % behind 0.2 mm, a third behind 0.5 mm.
     """
     kV = _checked_kV(kV, anode)
     tube = (anode, _checked_angle(anode_angle_deg), _checked_model(model))

@@ -119,6 +119,36 @@ def test_sums_over_the_grid_are_the_integrals_over_spekpy_s_spectrum_at_that_kV(
         assert our_gain == pytest.approx(gain, rel=factor * 1e-4), filters
 
 
+@pytest.mark.parametrize("filters", ["Al:0.1", "Al:0.5", "Al:2", "Al:0.5+Cu:0.05"])
+def test_sums_of_soft_beams_that_have_crossed_some_aluminium_hold_too(filters: str) -> None:
+    truth, gain = _spekpy_signal_and_gain(20.0, filters)
+    ours, our_gain = _signal_and_gain(20.0, filters, for_sums=True)
+    assert ours == pytest.approx(truth, rel=2e-3)
+    assert our_gain == pytest.approx(gain, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kV", "filters", "low", "high"),
+    [
+        (20.0, "Cu:0.05", -0.006, -0.003),
+        (20.0, "Cu:0.2", 0.06, 0.08),
+        (20.0, "Cu:0.5", 0.33, 0.37),
+        (25.0, "Cu:0.2", 0.0, 0.011),
+        (25.0, "Cu:0.5", 0.0, 0.004),
+    ],
+)
+def test_copper_alone_lets_the_tube_s_l_lines_through_where_a_sum_over_bins_is_off(
+    kV: float, filters: str, low: float, high: float
+) -> None:
+    """Known error: below copper's edge at 9 keV the transmission changes up to threefold within a bin, where the lines lie.
+
+    It counts where that window is what is left of the beam: 1e-4 of it behind 0.2 mm at 20 kV, 1e-9 behind 0.5 mm.
+    """
+    truth, _ = _spekpy_signal_and_gain(kV, filters)
+    ours, _ = _signal_and_gain(kV, filters, for_sums=True)
+    assert low < ours / truth - 1.0 < high
+
+
 @pytest.mark.parametrize("kV", [40.3, 70.2])
 def test_the_spectrum_s_own_heights_give_signals_within_a_fifth_of_a_percent(kV: float) -> None:
     for filters in BEAMS:

@@ -5,9 +5,9 @@ A designer trains networks on the twin's images, tries them on others of the twi
     a90_before, a90_after   trained and tried on images of the twin as it was, and with the effects that were found
     a90_real                trained and tried on measured images
 
-and, beside them, the twin's networks tried on the measured images. All are tried on the same objects. Images of the two twins
-share products and random numbers, and all networks start from one network that learnt from both, so that what differs is the
-effect. The measured images must come from a line as it is now, with foreign objects whose masks are known.
+and, beside them, the twin's networks tried on the measured images. All are tried on the same objects where the measured
+products' path lengths are known. All networks start from one network that learnt from both twins. The measured images must
+come from the line as it is now, with foreign objects whose masks are known.
 
 Every file stands in one folder; what is there already is not made again, and training goes on where it stopped.
 """
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, open_acquisition
+from ..acquisition.contrast import DILATIONS, dilations_for_pixel
 from ..acquisition.dataset_io import (
     Dataset,
     DatasetRow,
@@ -80,7 +81,7 @@ class TaskPlan:
     images: int = 120
     test_share: float = 0.5
     validation_share: float = 0.1
-    size: str = "size_mm"
+    size: str = "contrast"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -199,7 +200,7 @@ def run_task(
         result[key] = found["a90"]
         result[f"{key}_95"] = found["a90_95_interval"]
         if found["a90"] is None:
-            warnings.append(f"no {key}: {found['warnings'][-1] if found['warnings'] else 'the curve has none'}")
+            warnings.append(f"no {key}: {'; '.join(found['warnings']) or 'the curve has none'}")
     result |= {
         "size": plan.size,
         "unit": SIZES[plan.size],
@@ -316,6 +317,7 @@ def _from_acquisition(
         )
     warnings: list[str] = []
     bad = twin.maps.bad_pixels > 0
+    pixel_mm = acquisition.instrument.pixel_mm
     if not out.exists():
         everything = out.with_name("measured_frames.h5")
         summary = dataset_from_acquisition(
@@ -326,6 +328,7 @@ def _from_acquisition(
             with_counts=False,
             split=split,
             each_frame=True,
+            dilations=DILATIONS if pixel_mm is None else dilations_for_pixel(pixel_mm),
             bad_pixels=bad if bad.shape == pairs[0].low.shape else None,
             provenance={"source": brought.measured.name},
         )

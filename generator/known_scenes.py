@@ -155,7 +155,7 @@ def generate_known_scenes(
 ) -> tuple[str, ...]:
     """Write `draws` images of every scene, each with noise of its own, to a dataset file; returns warnings.
 
-    Noise depends on the seed, the scene's place and the draw: twins that differ by an effect see the same random numbers.
+    Noise depends on the seed, the scene's place and the draw, so that an effect that changes no picture changes no pixel.
     Images are named `SCENE`, `SCENE#2` and so on.
 
     Raises:

@@ -22,7 +22,7 @@ EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol full --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o diagnosis
   raytwin diagnose session.h5 -o plan --plan
-  raytwin lab -o products.h5 --protocol products --session 1 --products 96 --bones-mm 0.7,1,1.4,2,2.8,4 \\
+  raytwin lab -o products.h5 --protocol products --session 1 --products 96 --bones-mm 1,1.5,2,2.5,3,4 \\
     --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o with_pod --task products.h5
 """
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     task.add_argument(
         "--task-images", type=int, help="images from a description or references, to learn and to try (120)"
     )
-    task.add_argument("--task-size", choices=("size_mm", "contrast"), help="what a90 is a size of (size_mm)")
+    task.add_argument("--task-size", choices=("size_mm", "contrast"), help="what a90 is a size of (contrast)")
     task.add_argument("--device", default="auto", help="of the networks: auto, cpu, cuda, mps (default auto)")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws (default 0)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")

@@ -27,6 +27,10 @@ from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.materials import material_from_name, transmission
 from raytwin.spectra import Spectrum, tube_spectrum
 
+LIBRARIES = (
+    "its wheel wants the system's X and EGL libraries, on Debian libxcb-res0 libxcb-ewmh2 libxcb-composite0"
+    " libxcb-xinerama0 libegl1 libgl1 libglu1-mesa libgl1-mesa-dri"
+)
 BEAMS = ((40.0, "Al:1+Cu:0.05"), (60.0, "Al:2"), (90.0, "Al:1+Cu:0.05"), (150.0, "Al:1+Cu:0.5"))
 # each line of a wedge: layers one behind the other, in the order of the beam
 OBJECTS: dict[str, tuple[tuple[Filter, ...], ...]] = {
@@ -98,8 +102,10 @@ def _renderer() -> tuple[Any, str]:
     """gVirtualXRay ready to draw, or None and the reason."""
     try:
         from gvxrPython3 import gvxr
+    except ModuleNotFoundError:
+        return None, "gvxr is not installed; pip install gvxr"
     except ImportError as error:
-        return None, f"gvxr is not installed or cannot be loaded ({error}); pip install gvxr"
+        return None, f"gvxr cannot be loaded ({error}); {LIBRARIES}"
     try:
         gvxr.createWindow(-1, 0, "EGL")
         gvxr.setSourcePosition(-1000.0, 0.0, 0.0, "mm")

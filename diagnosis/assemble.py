@@ -123,8 +123,11 @@ class Problem:
 
     def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
-        spreads = {item.effect: item.spread for item in reversed(self.curves)}
-        curves = [variant.curve(responses, spreads.get(variant.effect)) for variant, responses in more]
+        first = {item.effect: item for item in reversed(self.curves)}
+        curves = [
+            variant.curve(responses, first[variant.effect].spread, first[variant.effect].jitter)
+            for variant, responses in more
+        ]
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
         )
@@ -466,6 +469,7 @@ def build_problem(
             pattern_noise_DN2=pattern_noise,
             block_noise_DN2=block_noise,
             quantum_DN2=float(np.mean(np.broadcast_to(model.quantum_variance_DN2, shape)[clean])),
+            dark_DN=float(np.mean(np.broadcast_to(model.dark_DN, shape)[clean])),
         )
         base_scalars[item.name] = expected_scalars(model, contexts[item.name])
 
@@ -1019,6 +1023,7 @@ def _block(
         if image is not None and values is not None:
             responses[index] = _standardised(block, base_scalars, image, values, shape)
     block["responses"] = responses
+    block["pattern"], block["pattern_jitter"] = _pattern_of_gain(item, projection, signal, len(scalar_probes), shrink)
     # a panel seldom warms evenly, and no anode's heel is a straight line
     rows, columns = shape
     ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
@@ -1034,6 +1039,29 @@ def _block(
         if index in uneven and image is not None
     }
     return block
+
+
+def _pattern_of_gain(
+    item: SessionSeries,
+    projection: MapProjection,
+    signal: NDArray[np.float64],
+    n_scalars: int,
+    shrink: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest."""
+    waves = [(i, k) for i in range(scales.PATTERN_WAVES + 1) for k in range(scales.PATTERN_WAVES + 1) if i or k]
+    smooth = np.zeros((len(projection) + n_scalars, len(waves)))
+    rest = np.zeros(len(projection) + n_scalars)
+    if item.calibrates or item.series.kind not in ("flat", "object"):
+        return smooth, rest
+    rows, columns = signal.shape
+    y, x = (np.pi * (np.arange(length) + 0.5) / length for length in (rows, columns))
+    for number, (i, k) in enumerate(waves):
+        wave = np.cos(i * y)[:, None] * np.cos(k * x)[None, :]
+        amount = 0.01 * math.sqrt(scales.PATTERN_SMOOTH_SHARE / len(waves) / float(np.mean(wave**2)))
+        smooth[: len(projection), number] = projection.apply(amount * wave * signal)
+    rest[: len(projection)] = projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
+    return smooth * shrink[:, None], rest * shrink**2
 
 
 def _standardised(
@@ -1224,7 +1252,11 @@ def _join(
         if not float(np.max(np.abs(block_responses))) > 1e-3:
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
-        curves.append(variant.curve(block_responses, _spread(variant, blocks, starts, len(residual), rows[0])))
+        spread = _spread(variant, blocks, starts, len(residual), rows[0])
+        jitter = None
+        if variant.effect == "gain_map_error":
+            jitter = np.concatenate([block["pattern_jitter"] for block in blocks])
+        curves.append(variant.curve(block_responses, spread, jitter))
         chosen.append(variant)
     for curve in curves:
         missing.pop(curve.effect, None)
@@ -1278,7 +1310,8 @@ def _spread(
 ) -> NDArray[np.float64] | None:
     """Random responses (probe, factor) a unit of strength.
 
-    A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel.
+    A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
+    a part of a gain map's change is smooth.
     """
     if variant.effect in scales.UNEVEN:
         uneven = np.zeros((size, 2))
@@ -1286,6 +1319,8 @@ def _spread(
             if row in block["uneven"]:
                 uneven[starts[number] : starts[number + 1]] = block["uneven"][row].T
         return uneven * (scales.UNEVEN_SHARE / variant.strengths[0])
+    if variant.effect == "gain_map_error":
+        return np.concatenate([block["pattern"] for block in blocks])
     if variant.effect != "output_drift":
         return None
     columns = []

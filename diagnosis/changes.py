@@ -39,6 +39,21 @@ _SHARES_OF = {
     **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "heel"), _TWO_SHARES),
 }
 _MOST_VARIANTS = 4
+_CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
+    "misregistration": [
+        *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
+        *({"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)),
+    ],
+    "veiling_glare": [{"length_mm": 2.1}, {"length_mm": 9.5}],
+    "mtf_tail": [{"reach_px": 0.84}, {"reach_px": 2.4}],
+    "k_fluorescence": [{"range_mm": 0.15}, {"range_mm": 0.33}],
+    "object_scatter": [
+        {"width_mm": 25.0},
+        {"width_mm": 70.0},
+        {"width_mm": 200.0},
+        {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
+    ],
+}
 _BOTH_ONSETS = frozenset(
     (
         "mtf_tail",
@@ -80,6 +95,8 @@ TILT_SD = 0.0005  # of the field's gradient between series
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
 UNEVEN = frozenset(("dark_drift", "heel"))
 UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
+PATTERN_WAVES = 4  # cosine waves along each side of a gain map's smooth change
+PATTERN_SMOOTH_SHARE = 0.3  # of that change's variance
 DARK_SD_DN = 0.05  # of the dark between series
 
 
@@ -101,8 +118,13 @@ class Variant:
     strengths: tuple[float, ...]
     options: Mapping[str, str] = field(default_factory=dict)
 
-    def curve(self, responses: NDArray[np.float64], spread: NDArray[np.float64] | None = None) -> Curve:
-        """The curve through responses (strength, probe) at this variant's strengths; spread as in `Curve`."""
+    def curve(
+        self,
+        responses: NDArray[np.float64],
+        spread: NDArray[np.float64] | None = None,
+        jitter: NDArray[np.float64] | None = None,
+    ) -> Curve:
+        """The curve through responses (strength, probe) at this variant's strengths; spread, jitter as in `Curve`."""
         return Curve(
             effect=self.effect,
             variant=self.name,
@@ -113,6 +135,7 @@ class Variant:
             responses=responses,
             since=self.since,
             spread=spread,
+            jitter=jitter,
         )
 
     def applied(self, strength: float) -> AppliedEffect:
@@ -152,9 +175,8 @@ def variants_of(effect: Effect) -> list[Variant]:
             )
         grown = [{**choice, item.name: value} for choice in choices for value in values]
         choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
-    if effect.id == "misregistration":
-        choices = [{"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)]
-        choices += [{"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)]
+    if effect.id in _CHOICES:
+        choices = [{item.name: item.default for item in inner} | choice for choice in _CHOICES[effect.id]]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
     shares = _SHARES_OF.get(effect.id, STRENGTH_SHARES)

@@ -491,6 +491,7 @@ def _strengths_on(
                 curve,
                 responses=curve.responses[:, fit],
                 spread=None,
+                jitter=None if curve.jitter is None else curve.jitter[fit],
             )
             result = fit_curve((problem.residual - others)[fit], part, inner, problem.groups[fit])
             strengths[effect] = result.best

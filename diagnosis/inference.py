@@ -28,8 +28,10 @@ LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
+UNKNOWN_DOUBT = 0.05  # share of what an effect of the catalogue explains that an unknown one must explain beyond it
 PAIR_DOUBT = 2e-3  # share of the stronger effect's log evidence that a second effect must bring
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
+_PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
 UNKNOWN_SHARE = 0.1  # of the groups of probes in which an effect outside the catalogue shows
 _SWEEPS = 4
@@ -62,7 +64,8 @@ class Curve:
     Fields: effect (id); variant (name of the inner parameters' choice); parameters (inner parameters, without the
     strength); low, high: plausible range of the strength; strengths (node,) > 0 ascending; responses (node, probe): m_e at
     the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
-    that come with the effect (a drifting output shifts each series' level by chance).
+    that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
+    strength squared that it gives each probe by itself (a gain map that changed pixel by pixel).
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -76,6 +79,7 @@ class Curve:
     responses: NDArray[np.float64]
     since: str = "always"
     spread: NDArray[np.float64] | None = None
+    jitter: NDArray[np.float64] | None = None
 
     def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights (strength, node) with which the nodes' responses add up at given strengths."""
@@ -288,7 +292,7 @@ def fit_curve(
         for _ in range(3):
             effective = curve.weights(np.array([best]))[0] @ solved
             extra = _law_factors(curve, best, effective, groups, law_error)
-            own = _inexact(effective, law_error)
+            own = _own_variance(curve, best, effective, law_error)
             if extra.shape[1] == 0 and float(own.max()) < _LEAST_FACTOR:
                 break
             # evidence over none: the residual's own terms change with the covariance
@@ -330,9 +334,29 @@ def _law_factors(
     return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
 
 
-def _inexact(effective: NDArray[np.float64], law_error: float) -> NDArray[np.float64]:
-    """Variance (probe,) that a law's relative error gives each probe of its own."""
-    return np.asarray((LAW_PROBE_SHARE * law_error * effective) ** 2)
+def _own_variance(
+    curve: Curve, strength: float, effective: NDArray[np.float64], law_error: float
+) -> NDArray[np.float64]:
+    """Variance (probe,) that an effect gives each probe by itself: by its law's relative error, and by chance."""
+    own = (LAW_PROBE_SHARE * law_error * effective) ** 2
+    return np.asarray(own if curve.jitter is None else own + strength**2 * curve.jitter)
+
+
+def widened_for(
+    residual: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    curve: Curve,
+    strength: float,
+    nuisances: Nuisances,
+    groups: NDArray[np.intp],
+    law_error: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Nuisances]:
+    """Residual (probe,), responses (row, probe) and nuisances where a curve's law at a strength may be off by law_error."""
+    effective = curve.weights(np.array([strength]))[0] @ nuisances.solve_all(curve.responses)
+    extra = _law_factors(curve, strength, effective, groups, law_error)
+    own = _own_variance(curve, strength, effective, law_error)
+    moved, moved_rows, wide, _ = _with_law(residual, rows, nuisances, extra, own)
+    return moved, moved_rows, wide
 
 
 def _with_law(
@@ -476,6 +500,7 @@ def weigh_hypotheses(
     n_pairs = max(n_effects * (n_effects - 1) // 2, 1)
     done: set[tuple[str, str]] = set()
     table = _NodeTable(curves)
+    starts: list[tuple[float, str, str, _PairStart]] = []
     for first in ranked[:pairs_from]:
         # the second is looked for in what the first leaves, over all its variants
         leading = singles[first]
@@ -485,17 +510,23 @@ def weigh_hypotheses(
             if second == first or key in done:
                 continue
             done.add(key)
-            evidence, strengths, chosen = _fit_pair(
-                residual, leading, second_fits, nuisances, groups, law_errors, states=states, table=table
-            )
-            # the first's own variants were averaged above; its best stands for them
-            evidence += evidence_of[first] - leading.log_evidence
-            # what a law that is slightly off leaves of a strong effect, any second effect can take up a little of
-            evidence -= PAIR_DOUBT * max(evidence_of[first], evidence_of[second], 0.0)
-            raw.append((key, evidence, math.log(priors.pair / n_pairs), strengths, chosen, ""))
+            start = _start_pair(leading, second_fits, states=states, table=table)
+            # the first's own variants were averaged above; its best stands for them. What a law that is slightly off
+            # leaves of a strong effect, any second effect can take up a little of
+            more = evidence_of[first] - leading.log_evidence
+            more -= PAIR_DOUBT * max(evidence_of[first], evidence_of[second], 0.0)
+            starts.append((more, first, second, start))
+    starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
+    for number, (more, first, second, start) in enumerate(starts):
+        errors = law_errors if number < _PAIRS_IN_FULL else ()
+        evidence, strengths, chosen = _finish_pair(residual, start, nuisances, groups, errors, table=table)
+        key = (min(first, second), max(first, second))
+        raw.append((key, evidence + more, math.log(priors.pair / n_pairs), strengths, chosen, ""))
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names
     unknown, place = unknown_evidence(residual, nuisances, parts, names)
+    # no law is exact: a strong effect leaves a part of what it does to be explained by anything
+    unknown -= UNKNOWN_DOUBT * max(0.0, min(unknown, max((evidence for _, evidence, *_ in raw), default=0.0)))
     raw.append(((UNKNOWN,), unknown, math.log(priors.unknown), {}, {}, place))
     scores = np.array([power * evidence + prior for _, evidence, prior, *_ in raw])
     probability = np.exp(scores - scores.max())
@@ -562,29 +593,28 @@ def _states_of(
     effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
     for law_error, probability in law_errors:
         extra = _law_factors(curve, leading.best, effective, groups, law_error)
-        own = _inexact(effective, law_error)
+        own = _own_variance(curve, leading.best, effective, law_error)
         if extra.shape[1] or float(own.max()) >= _LEAST_FACTOR:
             moved, nodes, wide, shift = _with_law(residual, table.nodes, nuisances, extra, own)
             result.append(state(wide, nodes, moved, shift + math.log(probability)))
     return result
 
 
-def _fit_pair(
-    residual: NDArray[np.float64],
-    first: CurveFit,
-    seconds: Sequence[CurveFit],
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
-    law_errors: Sequence[tuple[float, float]],
-    *,
-    states: Sequence[_State],
-    table: _NodeTable,
-) -> tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]:
-    """Log evidence over none of an effect's best variant with another effect, strengths, and the variants.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PairStart:
+    """An effect's best variant with the best variant of another: grid of strengths, log evidence over none (variants averaged)."""
 
-    The other's variants are weighed with the first's law only inexact; where the best of them moves the probes by so much
-    that its own law matters, both may be off.
-    """
+    first: Curve
+    second: Curve
+    grid: "_PairGrid"
+    log_evidence: float
+    moves: float
+
+
+def _start_pair(
+    first: CurveFit, seconds: Sequence[CurveFit], *, states: Sequence[_State], table: _NodeTable
+) -> _PairStart:
+    """The other's variants weighed with the first's law only inexact."""
     a = first.curve
     tried: list[tuple[float, _PairGrid, CurveFit]] = []
     for second in seconds:
@@ -596,16 +626,33 @@ def _fit_pair(
         grid = max(grids, key=lambda item: item.log_integral)
         tried.append((grid.log_integral, grid, second))
     mean = float(_log_mean_exp(np.array([item[0] for item in tried])))
-    value, grid, second = max(tried, key=lambda item: item[0])
-    share = mean - value
-    b = second.curve
-    rows = table.rows(a, b)
-    nodes = table.nodes[rows]
-    best: tuple[float, _PairGrid] = (value, grid)
+    _, grid, chosen = max(tried, key=lambda item: item[0])
+    b = chosen.curve
+    rows = table.rows(a, b)[len(a.responses) :]
     weights_b = b.weights(np.array([grid.best[1]]))[0]
-    gram_b = states[0].gram[np.ix_(rows[len(a.responses) :], rows[len(a.responses) :])]
-    moves = math.sqrt(max(float(weights_b @ gram_b @ weights_b), 0.0))
-    if moves * law_errors[0][0] > _LAW_MATTERS if law_errors else False:
+    moves = math.sqrt(max(float(weights_b @ states[0].gram[np.ix_(rows, rows)] @ weights_b), 0.0))
+    return _PairStart(first=a, second=b, grid=grid, log_evidence=mean, moves=moves)
+
+
+def _finish_pair(
+    residual: NDArray[np.float64],
+    pair: _PairStart,
+    nuisances: Nuisances,
+    groups: NDArray[np.intp],
+    law_errors: Sequence[tuple[float, float]],
+    *,
+    table: _NodeTable,
+) -> tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]:
+    """Log evidence over none of two effects, strengths, and the variants.
+
+    Where the second moves the probes by so much that its own law matters, both may be off.
+    """
+    a, b, grid = pair.first, pair.second, pair.grid
+    value = grid.log_integral
+    share = pair.log_evidence - value
+    nodes = table.nodes[table.rows(a, b)]
+    best: tuple[float, _PairGrid] = (value, grid)
+    if law_errors and pair.moves * law_errors[0][0] > _LAW_MATTERS:
         solved = nuisances.solve_all(nodes)
         for law_error, probability in law_errors:
             start = grid.best
@@ -621,7 +668,8 @@ def _fit_pair(
                 )
                 if not extra.shape[1]:
                     break
-                own = _inexact(effective_a, law_error) + _inexact(effective_b, law_error)
+                own = _own_variance(a, start[0], effective_a, law_error)
+                own = own + _own_variance(b, start[1], effective_b, law_error)
                 moved, moved_nodes, wide, shift = _with_law(residual, nodes, nuisances, extra, own)
                 again = _pair_integral(a, b, _pair_terms(wide, moved_nodes, moved), shift + math.log(probability))
                 if again.log_integral > best[0]:

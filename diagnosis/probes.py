@@ -21,6 +21,7 @@ from .summaries import BLOCK_PX, LAGS, SeriesSummary
 
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
+_NOISE_PIXELS = 65_536  # whose noise is projected at a time
 OUTLIER_SD = 7.0
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
@@ -112,7 +113,7 @@ class ScalarContext:
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
     base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise_DN2,
     block_noise_DN2: of the corrected mean frame from pixel to pixel and of block means; quantum_DN2: the base model's quantum
-    variance of one frame.
+    variance of one frame; dark_DN: the base model's mean dark.
     """
 
     kind: str
@@ -127,6 +128,7 @@ class ScalarContext:
     pattern_noise_DN2: float
     block_noise_DN2: float
     quantum_DN2: float
+    dark_DN: float
 
 
 def time_templates(frames: int) -> list[tuple[str, NDArray[np.float64]]]:
@@ -164,37 +166,49 @@ def expected_scalars(
     keep = _lag_loss(expected)
     row, column = expected.row_variance_DN2, expected.column_variance_DN2
     mean_q, mean_w = quantum_mean(expected, good)
-    total = mean_q * keep + mean_w + row + column
+    moving = _MovingPicture.of(expected, context)
+    total = mean_q * keep + mean_w + row + column + moving.pixels(good)
     if context.frames > 2:
         for label, name in enumerate(context.label_names):
             mask = good & (context.labels == label)
             q, w = quantum_mean(expected, mask)
-            here = q * keep + w + row + column
+            shared = moving.pixels(mask)
+            here = q * keep + w + row + column + shared
             values[f"log_variance {name}"] = math.log(max(here, 1e-12))
             for dr, dc in LAGS:
-                covariance = (
-                    q * keep * autocovariance(expected, dr, dc) + (row if dr == 0 else 0) + (column if dc == 0 else 0)
-                )
+                covariance = q * keep * autocovariance(expected, dr, dc) + shared
+                covariance += (row if dr == 0 else 0) + (column if dc == 0 else 0)
                 values[f"correlation {name} ({dr},{dc})"] = covariance / max(here, 1e-12)
         line_q = mean_q * keep
         values["row_ratio"] = math.log(
-            max(row * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w, 1e-12) / total
+            max(
+                (row + moving.rows(good)) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w,
+                1e-12,
+            )
+            / total
         )
         values["column_ratio"] = math.log(
-            max(column * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w, 1e-12) / total
+            max(
+                (column + moving.columns(good)) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w,
+                1e-12,
+            )
+            / total
         )
         values["block_ratio"] = math.log(
             max(
-                line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX) + mean_w + BLOCK_PX * (row + column),
+                line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
+                + mean_w
+                + BLOCK_PX * (row + column)
+                + BLOCK_PX**2 * moving.pixels(good),
                 1e-12,
             )
             / total
         )
         temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
-        full = mean_q + mean_w + row + column
+        full = mean_q + mean_w + row + column + moving.pixels(good)
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
-            values[f"temporal_correlation {step}"] = correlation * mean_q / full
+            values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(good, step)) / full
         values["kurtosis"] = 0.0
         if context.kind in ("flat", "object"):
             signal = context.reference_signal_DN
@@ -209,7 +223,7 @@ def expected_scalars(
             values[f"trend {name}"] = float(profile @ template) * scale / math.sqrt(context.frames)
     if context.kind == "afterglow" and context.previous_signal_DN:
         profile = frame_profile(expected, good) + float(
-            np.mean((expected.mean_DN - expected.dark_DN + np.asarray(dark_change_DN))[good])
+            np.mean(np.broadcast_to(expected.mean_DN + np.asarray(dark_change_DN), good.shape)[good]) - context.dark_DN
         )
         for start, stop in _afterglow_bins(context.frames):
             values[f"afterglow frames {start}-{stop - 1}"] = (
@@ -230,6 +244,70 @@ def expected_scalars(
         )
         values["outliers"] = math.sqrt(0.7 * expected.bad_pixel_share * n_good + 0.375)
     return values
+
+
+@dataclass(frozen=True, slots=True)
+class _MovingPicture:
+    """What a picture that fades from frame to frame adds to variances, once the frames' common factor is taken out.
+
+    Fields: images (trend, row, column); steps (trend, trend): half of the mean product of changes from one frame to the
+    next; courses (trend, frame).
+    """
+
+    images: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    courses: NDArray[np.float64]
+
+    @staticmethod
+    def of(expected: ExpectedSeries, context: ScalarContext) -> "_MovingPicture":
+        good = context.good
+        shape = np.ones(good.shape)
+        if context.kind in ("flat", "object"):
+            signal = np.broadcast_to(expected.signal_DN, good.shape)
+            shape = signal / max(float(signal[good].mean()), 1e-12)
+        images, courses = [], []
+        for image, course in expected.trend_DN or ():
+            whole = np.broadcast_to(np.asarray(image, dtype=np.float64), good.shape)
+            own = whole - float(whole[good].mean()) * shape
+            profile = np.asarray(course, dtype=np.float64)
+            # a hundredth of a DN adds nothing to any variance
+            if profile.size > 1 and float(np.abs(own[good]).max()) * float(np.ptp(profile)) > 0.01:
+                images.append(np.where(good, own, 0.0))
+                courses.append(profile - profile.mean())
+        if not images:
+            return _MovingPicture(np.zeros((0, 1, 1)), np.zeros((0, 0)), np.zeros((0, 1)))
+        profiles = np.stack(courses)
+        steps = np.diff(profiles, axis=1)
+        return _MovingPicture(np.stack(images), 0.5 * steps @ steps.T / steps.shape[1], profiles)
+
+    def pixels(self, mask: NDArray[np.bool_]) -> float:
+        """Variance of single pixels, DN^2."""
+        if not len(self.images):
+            return 0.0
+        inside = self.images[:, mask]
+        return float(np.sum(self.steps * (inside @ inside.T))) / max(inside.shape[1], 1)
+
+    def rows(self, good: NDArray[np.bool_]) -> float:
+        """Variance of rows' means, DN^2."""
+        return self._lines(good, 2)
+
+    def columns(self, good: NDArray[np.bool_]) -> float:
+        """Variance of columns' means, DN^2."""
+        return self._lines(good, 1)
+
+    def lasting(self, good: NDArray[np.bool_], step: int) -> float:
+        """Mean product of a pixel's deviations `step` frames apart, DN^2."""
+        if not len(self.images):
+            return 0.0
+        inside = self.images[:, good]
+        early, late = self.courses[:, :-step], self.courses[:, step:]
+        return float(np.sum(early @ late.T / early.shape[1] * (inside @ inside.T))) / max(inside.shape[1], 1)
+
+    def _lines(self, good: NDArray[np.bool_], axis: int) -> float:
+        if not len(self.images):
+            return 0.0
+        means = self.images.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1)
+        return float(np.sum(self.steps * (means @ means.T))) / means.shape[1]
 
 
 def frame_profile(expected: ExpectedSeries, good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -499,6 +577,20 @@ class MapProjection:
 
         q = (self._rows @ np.asarray(image, dtype=np.float32)[self.mask]).astype(np.float64)
         return np.asarray(solve_triangular(self._lower, q, lower=True))
+
+    def pixel_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
+        if not self._names:
+            return np.zeros(0)
+        from scipy.linalg import solve_triangular
+
+        inverse = solve_triangular(self._lower, np.eye(len(self)), lower=True)
+        variance = np.asarray(sd_DN, dtype=np.float32)[self.mask] ** 2
+        total = np.zeros(len(self))
+        for start in range(0, variance.size, _NOISE_PIXELS):
+            part = slice(start, start + _NOISE_PIXELS)
+            total += (inverse @ self._rows[:, part]) ** 2 @ variance[part]
+        return total
 
     def names(self) -> list[ProbeName]:
         """One name a probe."""

@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.effects.effect import Parameter
 from .changes import Variant
-from .inference import UNKNOWN, CurveFit, Hypothesis, Nuisances, fit_curve
+from .inference import UNKNOWN, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
-_ROUNDS = 3
+_ROUNDS = 5
+_ENOUGH = 1.0  # gain of log evidence below which the search ends
+_STEP = 0.1  # of half a parameter's range: to find how responses change with it
+_FARTHEST = 0.6  # step in half ranges
+_LAW_ERROR = 0.1
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
 
 
@@ -102,44 +106,76 @@ def _refined(
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fit_curve(residual, item.curve(whitener.apply(answer[0]), fit.curve.spread), nuisances, groups)
+        return fit_curve(
+            residual, item.curve(whitener.apply(answer[0]), fit.curve.spread, fit.curve.jitter), nuisances, groups
+        )
 
     inner = [item for item in EFFECTS[variant.effect].parameters[1:] if item.fitted and item.name in variant.parameters]
     here = tried(near(best.parameters, (1.0,)))
     if here is None:
         return None
     strength = here.best
-    share = 0.5
-    for _ in range(_ROUNDS if inner else 1):
-        for item in inner:
-            for value in _beside(item, best.parameters[item.name], share):
-                candidate = tried(near({**best.parameters, item.name: value}, (1.0,)))
-                if candidate is not None and candidate.log_evidence > here.log_evidence:
-                    here = candidate
-                    best = replace(best, parameters={**best.parameters, item.name: value})
-                    strength = here.best
-                    break
-        share *= 0.5
+    for _ in range(_ROUNDS if inner else 0):
+        steps = _newton(residual, here, best, inner, nuisances, groups, respond, whitener)
+        before = here.log_evidence
+        for share in (1.0, 0.3, 0.1):
+            parameters = dict(best.parameters)
+            for item in inner:
+                parameters[item.name] = _moved(item, parameters[item.name], share * steps[item.name])
+            candidate = tried(near(parameters, (1.0,)))
+            if candidate is not None and candidate.log_evidence > here.log_evidence:
+                here, strength = candidate, candidate.best
+                best = replace(best, parameters=parameters)
+                break
+        if here.log_evidence - before < _ENOUGH:
+            break
     final = near(best.parameters, _NEAR)
     answer = respond([final])
     return (final, answer[0]) if 0 in answer else None
 
 
-def _beside(item: Parameter, value: float, share: float) -> list[float]:
-    """Values to either side of a parameter's, within its range; `share` of a grid's step away."""
+def _newton(
+    residual: NDArray[np.float64],
+    here: CurveFit,
+    variant: Variant,
+    inner: Sequence[Parameter],
+    nuisances: Nuisances,
+    groups: NDArray[np.intp],
+    respond: Responder,
+    whitener: Whitener,
+) -> dict[str, float]:
+    """Steps of the inner parameters, each in half of its range, towards where the probes want them.
+
+    Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
+    by _LAW_ERROR, each parameter within about its range.
+    """
+    strength = here.best
+    at = np.asarray(here.curve.response(strength))
+    rows, kept = [at], []
+    for item in inner:
+        value = variant.parameters[item.name]
+        step = _STEP if _moved(item, value, _STEP) != value else -_STEP
+        moved = {**variant.parameters, item.name: _moved(item, value, step)}
+        answer = respond([replace(variant, parameters=moved, strengths=(strength,))])
+        if 0 in answer:
+            rows.append((whitener.apply(answer[0])[0] - at) / step)
+            kept.append(item.name)
+    left, slopes, wide = widened_for(residual - at, np.stack(rows), here.curve, strength, nuisances, groups, _LAW_ERROR)
+    normal = wide.inner(slopes, slopes)
+    normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
+    normal[0, 0] += 1e-9
+    solved = np.linalg.solve(normal, wide.inner(slopes, left[None, :])[:, 0])
+    return {item.name: 0.0 for item in inner} | {
+        name: float(np.clip(solved[1 + number], -_FARTHEST, _FARTHEST)) for number, name in enumerate(kept)
+    }
+
+
+def _moved(item: Parameter, value: float, step: float) -> float:
+    """A parameter's value moved by `step` times half of its range, within the range."""
     if item.log:
-        step = (math.log(item.high) - math.log(item.low)) / 2.0 * share
-        values = [value * math.exp(step), value * math.exp(-step)]
-        return [
-            min(max(one, item.low), item.high)
-            for one in values
-            if item.low < one * math.exp(step) and one < item.high * math.exp(step)
-        ]
-    if item.name.endswith("_deg") and item.high - item.low >= 360.0:
-        return [(value + 90.0 * share) % 360.0, (value - 90.0 * share) % 360.0]
-    step = (item.high - item.low) / 2.0 * share
-    return [
-        min(max(one, item.low), item.high)
-        for one in (value + step, value - step)
-        if item.low - step < one < item.high + step
-    ]
+        moved = value * math.exp(step * math.log(item.high / item.low) / 2.0)
+    elif item.name.endswith("_deg") and item.high - item.low >= 360.0:
+        return (value + 180.0 * step) % 360.0
+    else:
+        moved = value + step * (item.high - item.low) / 2.0
+    return min(max(moved, item.low), item.high)

@@ -40,6 +40,16 @@ class Whitening:
             result[:, members] = solve_triangular(lower, vectors[:, members].T, lower=True, check_finite=False).T
         return result
 
+    def variances(self, variances: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variances (probe,) of independent extra noise of the probes, as they are in whitened ones."""
+        from scipy.linalg import solve_triangular
+
+        result = np.empty_like(variances)
+        for members, lower in zip(self._members, self._lower, strict=True):
+            inverse = solve_triangular(lower, np.eye(len(members)), lower=True, check_finite=False)
+            result[members] = inverse**2 @ variances[members]
+        return result
+
     def curves(self, curves: Sequence[Curve]) -> tuple[Curve, ...]:
         """Curves with their responses whitened."""
         if not curves:
@@ -49,6 +59,8 @@ class Whitening:
         result = []
         for curve in curves:
             spread = None if curve.spread is None else np.ascontiguousarray(self.apply(curve.spread.T).T)
-            result.append(replace(curve, responses=whole[position : position + len(curve.responses)], spread=spread))
+            jitter = None if curve.jitter is None else self.variances(curve.jitter)
+            responses = whole[position : position + len(curve.responses)]
+            result.append(replace(curve, responses=responses, spread=spread, jitter=jitter))
             position += len(curve.responses)
         return tuple(result)

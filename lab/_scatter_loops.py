@@ -1,4 +1,4 @@
-"""The compiled photon histories of `scatter`: first collision forced, every collision heard by random detector points."""
+"""The compiled photon histories of `scatter`: first collision forced, every collision heard all over the detector."""
 
 import math
 
@@ -9,6 +9,8 @@ from ._loops import seed_stream, uniform
 
 _ELECTRON_KEV = 510.99895
 _STREAMS = 64
+# Steps of an additive sequence in four dimensions that fills them evenly: powers of 1 / g, g^5 = g + 1.
+_STEPS = tuple(1.1673039782614187 ** -(power + 1) for power in range(4))
 
 
 @njit(inline="always")
@@ -83,23 +85,29 @@ def follow_photons(  # type: ignore[no-untyped-def]
     n_energy = mu.shape[1]
     n_material = mu.shape[0]
     tally_rows, tally_columns = tally_grid
-    area_mm2 = detector_mm[0] * detector_mm[1] / points
+    area_mm2 = detector_mm[0] * detector_mm[1] / (points * points)
+    state = np.empty(4, dtype=np.uint64)
+    seed_stream(state, key, 9, 1, 0)
+    offset_x, offset_y, offset_energy, offset_depth = uniform(state), uniform(state), uniform(state), uniform(state)
+    per_stream = histories // _STREAMS
     for stream in range(_STREAMS):
-        state = np.empty(4, dtype=np.uint64)
         seed_stream(state, key, 9, 0, stream)
-        for _ in range(histories // _STREAMS):
-            x, y = (uniform(state) - 0.5) * field_mm[1], (uniform(state) - 0.5) * field_mm[0]
+        for number in range(stream * per_stream, (stream + 1) * per_stream):
+            # Where a history starts is spread evenly: place, energy and depth.
+            x = ((offset_x + number * _STEPS[0]) % 1.0 - 0.5) * field_mm[1]
+            y = ((offset_y + number * _STEPS[1]) % 1.0 - 0.5) * field_mm[0]
             cell = _cell(x, y, half_x, half_y, cell_x, cell_y, rows, columns)
             if cell < 0 or height_mm[cell] <= 0.0:
                 continue
-            energy = group_energy[int(_pick(group_cumulated, uniform(state)) + 1.0)]
+            energy = group_energy[int(_pick(group_cumulated, (offset_energy + number * _STEPS[2]) % 1.0) + 1.0)]
             keV = lowest_keV + step_keV * energy
             length = math.sqrt(x * x + y * y + source_mm * source_mm)
             dx, dy, dz = x / length, y / length, -source_mm / length
             here = _mu_of(cell, energy, share, mu)
             depth = here * height_mm[cell]
             weight = -math.expm1(-depth)
-            z = height_mm[cell] * (1.0 + math.log(1.0 - uniform(state) * weight) / depth)
+            reached = (offset_depth + number * _STEPS[3]) % 1.0
+            z = height_mm[cell] * (1.0 + math.log(1.0 - reached * weight) / depth)
             for order in range(orders):
                 # The material that is hit, and what remains of the weight when it does not absorb.
                 left = uniform(state) * here
@@ -111,9 +119,9 @@ def follow_photons(  # type: ignore[no-untyped-def]
                 if weight < 1e-7:
                     break
                 is_coherent = uniform(state) < coherent[material, energy]
-                for _ in range(points):
-                    to_x = (uniform(state) - 0.5) * detector_mm[1]
-                    to_y = (uniform(state) - 0.5) * detector_mm[0]
+                for point in range(points * points):
+                    to_x = ((point % points + uniform(state)) / points - 0.5) * detector_mm[1]
+                    to_y = ((point // points + uniform(state)) / points - 0.5) * detector_mm[0]
                     px, py, pz = to_x - x, to_y - y, -gap_mm - z
                     away = math.sqrt(px * px + py * py + pz * pz)
                     px, py, pz = px / away, py / away, pz / away

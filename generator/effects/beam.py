@@ -185,15 +185,19 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
     mu = anode[:top]
     first, second = context.weights
     rows = np.stack([first, first * mu, first * mu**2, second, second * mu, second * mu**2])
-    across = path * _field_coordinate(context.shape, parameters["direction_deg"] - request.panel_rotation_deg)
 
+    def path_of(direction_deg: float) -> FloatArray:
+        u = _field_coordinate(context.shape, direction_deg)
+        return path * (u + parameters["curvature"] * u**2)
+
+    across = path_of(parameters["direction_deg"] - request.panel_rotation_deg)
     behind = context.project("heel", rows)
     tiny = 1e-300
     signal = _factor(np.maximum(behind[:3], tiny), across)
     variance = _factor(np.maximum(behind[3:], tiny), across)
     if absorbed:
         # the calibrated flat holds the heel of the unturned panel in the open beam
-        seen = path * _field_coordinate(context.shape, parameters["direction_deg"])
+        seen = path_of(parameters["direction_deg"])
         known = _factor(np.sum(rows[:3], axis=1)[:, None, None], seen)
         signal, variance = signal / known, variance / known
     return replace(state, signal_DN=state.signal_DN * signal, variance_DN2=state.variance_DN2 * variance)
@@ -221,9 +225,18 @@ HEEL = Effect(
             source="direction in which the signal falls: 0 along rising row index, 90 along rising column index",
             log=False,
         ),
+        Parameter(
+            name="curvature",
+            unit="",
+            low=-0.4,
+            high=0.8,
+            default=0.2,
+            source="cot(anode angle) times the field's angle: 0.24 for 12 degrees and 51 mm at 1 m",
+            log=False,
+        ),
     ),
     stage="arrivals",
-    reference="path z cot(alpha + phi) in the anode, linear in the position: Braun (1978), doi:10.1088/0031-9155/23/5/005",
+    reference="path z cot(alpha + phi) in the anode, to second order in the position: Braun (1978), doi:10.1088/0031-9155/23/5/005",
     after_calibration=True,
     change=_tilt,
     needs=("spectral",),

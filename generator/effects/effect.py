@@ -5,8 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 
+import numpy as np
+
 from ...errors import InputError
-from ..line_state import STAGES, Change
+from ..line_state import STAGES, Change, FloatArray
 
 SINCE = ("always", "calibration")
 
@@ -93,6 +95,31 @@ class Effect:
                 raise InputError(f"{name} of effect {self.id}", received=value, expected="a finite number")
             result[name] = float(value)
         return result
+
+
+def spread_transfer(
+    f_row: FloatArray, f_column: FloatArray, *, reach_px: float, order: float, usual_order: float
+) -> FloatArray:
+    """Transfer function (1 + (m / p) (2 pi L f)^2)^-p of light that spreads with reach L, of any shape p.
+
+    p = 1/2 is exp(-R / L) / (2 pi L R), p = 1 a Lorentzian; larger orders come close to a Gaussian. The rms distance is the
+    same for all orders; m = `usual_order` is the one for which reach_px is defined. Frequencies in cycles per pixel.
+    """
+    squared = (2.0 * np.pi * reach_px) ** 2 * (f_row**2 + f_column**2)
+    return np.asarray((1.0 + usual_order / order * squared) ** -order)
+
+
+def order_parameter(usual: float) -> Parameter:
+    """The shape of a spread's transfer function."""
+    return Parameter(
+        name="order",
+        unit="",
+        low=0.3,
+        high=6.0,
+        default=usual,
+        source="1/2: exponential over distance, 1: Lorentzian, large: Gaussian",
+        log=True,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

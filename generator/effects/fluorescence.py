@@ -1,8 +1,8 @@
 """K fluorescence caught again at a distance, for photons above the scintillator's K edges.
 
 A share s of the photons above the edge sends out a K photon of energy E_K which is absorbed some distance away, with
-K(f) = 1 / sqrt(1 + (2 pi L f)^2). The picture's transfer function becomes 1 - eta + eta K(f), the noise power
-1 - nu + nu K(f):
+K(f) = 1 / sqrt(1 + (2 pi L f)^2) (`order` 1/2; other shapes: effect.py). The picture's transfer function becomes
+1 - eta + eta K(f), the noise power 1 - nu + nu K(f):
 
     eta = s sum_above w1 E_K / E / sum w1          nu = s sum_above w2 2 (E - E_K) E_K / E^2 / sum w2
 
@@ -18,7 +18,9 @@ import numpy as np
 from ...acquisition.setting import Filter
 from ...materials import atomic_number_from_symbol, material_from_name
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Parameter
+from .effect import Effect, Parameter, order_parameter, spread_transfer
+
+_USUAL_ORDER = 0.5
 
 
 @lru_cache(maxsize=16)
@@ -58,7 +60,10 @@ def _spread_k_photons(state: LineState, parameters: Mapping[str, float], context
     power = share * float(weights[1] @ (2.0 * part * (1.0 - part))) / float(weights[1].sum())
 
     def transfer_of(amount: float, f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        return np.asarray(1.0 - amount + amount / np.sqrt(1.0 + (2 * np.pi * range_px) ** 2 * (f_row**2 + f_column**2)))
+        spread = spread_transfer(
+            f_row, f_column, reach_px=range_px, order=parameters["order"], usual_order=_USUAL_ORDER
+        )
+        return np.asarray(1.0 - amount + amount * spread)
 
     return replace(
         state,
@@ -89,6 +94,7 @@ K_FLUORESCENCE = Effect(
             source="absorption length of 29-31 keV photons in CsI is 0.25 mm",
             log=True,
         ),
+        order_parameter(_USUAL_ORDER),
     ),
     stage="optics",
     reference="Metz and Vyborny (1983), doi:10.1088/0031-9155/28/5/008",

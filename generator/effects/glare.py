@@ -1,6 +1,7 @@
 """Veiling glare: light that travels far inside the detector. It knows nothing of gap or thickness.
 
 h = (1 - r) delta + r exp(-R / L) / (2 pi L R),    transfer function (1 - r) + r / sqrt(1 + (2 pi L f)^2)
+(`order` 1/2; other shapes: effect.py)
 """
 
 from collections.abc import Mapping
@@ -9,7 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Parameter
+from .effect import Effect, Parameter, order_parameter, spread_transfer
+
+_USUAL_ORDER = 0.5
 
 
 def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -19,9 +22,10 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
     length_px = parameters["length_mm"] / needed(context.twin.instrument.pixel_mm, "pixel_mm", "veiling_glare")
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        return np.asarray(
-            (1.0 - share) + share / np.sqrt(1.0 + (2 * np.pi * length_px) ** 2 * (f_row**2 + f_column**2))
+        spread = spread_transfer(
+            f_row, f_column, reach_px=length_px, order=parameters["order"], usual_order=_USUAL_ORDER
         )
+        return np.asarray((1.0 - share) + share * spread)
 
     return replace(state, optical_transfers=(*state.optical_transfers, transfer))
 
@@ -48,6 +52,7 @@ VEILING_GLARE = Effect(
             source="reach of glare in scintillator and cover glass",
             log=True,
         ),
+        order_parameter(_USUAL_ORDER),
     ),
     stage="optics",
     reference="Seibert, Nalcioglu, Roeck (1984), doi:10.1118/1.595527",

@@ -1,14 +1,16 @@
 """Radiation scattered by the object: a broad floor in its shadow, wider the further the detector stands behind it.
 
-    S = c [a P (-ln T)] * K,    sum K = 1
+    S = c (E / 45 keV)^e [a P (-ln T)] * K,    sum K = 1
 
 P is the primary signal and T = P / P_open; photons that the object takes out of the primary beam reappear elsewhere.
-a is the share of its materials' attenuation that is scattering, over that of water, at the beam's mean energy: metal
-absorbs. A pixel that a sharp border cuts scatters as its two sides do.
+a is the share of its materials' attenuation that is scattering, over that of water, at the beam's mean energy E: metal
+absorbs (`own_albedo` 0: every material scatters as water does). e says how scatter behind 20 mm of water changes from
+beam to beam: coherent scatter goes forward and fades with energy. A pixel that a sharp border cuts scatters as its two
+sides do.
 K is the picture of a point that scatters into all directions alike, seen on a plane at distance h:
-K(R) = h / (2 pi (h^2 + R^2)^(3/2)), half as high at R = 0.77 h. One law for the air gap: h grows in proportion to the
-gap plus 10 mm (half of a product), and the scattered light in all stays, so that what a field of finite size
-catches falls by itself. Only the field that the detector covers is irradiated.
+K(R) = h / (2 pi (h^2 + R^2)^(3/2)), half as high at R = 0.77 h. One law for the air gap: h grows as a power
+(`gap_exponent`, 1: in proportion) of the gap plus 10 mm (half of a product), and the scattered light in all stays, so
+that what a field of finite size catches falls by itself. Only the field that the detector covers is irradiated.
 """
 
 from collections.abc import Mapping
@@ -25,6 +27,7 @@ from .effect import Effect, Parameter
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0
+_REFERENCE_KEV = 45.0
 _BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a pixel cannot be told by its mean
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
 
@@ -81,13 +84,19 @@ def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) 
     return row_back @ spread @ column_back.T, centre
 
 
-def _scattering_share(context: LineContext) -> NDArray[np.float64]:
-    """Scattering's share of attenuation (row, column), or (1, 1), over that of water, at the beam's mean energy."""
-    thickness = context.request.thickness_mm
-    if not thickness or context.weights is None or context.energies_keV is None or context.model is None:
-        return np.ones((1, 1))
+def _mean_energy_keV(context: LineContext) -> float:
+    """Mean energy of the open beam's signal, keV."""
+    if context.weights is None or context.energies_keV is None:
+        return _REFERENCE_KEV
     weights = context.weights[0]
-    energy_keV = float(weights @ context.energies_keV[: weights.size] / weights.sum())
+    return float(weights @ context.energies_keV[: weights.size] / weights.sum())
+
+
+def _scattering_share(context: LineContext, energy_keV: float) -> NDArray[np.float64]:
+    """Scattering's share of attenuation (row, column), or (1, 1), over that of water, at an energy."""
+    thickness = context.request.thickness_mm
+    if not thickness or context.energies_keV is None or context.model is None:
+        return np.ones((1, 1))
     water = _albedo("water_liquid", energy_keV)
     at = int(np.searchsorted(context.energies_keV, energy_keV))
     whole, scattered = np.zeros(context.shape), np.zeros(context.shape)
@@ -133,11 +142,14 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
         usual = instrument.source_detector_mm - instrument.source_object_mm
     half_height = parameters["width_mm"] / 1.533  # the kernel's full width at half maximum is 1.533 h
     at_usual_gap = half_height
-    half_height *= (max(gap, 0.0) + _HALF_PRODUCT_MM) / (max(usual, 0.0) + _HALF_PRODUCT_MM)
+    wider = (max(gap, 0.0) + _HALF_PRODUCT_MM) / (max(usual, 0.0) + _HALF_PRODUCT_MM)
+    half_height *= wider ** parameters["gap_exponent"]
     shape = np.broadcast_shapes(state.signal_DN.shape, context.shape)
     signal = np.broadcast_to(state.signal_DN, shape)
     depth = -np.log(np.maximum(signal / context.open_signal_DN, 1e-12))
-    source = depth * _scattering_share(context)
+    energy_keV = _mean_energy_keV(context)
+    own = parameters["own_albedo"]
+    source = depth if own == 0 else depth * (1.0 + own * (_scattering_share(context, energy_keV) - 1.0))
     field = np.stack([signal * source, np.broadcast_to(state.variance_DN2, shape) * source])
     field = _shared_at_borders(field, signal, depth)
     scattered, _ = _spread(field, pitch, half_height)
@@ -147,6 +159,7 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     water = context.model.mu("water_liquid")[:top]
     behind_water = -np.log(float(weights @ np.exp(-_WATER_MM * water)) / float(weights.sum()))
     factor = parameters["strength"] / 100.0 / (behind_water * centre)
+    factor *= (energy_keV / _REFERENCE_KEV) ** parameters["energy_exponent"]
     return replace(
         state,
         signal_DN=state.signal_DN + factor * scattered[0],
@@ -164,7 +177,7 @@ OBJECT_SCATTER = Effect(
             low=1.0,
             high=50.0,
             default=10.0,
-            source="scatter over primary at the centre of this field behind 20 mm of water at the line's usual gap",
+            source="scatter over primary at the centre of this field behind 20 mm of water, usual gap, beam of 45 keV",
             log=False,
         ),
         Parameter(
@@ -175,6 +188,33 @@ OBJECT_SCATTER = Effect(
             default=100.0,
             source="full width at half maximum at the usual gap; 1.5 gaps for scatter alike in all directions",
             log=True,
+        ),
+        Parameter(
+            name="energy_exponent",
+            unit="",
+            low=-1.5,
+            high=1.5,
+            default=-0.3,
+            source="photons followed one by one behind water at 40 and 90 kV: -0.2 at 350 mm, -0.5 at 100 mm of air",
+            log=False,
+        ),
+        Parameter(
+            name="own_albedo",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=1.0,
+            source="0: scatter goes with attenuation alone, 1: with the scattering part of each material's",
+            log=False,
+        ),
+        Parameter(
+            name="gap_exponent",
+            unit="",
+            low=0.0,
+            high=1.5,
+            default=1.0,
+            source="1 for a point that scatters; 0: the same width at any gap",
+            log=False,
         ),
     ),
     stage="arrivals",

@@ -2,7 +2,7 @@
 
 focal spot   Gaussian of full width a (M - 1) at the detector, M = source-detector over source-object
 motion       box of length v t M along the belt
-MTF tail     (1 - w) G(f) + w / (1 + H f^2) in place of the calibrated G(f)
+MTF tail     (1 - w) G(f) + w / (1 + H f^2) in place of the calibrated G(f) (`order` 1; other shapes: effect.py)
 """
 
 import math
@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Parameter
+from .effect import Effect, Parameter, order_parameter, spread_transfer
 
+_USUAL_ORDER = 1.0  # of the tail: a Lorentzian
 _SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 
@@ -111,7 +112,7 @@ def _add_tail(state: LineState, parameters: Mapping[str, float], context: LineCo
     reach_px = parameters["reach_px"]
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        return np.asarray(1.0 / (1.0 + (2 * np.pi * reach_px) ** 2 * (f_row**2 + f_column**2)))
+        return spread_transfer(f_row, f_column, reach_px=reach_px, order=parameters["order"], usual_order=_USUAL_ORDER)
 
     return replace(state, tails=(*state.tails, (weight, transfer)))
 
@@ -138,6 +139,7 @@ MTF_TAIL = Effect(
             source="sqrt(H) / (2 pi): H about 40 to 250 px^2 for thick scintillator screens",
             log=True,
         ),
+        order_parameter(_USUAL_ORDER),
     ),
     stage="optics",
     reference="Lorentzian transfer function of screens: Burgess (1978), doi:10.1118/1.594387",

@@ -28,6 +28,8 @@ _LEAST = 0.02  # transmissions below are mostly scatter
 _PIXELS = 20  # a step of fewer is left out
 _STEPS = 40  # a map of more different thicknesses is a ramp, and is cut into bins
 _BINS = 12
+_SPREAD_PX = 5  # light and penumbra of the next step reach so far
+_LEAST_SHARE = 0.25  # of a step's pixels that must be left
 _EDGE_SHARE = 0.06  # of the whole range: where neighbours differ by more there is an edge
 
 
@@ -189,12 +191,32 @@ def _steps(thickness_mm: dict[str, NDArray[np.float32]]) -> tuple[NDArray[np.int
         inside[kept & (total == 0)] = _BINS
     else:
         inside[~edge.ravel()] = labels.ravel()
+        inside = _away_from_borders(inside.reshape(edge.shape)).ravel()
     steps = []
     for number in range(int(inside.max()) + 1):
         members = planes.reshape(len(names), -1)[:, inside == number]
         means = members.mean(axis=1) if members.size else np.zeros(len(names))
         steps.append({name: float(f"{mean:.4g}") for name, mean in zip(names, means, strict=True)})
     return inside.reshape(edge.shape), steps
+
+
+def _away_from_borders(inside: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Step numbers (row, column) without the pixels into which light of the next step spreads, as far as a step is wide."""
+    from scipy.ndimage import distance_transform_edt
+
+    if np.all(inside >= 0):
+        return inside  # nothing bounds a slab that fills the field
+    distance = np.asarray(distance_transform_edt(inside >= 0))
+    kept = np.full_like(inside, -1)
+    for number in range(int(inside.max()) + 1):
+        mine = inside == number
+        least = max(2 * _PIXELS, _LEAST_SHARE * int(np.count_nonzero(mine)))
+        for reach in range(_SPREAD_PX, -1, -1):
+            far = mine & (distance > reach)
+            if reach == 0 or np.count_nonzero(far) >= least:
+                kept[far] = number
+                break
+    return kept
 
 
 def predict_transmission(twin: Twin, *, kV: float, filters: Sequence[Filter], layers: Sequence[Filter]) -> Estimate:

@@ -12,7 +12,12 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.validate import leave_one_out, plot_validation, validate_twin
-from raytwin.calibration.wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
+from raytwin.calibration.wedges import (
+    _away_from_borders,
+    measure_transmissions,
+    predict_transmission,
+    transmissions_of_evidence,
+)
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.predict import spectral_model_of
@@ -138,6 +143,17 @@ def test_a_ramp_is_cut_into_bins(tmp_path, line, measured):
     assert 8 <= len(found.transmissions) <= 12
     for item in found.transmissions[::3]:
         assert item.value == pytest.approx(true_transmission(line, item.layers[0].thickness_mm), rel=0.012)
+
+
+def test_pixels_near_a_border_are_left_out_where_a_step_is_wide_enough():
+    """A wide step keeps its inner pixels, 5 px off; a narrow one as many as it needs; a slab that fills the field all."""
+    steps = np.full((60, 60), -1)
+    steps[:, :30], steps[:, 31:35], steps[:, 36:] = 0, 1, 2
+    kept = _away_from_borders(steps)
+    assert np.array_equal(np.flatnonzero(kept[30] == 0), np.arange(25))
+    assert np.array_equal(np.flatnonzero(kept[30] == 1), [32, 33])
+    assert np.array_equal(np.flatnonzero(kept[30] == 2), np.arange(41, 60))
+    np.testing.assert_array_equal(_away_from_borders(np.zeros((8, 8), dtype=int)), 0)
 
 
 def test_the_wedge_joins_the_fit_and_is_kept_in_the_twin(measured, tmp_path):

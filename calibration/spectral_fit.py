@@ -690,7 +690,7 @@ def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: di
             width *= DEPARTURE_FACTOR * math.exp(LOG_DEPARTURE_SD**2)  # root mean square over the factor's prior
         share = float(np.std(samples[:, names.index(name)])) / width
         if share > 0.7:
-            result.append(f"{name}: {100 * share:.0f} % of the prior's width is left")
+            result.append(f"{name}: {100 * min(share, 1.0):.0f} % of the prior's width is left")
     columns = samples[:, [names.index(name) for name in own]]
     varies = np.std(columns, axis=0) > 0
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -19,8 +19,8 @@ def spectrum_from_file(
 ) -> Spectrum:
     """Read a spectrum (fluence per keV) and put it on the common grid; photons are conserved.
 
-    Text, two columns: energy in keV on equal steps, and fluence per keV. Lines with `#` are a header; three of them say
-    something when they are there:
+    Text, two columns: energy in keV on equal steps, and fluence per keV. Column names may stand above them. Lines with `#`
+    are a header; three of them say something when they are there:
 
         # energy: centre | top | bottom        which point of its bin the energy is (also as words: "top of bin")
         # unit: photons/keV/cm2/mAs            the scale is absolute, at 1 m in vacuum; otherwise it is arbitrary
@@ -96,10 +96,11 @@ def _columns(where: Path) -> tuple[dict[str, str], NDArray[np.float64], NDArray[
             if "top of bin" in text.lower() or "top of the bin" in text.lower():
                 header.setdefault("energy", "top")
             continue
-        if not text:
-            continue
+        words = text.replace(",", " ").replace(";", " ").split()
+        if not words or not (rows or any(map(_is_number, words))):
+            continue  # empty, or the columns' names
         try:
-            energy, value = text.replace(",", " ").replace(";", " ").split()[:2]
+            energy, value = words[:2]
             rows.append((float(energy), float(value)))
         except ValueError:
             raise FileFormatError(
@@ -113,6 +114,14 @@ def _columns(where: Path) -> tuple[dict[str, str], NDArray[np.float64], NDArray[
         )
     table = np.array(rows)
     return header, table[:, 0], table[:, 1]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _number(text: str | None) -> float | None:

@@ -147,6 +147,14 @@ def test_a_measured_spectrum_keeps_its_photons_and_its_energies(tmp_path: Path, 
     np.testing.assert_array_equal(spectrum.energies_keV, energy_grid_keV(200.0)[: spectrum.energies_keV.size])
 
 
+def test_column_names_above_the_numbers_are_passed_over(tmp_path: Path) -> None:
+    plain, named = tmp_path / "plain.csv", tmp_path / "named.csv"
+    rows = "10,1\n11,2\n12,1\n"
+    plain.write_text(rows, encoding="utf-8")
+    named.write_text(f"keV,fluence\n{rows}", encoding="utf-8")
+    np.testing.assert_array_equal(spectrum_from_file(named).fluence, spectrum_from_file(plain).fluence)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

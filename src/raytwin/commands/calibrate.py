@@ -133,6 +133,12 @@ def _text(result: dict[str, Any], path: Path) -> str:
             f"gain, {name:<18} {level['gain_DN']:.4g} ({level['gain_DN_low']:.4g} to {level['gain_DN_high']:.4g}) DN,"
             f" slope as measured {level['photon_transfer_slope_DN']:.4g} DN"
         )
+    open_names = [text.split(":")[0] for text in result["undetermined"] if ":" in text]
+    if open_names:
+        lines.append(f"left to the priors   {', '.join(open_names)}")
+    lines += [
+        f"known only together  {text.split(' are known')[0]}" for text in result["undetermined"] if ":" not in text
+    ]
     if result["next_measurement"]:
         lines.append(f"next measurement    {result['next_measurement']['text']}")
     lines.append(f"twin written to {path}")

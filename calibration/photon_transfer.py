@@ -874,7 +874,9 @@ def _evidence(
             " correlated; gains come from pairs"
         )
     linearity = _linearity(used)
-    repeats = _repeats(used)
+    read_DN2 = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
+    dark_frames = min((kept.frames for _, kept in darks.sums), default=1)
+    repeats = _repeats(used, dark_DN2=read_DN2 / dark_frames / int(good.sum()), pixels=int(good.sum()))
     for row in repeats:
         if abs(row["change_percent"]) > max(0.3, 5.0 * row["noise_percent"]):
             warnings.append(
@@ -989,8 +991,14 @@ def _session_evidence(
     return found
 
 
-def _repeats(points: Sequence[SeriesPoint]) -> list[dict[str, Any]]:
-    """Settings measured more than once: levels in order of time, change from first to last and its noise, %."""
+def _repeats(points: Sequence[SeriesPoint], *, dark_DN2: float, pixels: int) -> list[dict[str, Any]]:
+    """Settings measured more than once: levels in order of time, change from first to last and its noise, %.
+
+    Args:
+        points: the flats.
+        dark_DN2: variance of the level of a dark, mean over pixels.
+        pixels: that the levels are means of.
+    """
     groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
     for point in points:
         key = (point.kV, point.filters, point.exposure_ms, point.load_mAs, point.photons_per_pixel)
@@ -1001,7 +1009,12 @@ def _repeats(points: Sequence[SeriesPoint]) -> list[dict[str, Any]]:
             continue
         levels = [point.mean_signal_DN for point in members]
         change = 100.0 * (levels[-1] / levels[0] - 1.0)
-        own = [point.common_mode_percent / math.sqrt(point.frames) for point in (members[0], members[-1])]
+        own = []
+        for point in (members[0], members[-1]):
+            own.append(point.common_mode_percent / math.sqrt(point.frames))
+            # neighbours share light: a mean over pixels counts about a quarter of them
+            pixel_DN2 = 4.0 * point.pair_variance_DN2 / point.frames / pixels
+            own.append(100.0 * math.sqrt(pixel_DN2 + dark_DN2) / max(point.mean_signal_DN, 1e-9))
         rows.append(
             {
                 "series": [point.series for point in members],

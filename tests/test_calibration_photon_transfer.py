@@ -326,6 +326,23 @@ def test_a_steady_level_between_repeats_is_not_mentioned(tmp_path):
     assert found.warnings == ()
 
 
+def test_repeats_of_a_dim_level_are_judged_by_the_noise_of_darks_too(tmp_path):
+    """Two series of 5 DN above a dark known to 0.3 DN: a change of 2 % says nothing."""
+    path = tmp_path / "dim.h5"
+    rng = np.random.default_rng(9)
+    with write_acquisition(path) as writer:
+        dark = flat_frames(0.0, rng=rng, count=3, read_DN=20.0)
+        writer.add_series("dark", kind="dark", frames=as_adc(dark), exposure_ms=20.0)
+        for name, level in (("before", 5.0), ("after", 5.1)):
+            frames = as_adc(flat_frames(level, rng=rng, read_DN=20.0))
+            writer.add_series(name, kind="flat", frames=frames, exposure_ms=20.0)
+        writer.add_series("bright", kind="flat", frames=as_adc(flat_frames(3000.0, rng=rng)), exposure_ms=100.0)
+    found = transfer_of(path)
+    (row,) = found.evidence["repeated_settings"]
+    assert row["noise_percent"] > 1.0
+    assert not any("the level changed" in line for line in found.warnings)
+
+
 def test_two_frames_of_whole_numbers_still_give_a_fine_dark_level(tmp_path):
     path = tmp_path / "few.h5"
     rng = np.random.default_rng(7)

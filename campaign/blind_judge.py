@@ -68,7 +68,8 @@ def judge_session(
     from ..acquisition import open_acquisition
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
-    from ..diagnosis.diagnose import calibrated_twin, diagnose, diagnosis_answer
+    from ..diagnosis.diagnose import diagnose, diagnosis_answer
+    from ..diagnosis.preparation import calibrated_twin
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
     from .blind_statistics import session_features, session_statistics, write_statistics

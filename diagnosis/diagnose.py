@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile
-from ..calibration.calibrate import calibrate_twin
+from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
@@ -17,14 +17,16 @@ from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
 from .plan import best_repeat
+from .plausibility import Suspect
+from .preparation import mislabelled, prepare_session
 from .refine import refine
-from .session import calibrating_names
 from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
 POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
+SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 _STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
@@ -70,7 +72,11 @@ class Gap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
-    """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added."""
+    """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added.
+
+    mislabelled: series whose labels look wrong; no effect is named then. not_tested: effects that these series could not
+    show, each with the reason.
+    """
 
     verdict: str
     hypotheses: tuple[Hypothesis, ...]
@@ -89,15 +95,8 @@ class Diagnosis:
     named: tuple[str, ...]
     problem: Problem = field(repr=False)
     warnings: tuple[str, ...] = ()
-
-
-def calibrated_twin(
-    acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
-) -> Twin:
-    """The twin from the series that calibrate (see diagnosis.session)."""
-    names = calibrating_names(acquisition.series)
-    part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
-    return calibrate_twin(part, rng=rng, progress=progress)
+    mislabelled: tuple[Suspect, ...] = ()
+    not_tested: Mapping[str, str] = field(default_factory=dict)
 
 
 def diagnose(
@@ -122,19 +121,68 @@ def diagnose(
     Raises:
         InputError: nothing in the session can be judged.
     """
-    tell = progress or (lambda stage: None)
-    elsewhere = twin is not None
-    if twin is None:
-        tell("calibration")
-        twin = calibrated_twin(acquisition, rng=rng, progress=progress)
-    problem = build_problem(
-        acquisition,
-        twin,
-        variants=catalogue_variants(without=without),
-        calibrated_elsewhere=elsewhere,
-        progress=progress,
+    session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
+    try:
+        problem = build_problem(
+            session.acquisition,
+            session.twin,
+            variants=catalogue_variants(without=without),
+            calibrated_elsewhere=session.calibrated_elsewhere,
+            progress=progress,
+        )
+    except InputError as error:
+        if session.suspects:
+            raise mislabelled(acquisition, session.suspects) from error
+        raise
+    result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
+    result = replace(result, warnings=(*session.left_out, *result.warnings))
+    return _doubted(result, session.twin, session.suspects) if session.suspects else result
+
+
+def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:
+    """The diagnosis of a session whose labels look wrong: no effect is named, whatever the frames would say under them."""
+    known = {item.effects for item in diagnosis.hypotheses}
+    hypotheses = [
+        replace(item, probability=1.0 if item.effects == (UNKNOWN,) else 0.0) for item in diagnosis.hypotheses
+    ]
+    if (UNKNOWN,) not in known:
+        hypotheses.append(Hypothesis(effects=(UNKNOWN,), probability=1.0, log_evidence=0.0))
+    return replace(
+        diagnosis,
+        verdict="unknown_effect",
+        hypotheses=tuple(sorted(hypotheses, key=lambda item: -item.probability)),
+        causes=(),
+        probability_no_gap=0.0,
+        probability_unknown=1.0,
+        unknown_location="labels of the series",
+        gap=replace(diagnosis.gap, after=diagnosis.gap.before, shrinks_by=None),
+        held_out=tuple((axis, before, before, floor) for axis, before, _, floor in diagnosis.held_out),
+        ambiguous_with=(),
+        next_measurement=None,
+        twin=twin,
+        added=(),
+        named=(),
+        warnings=(*(item.text for item in suspects), *diagnosis.warnings),
+        mislabelled=suspects,
     )
-    return judge(problem, twin, rng=rng, priors=priors, progress=progress)
+
+
+def _out_of_reach(problem: Problem, curves: Sequence[Curve], nuisances: Nuisances) -> dict[str, str]:
+    """Effects that the session could not show at their largest plausible strength, each with the reason."""
+    farthest: dict[str, tuple[float, float]] = {}
+    for curve in curves:
+        response = curve.response(curve.high)[None, :]
+        length = math.sqrt(max(float(nuisances.inner(response, response)[0, 0]), 0.0))
+        if length >= farthest.get(curve.effect, (-1.0, 0.0))[0]:
+            farthest[curve.effect] = (length, curve.high)
+    found = dict(problem.missing_effects)
+    for effect, (length, high) in farthest.items():
+        if length < SEEN_FROM:
+            found[effect] = (
+                f"at {high:g} {EFFECTS[effect].strength.unit}, the largest plausible, it would lie {length:.1f} standard"
+                " deviations from nothing in these series"
+            )
+    return {effect: found[effect] for effect in EFFECTS if effect in found}
 
 
 def judge(
@@ -294,6 +342,7 @@ def judge(
         named=tuple(named),
         problem=problem,
         warnings=tuple(problem.skipped),
+        not_tested=_out_of_reach(problem, whitened, shared),
     )
 
 
@@ -562,6 +611,8 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict
             {"axis": axis, "before": before, "after": after, "floor": floor}
             for axis, before, after, floor in diagnosis.held_out
         ],
+        "not_tested": [{"effect": effect, "reason": reason} for effect, reason in diagnosis.not_tested.items()],
+        "mislabelled": [{"series": list(item.series), "text": item.text} for item in diagnosis.mislabelled],
         "task": None,
         "warnings": list(diagnosis.warnings),
         "inputs": dict(inputs),

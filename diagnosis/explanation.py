@@ -7,6 +7,8 @@ from typing import Any
 from ..generator.effects import EFFECTS
 from .diagnose import Cause, Diagnosis, Place
 
+_NAMED_DOUBTS = 3
+_NAMED_UNTESTED = 8
 _AXIS_WORDS = {
     "level": "brightness",
     "noise": "noise",
@@ -48,10 +50,41 @@ def _where_text(places: Sequence[Place]) -> str:
     return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
 
 
+def compared_text(diagnosis: Diagnosis) -> str:
+    """What was compared, what was left out, and what these series could not show."""
+    kinds: dict[str, int] = {}
+    for view in diagnosis.problem.views:
+        kinds[view.session.series.kind] = kinds.get(view.session.series.kind, 0) + 1
+    told = ", ".join(f"{number} of kind {kind}" for kind, number in kinds.items())
+    text = f"{sum(kinds.values())} series were compared ({told})"
+    left_out = len(diagnosis.warnings) - len(diagnosis.mislabelled)
+    if left_out:
+        text += f", {left_out} could not be used"
+    if diagnosis.not_tested:
+        names = [title_of(effect) for effect in diagnosis.not_tested]
+        shown = ", ".join(names[:_NAMED_UNTESTED]) + (" and others" if len(names) > _NAMED_UNTESTED else "")
+        text += f"; {len(names)} of the catalogue's {len(EFFECTS)} effects would not show in them: {shown}"
+    return text + "."
+
+
 def paragraph(diagnosis: Diagnosis) -> str:
-    """Verdict, where, which, how far."""
+    """Verdict, where, which, how far; labels in doubt come first, what the session could not show comes last."""
+    text = _verdict_text(diagnosis)
+    if diagnosis.mislabelled:
+        doubts = [item.text for item in diagnosis.mislabelled]
+        shown = "; ".join(doubts[:_NAMED_DOUBTS])
+        more = f"; and {len(doubts) - _NAMED_DOUBTS} more" if len(doubts) > _NAMED_DOUBTS else ""
+        text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
+    if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
+        text += f" {compared_text(diagnosis)}"
+    return text
+
+
+def _verdict_text(diagnosis: Diagnosis) -> str:
     gap = diagnosis.gap
     figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
+    if diagnosis.mislabelled:
+        return f"{_where_text(diagnosis.where)} {figures}."
     if diagnosis.verdict == "no_gap":
         return (
             f"The session agrees with its twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing). "

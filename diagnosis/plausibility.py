@@ -480,7 +480,7 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "mirrored top to bottom": lambda image: image[::-1],
     "mirrored left to right": lambda image: image[:, ::-1],
     "transposed": lambda image: image.T,
-    "turned by 90 degrees": lambda image: np.rot90(image),
+    "turned by 90 degrees": np.rot90,
     "turned by 270 degrees": lambda image: np.rot90(image, 3),
 }
 
@@ -738,7 +738,7 @@ def _attenuation(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
         return []
 
     def expected(index: int, label: _Label) -> float:
-        measured, covered = shadows[index]
+        covered = shadows[index][1]
         depth = maps.depth(judged[index].series.scene, label)
         if depth is None:
             return 0.0

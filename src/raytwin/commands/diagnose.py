@@ -79,6 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin diagnose`."""
+    from difflib import get_close_matches
+
     import numpy as np
     from tqdm import tqdm
 
@@ -94,7 +96,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     for name in arguments.without:
         if name not in EFFECTS:
-            raise InputError("--without", received=name, expected="one of " + ", ".join(EFFECTS))
+            near = get_close_matches(name, EFFECTS, 3, 0.4) + [item for item in EFFECTS if name.lower() in item]
+            raise InputError(
+                "--without",
+                received=name,
+                expected="one of " + ", ".join(EFFECTS),
+                remedy="did you mean " + " or ".join(dict.fromkeys(near)) + "?" if near else "",
+            )
     if arguments.output.exists() and not arguments.output.is_dir():
         raise InputError("-o", received=f"{arguments.output}, a file", expected="a folder, which may not exist yet")
     twin = None if arguments.twin is None else read_twin(arguments.twin)
@@ -109,8 +117,9 @@ def run(arguments: argparse.Namespace) -> int:
             without=arguments.without,
             progress=bar.set_description_str,
         )
-    for line in result.warnings:
-        say(f"not used: {line}")
+    doubts = len(result.mislabelled)
+    for number, line in enumerate(result.warnings):
+        say(f"label in doubt: {line}" if number < doubts else f"not used: {line}")
     inputs = {
         "acquisition_sha256": sha256_of_file(arguments.acquisition),
         "twin_sha256": None if arguments.twin is None else sha256_of_file(arguments.twin),
@@ -198,17 +207,19 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     from ..acquisition import open_acquisition
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
-    from ..diagnosis.diagnose import calibrated_twin
     from ..diagnosis.plan import distinguishability, table_text
+    from ..diagnosis.preparation import mislabelled, prepare_session
     from ..files import whole_file
 
     with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
-        known = twin or calibrated_twin(acquisition, rng=np.random.default_rng(arguments.seed))
+        session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
+        if session.suspects:
+            raise mislabelled(acquisition, session.suspects)
         problem = build_problem(
-            acquisition,
-            known,
+            session.acquisition,
+            session.twin,
             variants=catalogue_variants(without=arguments.without),
-            calibrated_elsewhere=twin is not None,
+            calibrated_elsewhere=session.calibrated_elsewhere,
             progress=bar.set_description_str,
         )
     found = distinguishability(problem)

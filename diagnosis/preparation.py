@@ -1,0 +1,152 @@
+"""What happens to a session before its gap is looked for: series that cannot be used, labels in doubt, the twin."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..acquisition.acquisition_io import AcquisitionFile
+from ..calibration.calibrate import calibrate_twin
+from ..errors import FitError, InputError, RaytwinError
+from ..generator.twin import Twin
+from .plausibility import Suspect, check_plausibility
+from .session import calibrating_names
+
+LEAST_SIDE = 16  # rows and columns below which pictures say nothing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PreparedSession:
+    """A session ready for its diagnosis.
+
+    Fields: acquisition (less the series that cannot be used); twin; calibrated_elsewhere (the twin was given); suspects
+    (series whose labels look wrong); left_out (series that are not used, each with the reason).
+    """
+
+    acquisition: AcquisitionFile
+    twin: Twin
+    calibrated_elsewhere: bool
+    suspects: tuple[Suspect, ...]
+    left_out: tuple[str, ...]
+
+
+def calibrated_twin(
+    acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
+) -> Twin:
+    """The twin from the series that calibrate (see diagnosis.session)."""
+    names = calibrating_names(acquisition.series)
+    part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
+    return calibrate_twin(part, rng=rng, progress=progress)
+
+
+def prepare_session(
+    acquisition: AcquisitionFile,
+    *,
+    twin: Twin | None,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None = None,
+) -> PreparedSession:
+    """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
+
+    Raises:
+        InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
+    """
+    tell = progress or (lambda stage: None)
+    acquisition, left_out = _of_one_shape(acquisition, twin)
+    names = calibrating_names(acquisition.series)
+    found = check_plausibility(
+        acquisition,
+        calibrating=names,
+        dark_DN=None if twin is None else twin.maps.dark_at,
+        progress=progress,
+    )
+    left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
+    kept = tuple(item for item in acquisition.series if item.name not in found.unusable)
+    if not kept:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="; ".join(left_out),
+            expected="series with light and noise",
+        )
+    acquisition = replace(acquisition, series=kept)
+    elsewhere = twin is not None
+    if twin is None:
+        tell("calibration")
+        try:
+            twin = calibrated_twin(acquisition, rng=rng, progress=progress)
+        except (InputError, FitError) as error:
+            raise _not_calibrated(acquisition, found.suspects, error) from error
+    return PreparedSession(
+        acquisition=acquisition,
+        twin=twin,
+        calibrated_elsewhere=elsewhere,
+        suspects=found.suspects,
+        left_out=tuple(left_out),
+    )
+
+
+def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> InputError:
+    """The error for a session that cannot be worked with because of its labels."""
+    return InputError(
+        f"acquisition {acquisition.path}",
+        received="; ".join(item.text for item in suspects),
+        expected="labels that the frames agree with",
+        remedy="correct the labels of these series, or leave them out",
+    )
+
+
+def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[AcquisitionFile, list[str]]:
+    """The series whose frames have the twin's shape, or the commonest one; and which were left out."""
+    if not acquisition.series:
+        raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
+    counted = Counter(item.shape for item in acquisition.series)
+    shape = counted.most_common(1)[0][0] if twin is None else twin.maps.shape
+    if shape not in counted:
+        rows, columns = counted.most_common(1)[0][0]
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"frames of {rows} x {columns}",
+            expected=f"the twin's detector of {shape[0]} x {shape[1]}",
+            remedy="diagnose sessions of the detector that the twin was calibrated from, or leave --twin out",
+        )
+    if min(shape) < LEAST_SIDE:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"frames of {shape[0]} x {shape[1]}",
+            expected=f"at least {LEAST_SIDE} rows and columns",
+            remedy="put the lines of a line detector together to pictures",
+        )
+    left_out = [
+        f"{item.name}: frames of {item.shape[0]} x {item.shape[1]}, not {shape[0]} x {shape[1]}"
+        for item in acquisition.series
+        if item.shape != shape
+    ]
+    kept = tuple(item for item in acquisition.series if item.shape == shape)
+    return replace(acquisition, series=kept), left_out
+
+
+def _not_calibrated(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...], error: RaytwinError) -> InputError:
+    """Why a session cannot calibrate its own twin, and what could be said with one from elsewhere."""
+    if suspects:
+        return mislabelled(acquisition, suspects)
+    counted = Counter(item.kind for item in acquisition.series)
+    several = sum(item.n_frames > 1 for item in acquisition.series)
+    have = ", ".join(f"{number} {kind}" for kind, number in counted.items())
+    remedy = (
+        f"or give --twin, calibrated from another session of this line: with it this session ({have} series,"
+        f" {several} of them of two frames or more) can be compared as far as it goes"
+    )
+    if isinstance(error, InputError):
+        return InputError(
+            error.argument,
+            received=error.received,
+            expected=error.expected,
+            remedy=f"{error.remedy}; {remedy}" if error.remedy else remedy,
+        )
+    return InputError(
+        f"acquisition {acquisition.path}",
+        received=str(error),
+        expected="flats and darks that calibrate a twin",
+        remedy=remedy,
+    )

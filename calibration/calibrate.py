@@ -90,10 +90,16 @@ def calibrate_twin(
                 spectra=spectra,
                 transmissions=transmissions,
                 noise=transfer.noise,
+                repeats=transfer.evidence["repeated_settings"],
             )
             if transmissions and _contradicts(fit):
                 without = fit_spectrum(
-                    transfer.levels, acquisition.instrument, rng=rng, spectra=spectra, noise=transfer.noise
+                    transfer.levels,
+                    acquisition.instrument,
+                    rng=rng,
+                    spectra=spectra,
+                    noise=transfer.noise,
+                    repeats=transfer.evidence["repeated_settings"],
                 )
                 if not _contradicts(without):
                     fit = without

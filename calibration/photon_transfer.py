@@ -876,7 +876,14 @@ def _evidence(
     linearity = _linearity(used)
     read_DN2 = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
     dark_frames = min((kept.frames for _, kept in darks.sums), default=1)
-    repeats = _repeats(used, dark_DN2=read_DN2 / dark_frames / int(good.sum()), pixels=int(good.sum()))
+    left = np.asarray(fit.slope_DN / np.where(fit.gain_DN > 0, fit.gain_DN, np.nan))
+    repeats = _repeats(
+        used,
+        read_DN2=read_DN2,
+        dark_frames=dark_frames,
+        pixels=int(good.sum()),
+        share=float(np.nanmedian(left)) if np.isfinite(left).any() else 1.0,
+    )
     for row in repeats:
         if abs(row["change_percent"]) > max(0.3, 5.0 * row["noise_percent"]):
             warnings.append(
@@ -991,13 +998,17 @@ def _session_evidence(
     return found
 
 
-def _repeats(points: Sequence[SeriesPoint], *, dark_DN2: float, pixels: int) -> list[dict[str, Any]]:
-    """Settings measured more than once: levels in order of time, change from first to last and its noise, %.
+def _repeats(
+    points: Sequence[SeriesPoint], *, read_DN2: float, dark_frames: int, pixels: int, share: float
+) -> list[dict[str, Any]]:
+    """Settings measured more than once: levels in order of time, sampling noise of each, change from first to last, %.
 
     Args:
         points: the flats.
-        dark_DN2: variance of the level of a dark, mean over pixels.
+        read_DN2: electronic variance of a pixel and frame.
+        dark_frames: of the shortest dark series.
         pixels: that the levels are means of.
+        share: of the quanta's variance that the spread leaves in one pixel; a mean over pixels carries all of it.
     """
     groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
     for point in points:
@@ -1009,18 +1020,19 @@ def _repeats(points: Sequence[SeriesPoint], *, dark_DN2: float, pixels: int) -> 
             continue
         levels = [point.mean_signal_DN for point in members]
         change = 100.0 * (levels[-1] / levels[0] - 1.0)
-        own = []
-        for point in (members[0], members[-1]):
-            own.append(point.common_mode_percent / math.sqrt(point.frames))
-            # neighbours share light: a mean over pixels counts about a quarter of them
-            pixel_DN2 = 4.0 * point.pair_variance_DN2 / point.frames / pixels
-            own.append(100.0 * math.sqrt(pixel_DN2 + dark_DN2) / max(point.mean_signal_DN, 1e-9))
+        sampling = []
+        for point in members:
+            quanta_DN2 = max(point.pair_variance_DN2 - read_DN2, 0.0) / max(share, 1e-3)
+            noise_DN2 = ((quanta_DN2 + read_DN2) / point.frames + read_DN2 / dark_frames) / pixels
+            of_pixels = 100.0 * math.sqrt(noise_DN2) / max(point.mean_signal_DN, 1e-9)
+            sampling.append(math.hypot(point.common_mode_percent / math.sqrt(point.frames), of_pixels))
         rows.append(
             {
                 "series": [point.series for point in members],
                 "mean_signal_DN": levels,
                 "change_percent": change,
-                "noise_percent": math.hypot(*own, 0.02),
+                "sampling_percent": sampling,
+                "noise_percent": math.hypot(sampling[0], sampling[-1], 0.02),
             }
         )
     return rows

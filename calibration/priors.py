@@ -108,7 +108,8 @@ DEPARTURE_FACTOR = 0.3
 LOG_DEPARTURE_SD = 0.8
 
 # Departure of single levels and gains from any such model: reproducibility of tube and filters, and physics that is not
-# in it; relative standard deviation. Levels carry no other allowance for reproducibility.
+# in it; relative standard deviation. Levels carry no other allowance for reproducibility. Settings measured more than once
+# tell it best: a steady line's intervals shrink, and those of one that is not widen.
 LEVEL_DISCREPANCY = 0.0006
 GAIN_DISCREPANCY = 0.002
 LOG_DISCREPANCY_SD = 0.8  # a factor of 2.2 either way

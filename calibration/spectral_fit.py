@@ -9,6 +9,7 @@ exactly about that draw's own derivatives, and drawn back from its conditional G
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,6 +227,7 @@ def fit_spectrum(
     correction: SpectrumCorrection | None = None,
     model_name: str = "casim",
     noise: NoiseModel | None = None,
+    repeats: Sequence[Mapping[str, Any]] = (),
 ) -> SpectralFit:
     """Posterior of the spectral parameters from measured levels, gains and transmissions.
 
@@ -242,6 +244,8 @@ def fit_spectrum(
         model_name: SpekPy's physics model.
         noise: the detector's spread, which says how much of the levels' slopes is white; None: their ratio to the gain is
             taken as the same in all beams.
+        repeats: settings measured more than once (`repeated_settings` of the evidence): how far their levels scatter
+            beyond sampling tells how well the line repeats itself.
 
     Raises:
         FitError: no level with a kV, or the posterior cannot be sampled.
@@ -267,7 +271,8 @@ def fit_spectrum(
     )
     beams: dict[OpenBeam, int] = {}
     data = _data(known, transmissions, instrument, noise, beams)
-    posterior = _Posterior(model, priors, tuple(beams), data, {"level": level_discrepancy, "gain": gain_discrepancy})
+    fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
+    posterior = _Posterior(model, priors, tuple(beams), data, fixed, _repeated_levels(repeats))
     best, samples, discrepancies, effective = posterior.sample(rng)
     names = model.names
     voltages = [level.kV or 0.0 for level in known]
@@ -357,6 +362,17 @@ def _data(
     return data
 
 
+def _repeated_levels(repeats: Sequence[Mapping[str, Any]]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Logarithms of the levels of each repeated setting, and their sampling's relative sd (series,) each."""
+    found = []
+    for row in repeats:
+        levels = np.asarray(row.get("mean_signal_DN", ()), dtype=np.float64)
+        sampling = 0.01 * np.asarray(row.get("sampling_percent", ()), dtype=np.float64)
+        if levels.size > 1 and sampling.shape == levels.shape and np.all(levels > 0) and np.all(sampling > 0):
+            found.append((np.log(levels), sampling))
+    return found
+
+
 def _relative_sd(estimate: object) -> float:
     value, low, high = estimate.value, estimate.low, estimate.high  # type: ignore[attr-defined]
     return float((high - low) / (2 * _Z95) / max(abs(value), 1e-300))
@@ -376,6 +392,7 @@ class _Posterior:
         beams: Sequence[OpenBeam],
         data: Sequence[_Datum],
         discrepancies: Mapping[str, float | None],
+        repeats: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
     ) -> None:
         self.model = model
         self.beams = beams
@@ -391,6 +408,7 @@ class _Posterior:
         self.value = np.array([item.value for item in data])
         self.noise = np.array([item.sd for item in data])
         self.fixed = dict(discrepancies)
+        self.repeats = tuple(repeats)
         self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
         self.is_gain = np.array([item.kind == "gain" for item in data])
         self.dimensions = len(self.shape) + len(self.learned) + 1  # the last is the factor of the departures
@@ -492,6 +510,16 @@ class _Posterior:
         logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
         return logarithm, full, mean, lower
 
+    def _log_likelihood_of_repeats(self, level_sd: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log likelihood (draw,) of the scatter between repeats of a setting, whatever its level: y ~ N(m, s^2 + sd^2)."""
+        result = np.zeros(len(level_sd))
+        for logs, sampling in self.repeats:
+            weight = 1.0 / (sampling**2 + level_sd[:, None] ** 2)
+            mean = np.sum(weight * logs, axis=1) / np.sum(weight, axis=1)
+            result -= 0.5 * np.sum(weight * (logs - mean[:, None]) ** 2 - np.log(weight), axis=1)
+            result -= 0.5 * np.log(np.sum(weight, axis=1))
+        return result
+
     def log_likelihood(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log likelihood of draws (draw, dimension), the linear parameters integrated out; -inf out of bounds."""
         shapes = u[:, : len(self.shape)]
@@ -500,6 +528,7 @@ class _Posterior:
         result = np.full(len(u), -np.inf)
         if inside.any():
             result[inside] = self._conditional(u[inside])[0]
+            result[inside] += self._log_likelihood_of_repeats(self.discrepancies(u[inside])["level"])
         return result
 
     def with_linear(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:

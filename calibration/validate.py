@@ -331,6 +331,7 @@ def leave_one_out(
             transmissions=kept,
             correction=twin.spectral.correction,
             model_name=twin.spectral.model,
+            repeats=twin.evidence.get("repeated_settings") or (),
         )
         mine = [loads[name] for name in level.series if name in loads]
         load_mAs = float(np.mean([load for load, _ in mine])) if mine else 1.0

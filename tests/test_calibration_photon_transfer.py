@@ -343,6 +343,22 @@ def test_repeats_of_a_dim_level_are_judged_by_the_noise_of_darks_too(tmp_path):
     assert not any("the level changed" in line for line in found.warnings)
 
 
+def test_levels_of_repeats_scatter_as_their_sampling_noise_says(tmp_path):
+    """Within four standard errors of 39 degrees of freedom; output noise from frame to frame is in the measured part."""
+    path = tmp_path / "forty.h5"
+    rng = np.random.default_rng(10)
+    with write_acquisition(path) as writer:
+        writer.add_series("dark", kind="dark", frames=as_adc(flat_frames(0.0, rng=rng, count=60)), exposure_ms=20.0)
+        for number in range(40):
+            frames = as_adc(flat_frames(3000.0, rng=rng, count=6))
+            writer.add_series(f"flat_{number}", kind="flat", frames=frames, exposure_ms=20.0)
+    (row,) = transfer_of(path).evidence["repeated_settings"]
+    levels = np.array(row["mean_signal_DN"])
+    scatter = 100.0 * float(np.std(levels, ddof=1)) / levels.mean()
+    stated = float(np.sqrt(np.mean(np.square(row["sampling_percent"]))))
+    assert scatter / stated == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * 39))
+
+
 def test_two_frames_of_whole_numbers_still_give_a_fine_dark_level(tmp_path):
     path = tmp_path / "few.h5"
     rng = np.random.default_rng(7)

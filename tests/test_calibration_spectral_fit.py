@@ -13,6 +13,8 @@ from raytwin.calibration.spectral_fit import (
     OTHER_SCINTILLATOR,
     SHAPE_PARAMETERS,
     Transmission,
+    _Posterior,
+    _repeated_levels,
     correction_from_spectra,
     fit_spectrum,
     geometry_factor,
@@ -208,6 +210,55 @@ def test_levels_that_contradict_the_model_raise_the_learned_discrepancy(model):
     assert found[0].discrepancy["level"][0] < 0.0015
     assert found[1].discrepancy["level"][0] > 0.004
     assert found[1].posterior.level_discrepancy > 4 * found[0].posterior.level_discrepancy
+
+
+def repeated(scatter, *, sampling_percent=0.02):
+    """Four settings measured three times each, as the evidence has them; `scatter` relative."""
+    offsets = (scatter * math.sqrt(1.5), -scatter * math.sqrt(1.5), 0.0)  # of this standard deviation
+    return [
+        {"mean_signal_DN": [2000.0 * (1 + one) for one in offsets], "sampling_percent": [sampling_percent] * 3}
+        for _ in range(4)
+    ]
+
+
+def test_repeats_of_a_setting_tell_how_well_the_line_repeats_itself(model):
+    truth = typical(model)
+    levels = levels_of(model, truth, BEAMS)
+    found = [
+        fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(2), repeats=repeats)
+        for repeats in ((), repeated(1e-4), repeated(3e-3))
+    ]
+    alone, steady, unsteady = (one.discrepancy["level"] for one in found)
+    assert steady[0] < 0.6 * alone[0] and steady[2] < alone[2]
+    assert unsteady[1] < 3e-3 < unsteady[2] and unsteady[0] > 1.5e-3
+    widths = [one.posterior.level_discrepancy for one in found]
+    assert widths[1] < widths[0] < widths[2]
+
+
+def test_likelihood_of_repeats_is_that_of_any_level(model):
+    """Against the integral over the level, for series of different sampling noise."""
+    logs, sampling = np.array([0.0, 0.002, -0.001]), np.array([5e-4, 1e-3, 7e-4])
+    priors = priors_for(model, scintillator_declared=True)
+    fit = _Posterior(model, priors, [], [], {"level": None, "gain": None}, [(logs, sampling)])
+    sizes = np.array([1e-4, 1e-3, 4e-3])
+    level = np.linspace(-0.05, 0.05, 20001)
+    exact = []
+    for size in sizes:
+        sd = np.hypot(sampling, size)[:, None]
+        density = np.prod(np.exp(-0.5 * ((logs[:, None] - level) / sd) ** 2) / sd, axis=0)
+        exact.append(math.log(np.sum(density) * (level[1] - level[0])))
+    found = fit._log_likelihood_of_repeats(sizes)
+    assert found - found[0] == pytest.approx(np.array(exact) - exact[0], abs=1e-6)
+
+
+def test_rows_of_repeats_that_say_nothing_are_passed_over():
+    rows = [
+        {"mean_signal_DN": [100.0], "sampling_percent": [0.1]},
+        {"mean_signal_DN": [100.0, 101.0]},
+        {"mean_signal_DN": [100.0, -1.0], "sampling_percent": [0.1, 0.1]},
+        {"mean_signal_DN": [100.0, 101.0], "sampling_percent": [0.1, 0.0]},
+    ]
+    assert _repeated_levels(rows) == []
 
 
 def test_without_a_declared_scintillator_both_kinds_are_weighed():

@@ -1,7 +1,7 @@
 """Predictions at settings never measured, against the virtual lab's truth and against what any method could reach.
 
     python validation/prediction_limit.py [--systems 200] [--first 1000] [--kind nominal|departing|coarse]
-        [--processes 1] [--folder build/prediction_limit] [--fresh] [--prepare] [--next N] [--json FILE]
+        [--repeats 1] [--processes 1] [--folder build/prediction_limit] [--fresh] [--prepare] [--next N] [--json FILE]
 
 Each system is drawn: tube filtration, scintillator, kV offset, output, gain, Swank factor, spread, read noise. One session a
 system holds darks and flats; a protocol is a part of them:
@@ -16,6 +16,9 @@ The limit of a system and setting is the standard deviation that a linear and Ga
 derivatives: measured levels and noise with their sampling errors, priors of the unknowns as they are stated, nuisances
 for attenuation tables, spectrum models, escape, voltage and single levels' discrepancy. It is computed here from the
 lab's own sums over energy, without the twin's code; only the priors' widths are the twin's.
+
+With `--repeats N` the frames of each flat come in N series, all settings in turn, N times: what a session then shows of the
+line's steadiness is used. As many frames in all.
 
 `departing` lines show in full what the priors allow beside (see `Line`); `coarse` ones have an ADC whose step is half to
 four times the read noise. Sessions and results are kept in `--folder`, so that a run that was stopped goes on.
@@ -149,9 +152,12 @@ class Line:
         return replace(setting, filters=layers)
 
 
-def measure(path: Path, line: Line, seed: int, beams: Iterable[tuple[float, str]], *, part: int = 0) -> None:
-    """A session of darks and flats, one series a beam."""
-    rng = np.random.default_rng([seed, 78, part])
+def measure(
+    path: Path, line: Line, seed: int, beams: Iterable[tuple[float, str]], *, part: int = 0, repeats: int = 1
+) -> None:
+    """A session of darks and flats, one series a beam, or as many as it is repeated, all beams in turn."""
+    rng = np.random.default_rng([seed, 78, part] if repeats == 1 else [seed, 78, part, repeats])
+    every = list(beams)
     shape = (line.system.rows, line.system.columns)
     with write_acquisition(path, line.system.instrument()) as writer:
 
@@ -165,24 +171,31 @@ def measure(path: Path, line: Line, seed: int, beams: Iterable[tuple[float, str]
             put(name, frames, kind="dark", exposure_ms=DARK_MS)
 
         dark("dark_0")
-        for kV, layers in beams:
+        for number, (kV, layers) in enumerate(every * repeats):
             power_W = POWER_W.get(kV, 50.0)
             setting = Setting(kV=kV, power_W=power_W, exposure_ms=DARK_MS, filters=filters_from_text(layers))
             real = line.true(setting)
             real = replace(real, power_W=power_W * (1.0 + line.output_sd * float(rng.standard_normal())))
             name = f"flat_{kV:g}_{layers.replace(':', '') or 'open'}"
-            put(name, Bench(line.at(kV), rng=rng).expose(real, frames=FRAMES), kind="flat", setting=setting)
+            name += f"_{number // len(every)}" if repeats > 1 else ""
+            frames = Bench(line.at(kV), rng=rng).expose(real, frames=FRAMES // repeats)
+            put(name, frames, kind="flat", setting=setting)
         dark("dark_1")
 
 
-def prepare(seed: int, kind: str, folder: Path) -> tuple[Path, dict[str, Any]]:
+def prepare(seed: int, kind: str, folder: Path, *, repeats: int = 1) -> tuple[Path, dict[str, Any]]:
     """The session of a line, and what the lab knows of it: truths of the settings and derivatives at all beams."""
-    session, known = folder / f"{kind}_{seed}.h5", folder / f"{kind}_{seed}.json"
+    repeated = f"_x{repeats}" if repeats > 1 else ""
+    session, known = folder / f"{kind}{repeated}_{seed}.h5", folder / f"{kind}_{seed}.json"
+    if known.exists() and not session.exists():
+        beams = sorted({beam for protocol in PROTOCOLS.values() for beam in protocol})
+        measure(session, Line(seed, kind), seed, beams, repeats=repeats)
     if not known.exists():
         folder.mkdir(parents=True, exist_ok=True)
         line = Line(seed, kind)
         maps = detector_maps(line.system)
-        measure(session, line, seed, sorted({beam for protocol in PROTOCOLS.values() for beam in protocol}))
+        measured = sorted({beam for protocol in PROTOCOLS.values() for beam in protocol})
+        measure(session, line, seed, measured, repeats=repeats)
         truths = [flat_truth(line.at(setting.kV), maps, line.true(setting)) for setting in SETTINGS]
         beams = {(beam[0], filters_from_text(beam[1])) for protocol in PROTOCOLS.values() for beam in protocol}
         beams |= {(setting.kV, setting.filters) for setting in SETTINGS}
@@ -432,9 +445,9 @@ def calibrated(path: Path, beams: Iterable[tuple[float, str]] | None, seed: int)
         return calibrate_twin(part, rng=np.random.default_rng([seed, 79]), advise=False)
 
 
-def run_system(seed: int, *, kind: str, folder: Path) -> dict[str, Any]:
+def run_system(seed: int, *, kind: str, folder: Path, repeats: int = 1) -> dict[str, Any]:
     """Everything that is kept of one system."""
-    session, lab = prepare(seed, kind, folder)
+    session, lab = prepare(seed, kind, folder, repeats=repeats)
     derivatives = {(kV, layers): (np.array(level), np.array(gain)) for kV, layers, level, gain in lab["derivatives"]}
     prior = prior_covariance(lab["unknowns"])
     rows: list[dict[str, Any]] = []
@@ -572,11 +585,11 @@ def print_table(table: list[dict[str, Any]]) -> None:
 
 
 def run(
-    seeds: Iterable[int], *, kind: str, folder: Path, processes: int = 1, fresh: bool = False
+    seeds: Iterable[int], *, kind: str, folder: Path, processes: int = 1, fresh: bool = False, repeats: int = 1
 ) -> list[dict[str, Any]]:
     """Results of all seeds; those kept in the folder are not computed again, unless `fresh`."""
     done: dict[int, dict[str, Any]] = {}
-    file = folder / f"{kind}_results.jsonl"
+    file = folder / (f"{kind}_x{repeats}_results.jsonl" if repeats > 1 else f"{kind}_results.jsonl")
     if fresh:
         file.unlink(missing_ok=True)
     if file.exists():
@@ -589,7 +602,7 @@ def run(
     wanted = list(seeds)
     missing = [seed for seed in wanted if seed not in done]
     folder.mkdir(parents=True, exist_ok=True)
-    job = partial(run_system, kind=kind, folder=folder)
+    job = partial(run_system, kind=kind, folder=folder, repeats=repeats)
     with ExitStack() as stack, file.open("a", encoding="utf-8") as out:
         # a process of its own keeps the spectra that it has computed
         finished = (
@@ -611,6 +624,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=1000, help="first seed; development used seeds below 1000")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--kind", choices=("nominal", "departing", "coarse"), default="nominal")
+    parser.add_argument("--repeats", type=int, default=1, help="series that each flat's frames come in")
     parser.add_argument("--folder", type=Path, default=Path("build/prediction_limit"), help="sessions and results")
     parser.add_argument("--fresh", action="store_true", help="calibrate again; the lab's sessions are kept")
     parser.add_argument("--prepare", action="store_true", help="only measure the sessions")
@@ -622,10 +636,15 @@ def main() -> int:
     seeds = range(arguments.first, arguments.first + arguments.systems)
     if arguments.prepare:
         for seed in tqdm(seeds, disable=None, file=sys.stderr):
-            prepare(seed, arguments.kind, arguments.folder)
+            prepare(seed, arguments.kind, arguments.folder, repeats=arguments.repeats)
         return 0
     results = run(
-        seeds, kind=arguments.kind, folder=arguments.folder, processes=arguments.processes, fresh=arguments.fresh
+        seeds,
+        kind=arguments.kind,
+        folder=arguments.folder,
+        processes=arguments.processes,
+        fresh=arguments.fresh,
+        repeats=arguments.repeats,
     )
     table = summarise(results)
     print(f"{len(results)} {arguments.kind} systems, {time.perf_counter() - started:.0f} s")

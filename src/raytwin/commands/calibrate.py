@@ -1,7 +1,8 @@
 """Calibrate a twin from measured flat and dark series.
 
 Works from any subset: without kV or instrument the twin has gain, noise and blur but no spectral part, and says so.
-Series whose role is `evaluation` are not looked at; `raytwin validate` compares with them.
+Series whose role is `evaluation` are not looked at; `raytwin validate` compares with them. Settings measured more than
+once, with others in between, show how steady the line is: predictions of a steady one get narrower intervals.
 """
 
 import argparse

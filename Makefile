@@ -46,6 +46,12 @@ blind-check: $(READY)
 	@test -n "$(SEED)" || { echo "say which seed: make blind-check SEED=123456 [CASES=600]"; exit 2; }
 	$(BIN)/raytwin blind-check -n $(CASES) --seed $(SEED) -o build/blind_$(SEED) --train-cases 300 --workers 2
 
+# the worked stories of docs/stories, ten minutes each; what they write stands in build/stories
+stories: $(READY)
+	for story in scatter drift_and_lag spectrum; do \
+	mkdir -p build/stories/$$story && \
+	(cd build/stories/$$story && PATH=$(CURDIR)/$(BIN):$$PATH sh $(CURDIR)/docs/stories/$$story.sh) || exit 1; done
+
 # speed and memory as this machine has them, each against its reference in the same run
 benchmark: $(READY)
 	$(BIN)/python benchmarks/predict_settings.py

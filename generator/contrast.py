@@ -40,7 +40,7 @@ from .present_line import present_line
 from .psf import PSF_MODELS, blur_variance_share, noise_autocovariance_1d
 from .spectral_signal import OpenBeam
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
-from .twin_spectrum import spectral_model_of
+from .twin_spectrum import spectral_model_of, white_gain_DN
 
 FloatArray = NDArray[np.float64]
 
@@ -167,19 +167,22 @@ class _Spread:
 
     model: str
     sigma_px: float
-    white_fraction: float
     read_variance_DN2: float
     pixel_mm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Beam:
-    """A setting as a function: transmission of an object (energy,) -> rate and gain (draw,), row 0 the best values."""
+    """A setting as a function: transmission of an object (energy,) -> rate and gain (draw,), row 0 the best values.
+
+    secondary_DN: of the gain, what secondary quanta add, the same behind any object.
+    """
 
     signal: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
     energies_keV: FloatArray
     open_signal_DN: float
     open_gain_DN: float
+    secondary_DN: float
     warnings: tuple[str, ...]
 
 
@@ -224,6 +227,7 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
         energies_keV=model.energies_keV,
         open_signal_DN=predicted.mean_DN.value,
         open_gain_DN=predicted.gain_DN.value,
+        secondary_DN=white_gain_DN(twin, predicted.gain_DN.value),
         warnings=(*predicted.warnings, *told),
     )
 
@@ -278,6 +282,7 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         energies_keV=energies,
         open_signal_DN=float(rate[0]) * load * (1000.0 / distance) ** 2 * line.pixel_mm**2,
         open_gain_DN=float(gain[0]),
+        secondary_DN=0.0,
         warnings=(),
     )
 
@@ -287,14 +292,12 @@ def _spread_of(line: Twin | UncalibratedLine) -> _Spread:
         return _Spread(
             model=line.psf_model,
             sigma_px=line.psf_sigma_px,
-            white_fraction=0.0,
             read_variance_DN2=line.read_noise_keV**2,
             pixel_mm=line.pixel_mm,
         )
     return _Spread(
         model=line.noise.psf_model,
         sigma_px=line.noise.psf_sigma_px.value,
-        white_fraction=line.noise.white_fraction,
         read_variance_DN2=line.noise.read_variance_DN2,
         pixel_mm=line.instrument.pixel_mm or 0.15,
     )
@@ -360,12 +363,11 @@ def _slabs(
                 expected="a signal that a detector could hold",
                 remedy="check tube load, distance, pixel pitch and output",
             )
-        total = beam.open_gain_DN * float(ratio) / signal  # variance of M before the spread: gain S / S^2
-        quantum.append(total / (1.0 + spread.white_fraction) / setting.averaged)
-        white.append(
-            (total * spread.white_fraction / (1.0 + spread.white_fraction) + spread.read_variance_DN2 / signal**2)
-            / setting.averaged
-        )
+        gain_DN = beam.open_gain_DN * float(ratio)
+        secondary_DN = min(beam.secondary_DN, 0.9 * gain_DN)
+        # variance of M before the spread: gain S / S^2
+        quantum.append((gain_DN - secondary_DN) / signal / setting.averaged)
+        white.append((secondary_DN / signal + spread.read_variance_DN2 / signal**2) / setting.averaged)
         spreads.append(quantum[-1] * blur_variance_share(spread.model, spread.sigma_px) + white[-1])
     thin = []
     for layer in (product, foreign_object):

@@ -16,7 +16,7 @@ from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
-from .plan import best_repeat
+from .plan import best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import mislabelled, prepare_session
 from .refine import refine
@@ -368,12 +368,8 @@ def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[s
     found = best_repeat(problem, first, second)
     if found is None:
         return None
-    names = [" and ".join(item.effects) for item in tied[:2]]
     return {
-        "text": (
-            f"take {found.series} again with {found.times} times as many frames: {names[0]} and {names[1]} would lie"
-            f" {found.separation_then:.1f} standard deviations apart instead of {found.separation:.1f}"
-        ),
+        "text": repeat_text(found, tied[0].effects, tied[1].effects),
         "separates": sorted({effect for item in tied[:2] for effect in item.effects}),
         "series": found.series,
         "separation": found.separation,

@@ -4,7 +4,7 @@ Only expectations, noise and nuisances are used, so the frames' contents do not 
 taken on another day, says as much.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,31 @@ _GRID = 41  # strengths of a competitor, evenly in the logarithm
 _CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
+_WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
+
+# what shows an effect by itself; also what a session has to hold for it to be told from its like
+ISOLATED_BY = {
+    "object_scatter": "a slab at two gaps to the detector, or a beam stop",
+    "veiling_glare": "opaque discs of several sizes",
+    "focal_spot": "an edge at two magnifications",
+    "mtf_tail": "an edge close to the detector, with flats",
+    "k_fluorescence": "the same at a tube voltage below the scintillator's K edge (30 kV) and above it (60 kV)",
+    "image_lag": "frames with the beam off straight after an exposure",
+    "nonlinearity": "flats at several exposure times and one current",
+    "dark_drift": "darks in between, at the longest exposure time",
+    "output_drift": "frames with an open field beside the object",
+    "kv_error": "flats and two materials of known thickness at several tube voltages",
+    "filtration_error": "flats at two tube voltages with and without a known filter",
+    "heel": "a flat with the panel turned by 180 degrees, and a wedge at two places",
+    "row_noise": "darks",
+    "bad_pixels": "darks and flats",
+    "excess_noise": "flats of many frames at several levels",
+    "quantisation": "darks and flats at finely spaced levels",
+    "motion_blur": "an edge at several exposure times of equal charge",
+    "misregistration": "a grid of balls, or an edge in two directions",
+    "gain_map_error": "flats repeated, and behind a filter",
+    "composition_error": "a certified wedge of the product's material",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +104,26 @@ class Repeat:
     times: int
     separation: float
     separation_then: float
+
+
+def repeat_text(repeat: Repeat, first: Sequence[str], second: Sequence[str]) -> str:
+    """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them."""
+    names = " and ".join(first) + " from " + " and ".join(second)
+    if repeat.separation_then >= _WORTH_IT:
+        return (
+            f"take {repeat.series} again with {repeat.times} times as many frames, which would tell {names} by"
+            f" {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+        )
+    isolating = "; ".join(
+        f"{effect} by {ISOLATED_BY[effect]}"
+        for effect in (*first, *second)
+        if effect in ISOLATED_BY and (effect in first) != (effect in second)
+    )
+    return (
+        f"no series of this session will do: {repeat.times} times as many frames of the best one, {repeat.series}, tell"
+        f" {names} by {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}. Measure what"
+        f" isolates them: {isolating}"
+    )
 
 
 def best_repeat(

@@ -8,8 +8,9 @@ import pytest
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose import Gap, _leaves_too_much
 from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
-from raytwin.diagnosis.plan import best_repeat, distinguishability, table_text
+from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
+from raytwin.generator.effects import EFFECTS
 
 PROBES = 60
 
@@ -138,3 +139,20 @@ def test_refinement_finds_an_inner_parameter_between_the_grid_s():
 )
 def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
     assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None)) is vetoed
+
+
+def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():
+    good = Repeat(series="dark_100ms", times=4, separation=2.0, separation_then=3.9)
+    assert repeat_text(good, ["dark_drift"], ["image_lag"]).startswith(
+        "take dark_100ms again with 4 times as many frames"
+    )
+    poor = Repeat(series="flat_90kV", times=4, separation=1.6, separation_then=1.7)
+    text = repeat_text(poor, ["filtration_error", "row_noise"], ["kv_error", "row_noise"])
+    assert text.startswith("no series of this session will do")
+    assert ISOLATED_BY["kv_error"] in text
+    assert ISOLATED_BY["filtration_error"] in text
+    assert ISOLATED_BY["row_noise"] + ";" not in text
+
+
+def test_every_effect_of_the_catalogue_has_a_measurement_that_isolates_it():
+    assert set(ISOLATED_BY) == set(EFFECTS)

@@ -8,20 +8,25 @@ the task made stands in DIR/task, and a run that was stopped goes on there.
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ._answer import answer, jsonable, say
 
 if TYPE_CHECKING:
+    from ..acquisition.acquisition_io import AcquisitionFile
     from ..campaign.task import TaskInput, TaskPlan
     from ..diagnosis.diagnose import Diagnosis
     from ..generator.twin import Twin
+
+_LATER_S = 3600.0  # from the end of a session to what was measured later, which has a clock of its own
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol full --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o diagnosis
   raytwin diagnose session.h5 -o plan --plan
+  raytwin diagnose session.h5 -o again --also more.h5
   raytwin lab -o products.h5 --protocol products --session 1 --products 96 --bones-mm 1,1.5,2,2.5,3,4 \\
     --effect object_scatter=10 --seed 1
   raytwin diagnose session.h5 -o with_pod --task products.h5
@@ -33,6 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file")
     parser.add_argument(
         "--twin", metavar="TWIN", type=Path, help="twin calibrated before (default: from this session's own series)"
+    )
+    parser.add_argument(
+        "--also",
+        metavar="MORE",
+        type=Path,
+        action="append",
+        default=[],
+        help="what was measured later on the same line, such as the answer's next measurement; calibrates nothing; repeatable",
     )
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="folder of the answer")
     parser.add_argument(
@@ -85,7 +98,6 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from .. import __version__
-    from ..acquisition import open_acquisition
     from ..diagnosis.diagnose import diagnose, diagnosis_answer
     from ..diagnosis.explanation import paragraph, task_text
     from ..diagnosis.report import write_report
@@ -109,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plan:
         return _plan(arguments, twin)
     task = _task_of(arguments)
-    with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
+    with _opened(arguments) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         result = diagnose(
             acquisition,
             twin=twin,
@@ -122,6 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"label in doubt: {line}" if number < doubts else f"not used: {line}")
     inputs = {
         "acquisition_sha256": sha256_of_file(arguments.acquisition),
+        **({"also_sha256": [sha256_of_file(path) for path in arguments.also]} if arguments.also else {}),
         "twin_sha256": None if arguments.twin is None else sha256_of_file(arguments.twin),
         "raytwin_version": __version__,
         "seed": arguments.seed,
@@ -144,6 +157,28 @@ def run(arguments: argparse.Namespace) -> int:
         text += f" {task_text(data['task'])}"
     answer(data, as_json=arguments.json, text=f"{text}\nreport: {arguments.output / 'report.html'}")
     return 0
+
+
+def _opened(arguments: argparse.Namespace) -> "AcquisitionFile":
+    """The session, with what was measured later behind it in time."""
+    from ..acquisition import open_acquisition
+    from ..acquisition.sessions import merge_sessions
+
+    first = open_acquisition(arguments.acquisition)
+    if not arguments.also:
+        return first
+    merged = merge_sessions([first, *(open_acquisition(path) for path in arguments.also)])
+    series, begins_s, session = [], 0.0, 0
+    last_s = 0.0
+    for item in merged.series:
+        if item.session != session:
+            session, begins_s = item.session, last_s + _LATER_S
+        time_s = None if item.time_s is None else item.time_s + begins_s
+        if time_s is not None:
+            last_s = max(last_s, float(time_s[-1]))
+        role = item.role if item.session == 0 else "evaluation"
+        series.append(replace(item, time_s=time_s, role=role))
+    return replace(merged, series=tuple(series))
 
 
 def _task_of(arguments: argparse.Namespace) -> "tuple[TaskInput, TaskPlan] | None":
@@ -175,8 +210,6 @@ def _task_of(arguments: argparse.Namespace) -> "tuple[TaskInput, TaskPlan] | Non
 def _run_task(
     arguments: argparse.Namespace, task: "tuple[TaskInput, TaskPlan]", result: "Diagnosis"
 ) -> dict[str, object]:
-    from dataclasses import replace
-
     from tqdm import tqdm
 
     from ..campaign.task import run_task
@@ -204,14 +237,13 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     import numpy as np
     from tqdm import tqdm
 
-    from ..acquisition import open_acquisition
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
     from ..diagnosis.plan import distinguishability, table_text
     from ..diagnosis.preparation import mislabelled, prepare_session
     from ..files import whole_file
 
-    with open_acquisition(arguments.acquisition) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
+    with _opened(arguments) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
         if session.suspects:
             raise mislabelled(acquisition, session.suspects)

@@ -312,7 +312,7 @@ def test_images_without_foreign_objects_are_refused(line, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_line_with_another_voltage_is_followed_from_session_to_a90(line, tmp_path, capsys):
+def test_a_noisier_line_is_followed_from_session_to_a90(line, tmp_path, capsys):
     session = tmp_path / "session.h5"
     words = ["lab", "-o", str(session), "--protocol", "short", *LINE, "--frames", "16", "--products", "1"]
     assert main([*words, "--effect", "excess_noise=60@calibration"]) == 0

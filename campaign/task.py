@@ -680,8 +680,8 @@ def _train(
     """Folders of networks: one common start, then `networks` of each kind."""
     from ..segmentation import RECIPES, recipe_for_fine_tuning
 
-    with read_dataset(measured) as dataset:
-        crop = plan.crop_px if 0 < plan.crop_px < min(dataset.shape) else None
+    with read_dataset(measured) as images:
+        crop = plan.crop_px if 0 < plan.crop_px < min(images.shape) else None
     first = replace(RECIPES["raytwin"], steps=plan.start_steps, batch=plan.batch, crop_px=crop)
     later = replace(recipe_for_fine_tuning(RECIPES["raytwin"]), steps=plan.steps, batch=plan.batch, crop_px=crop)
     start = directory / "networks_start"

@@ -94,14 +94,12 @@ class KnownScenes:
         stack = np.stack([np.asarray(thickness_mm[name], dtype=np.float32) for name in names])
         scale = self._effects[0].attenuation_scale(names)
         moments = _moments_behind(stack, names, twin=self.twin, channels=self._channels, scale=scale)
-        return tuple(
-            effects.image(
-                *(plane.repeat(FINE, axis=0).repeat(FINE, axis=1) for plane in planes),
-                {name: np.asarray(thickness_mm[name], dtype=np.float64) for name in names},
-                focal_blur_px=self.geometry.focal_blur_px,
-            )
-            for effects, planes in zip(self._effects, moments, strict=True)
-        )
+        lengths = {name: np.asarray(thickness_mm[name], dtype=np.float64) for name in names}
+        images = []
+        for effects, planes in zip(self._effects, moments, strict=True):
+            signal, variance = (plane.repeat(FINE, axis=0).repeat(FINE, axis=1) for plane in planes)
+            images.append(effects.image(signal, variance, lengths, focal_blur_px=self.geometry.focal_blur_px))
+        return tuple(images)
 
     def draw(self, expected: Sequence[AffectedImage], rng: np.random.Generator) -> NDArray[np.float32]:
         """-ln(I / I0) (2, row, column) with noise of its own, divided by the flat of the line as it is now."""

@@ -30,6 +30,7 @@ from .probes import (
     Scalar,
     ScalarContext,
     Template,
+    correlation_sum,
     edge_templates,
     expected_scalars,
     measured_scalars,
@@ -44,6 +45,8 @@ Map = NDArray[np.float32]
 _CACHE_BYTES = 200_000_000
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _LABEL_PIXELS = 150  # that a noise label needs
+_UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
+_GAIN_MAP_MODES = 3  # cosines along each side
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
@@ -672,6 +675,10 @@ def build_problem(
                 shape,
             )
         )
+        if flats and kind in ("flat", "object") and not item.calibrates and "gain" not in item.series.corrected:
+            lasting = gain_white + gain_quantum * correlation_sum(model, BLOCK_PX, BLOCK_PX)
+            own = _of_gain_map(projection, signal, math.sqrt(lasting), len(scalar_probes))
+            blocks[-1]["local"] |= {name: column * blocks[-1]["shrink"] for name, column in own.items()}
 
     def respond(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
         """Responses (strength, probe) of further variants, by their place in `asked`; failed ones are left out."""
@@ -831,7 +838,8 @@ def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
         return "" if series.exposure_ms is not None else "exposure unknown"
     if series.kind == "afterglow":
         return ""
-    if series.setting is None or series.setting.tube_load_mAs is None:
+    load_stated = series.setting is not None and series.setting.tube_load_mAs is not None
+    if not load_stated and item.request.open_signal_DN is None:
         return "kV, exposure or tube load unknown"
     if series.kind == "object":
         scene = acquisition.scenes.get(series.scene)
@@ -1111,13 +1119,16 @@ def _local_nuisances(
     if series.kind in ("dark", "afterglow"):
         result[f"dark of {series.name}"] = of_map(np.full(signal.shape, scales.DARK_SD_DN))
         return result
-    beam = f"{series.kV:g} kV " + "+".join(str(layer) for layer in series.filters)
+    # without a voltage the noise of a beam is known only from its own series
+    voltage = f"unknown kV ({series.current_mA}, {series.power_W})" if series.kV is None else f"{series.kV:g} kV"
+    gain_sd = _UNKNOWN_GAIN_SD if series.kV is None else scales.GAIN_OF_BEAM_SD
+    beam = f"{voltage} " + "+".join(str(layer) for layer in series.filters)
     result[f"level of {beam}"] = of_map(scales.LEVEL_OF_BEAM_SD * signal)
     result[f"level of {series.name}"] = of_map(scales.LEVEL_OF_SERIES_SD * signal)
     result[f"tilt x of {series.name}"] = of_map(scales.TILT_SD * x * signal)
     result[f"tilt y of {series.name}"] = of_map(scales.TILT_SD * y * signal)
     result[f"gain of {beam}"] = of_scalars(
-        lambda probe: scales.GAIN_OF_BEAM_SD if probe.name.startswith("log_variance") else 0.0
+        lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
     )
 
     def texture(lag: tuple[int, int]) -> NDArray[np.float64]:
@@ -1131,7 +1142,7 @@ def _local_nuisances(
     for lag in LAGS:
         # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
         result[f"texture {lag}"] = texture(lag)
-        result[f"texture {lag} at {series.kV:g} kV"] = scales.TEXTURE_OF_BEAM_SHARE * texture(lag)
+        result[f"texture {lag} at {voltage}"] = scales.TEXTURE_OF_BEAM_SHARE * texture(lag)
     if series.kind == "object":
         dy, dx = gradient(signal)
         scene = series.scene
@@ -1166,9 +1177,30 @@ def _local_nuisances(
             )
             result[f"thickness of {material} in {scene}"] = response
             result[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
-            result[f"attenuation of {material} at {series.kV:g} kV"] = response * (
+            result[f"attenuation of {material} at {voltage}"] = response * (
                 scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
             )
+    return result
+
+
+def _of_gain_map(
+    projection: MapProjection, signal: NDArray[np.float64], pixel_sd: float, scalars: int
+) -> dict[str, NDArray[np.float64]]:
+    """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
+
+    pixel_sd: relative, of one pixel's gain in sums over many pixels.
+    """
+    result = {}
+    rows, columns = signal.shape
+    y = np.cos(np.pi * np.outer(np.arange(_GAIN_MAP_MODES), (np.arange(rows) + 0.5) / rows))
+    x = np.cos(np.pi * np.outer(np.arange(_GAIN_MAP_MODES), (np.arange(columns) + 0.5) / columns))
+    for i in range(_GAIN_MAP_MODES):
+        for j in range(_GAIN_MAP_MODES):
+            if i + j == 0:
+                continue  # the level has nuisances of its own
+            shape = np.outer(y[i], x[j])
+            sd = pixel_sd / math.sqrt(float(np.sum(shape**2)))
+            result[f"gain map {i},{j}"] = np.concatenate([projection.apply(sd * shape * signal), np.zeros(scalars)])
     return result
 
 

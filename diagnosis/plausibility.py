@@ -48,7 +48,7 @@ _PRICE_OF_A_SETTING = 2.0  # natural logarithm, of more than one word being wron
 _MOST_CHANGES = 4
 _INHERENT_MM_AL = 1.0  # where nothing is declared
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
-_NO_BEAM = 0.02  # of the level that a flat should have
+_NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
 _SHADOW_IN_FLAT = 0.35  # spread of the logarithm of a flat against other flats
 _DEEPEST = 4.0  # -log T beyond which nothing is compared
@@ -307,9 +307,12 @@ def _without_beam(judged: list[_Reading]) -> tuple[list[Suspect], list[_Reading]
     """Flats without light among flats with light."""
     flats = [item for item in judged if item.series.kind == "flat"]
     found, left = [], []
-    typical = float(np.median([item.level_DN for item in flats])) if flats else 0.0
+    # per mAs, or per ms: a short exposure is weak by right
+    rates = {item.name: item.level_DN / math.exp(item.label.log_load) for item in flats}
+    loads = {item.name: item.label.load is None for item in flats}
     for item in judged:
-        dim = item.level_DN <= _NO_BEAM * typical
+        alike = [rate for name, rate in rates.items() if loads[name] == loads.get(item.name)]
+        dim = item.name in rates and rates[item.name] <= _NO_BEAM * float(np.median(alike))
         if item.series.kind == "flat" and (dim or not item.level_DN > 0):
             found.append(
                 Suspect(

@@ -23,6 +23,7 @@ AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", 
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
 _NOISE_PIXELS = 65_536  # whose noise is projected at a time
 OUTLIER_SD = 7.0
+_LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
 # what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
@@ -167,18 +168,18 @@ def expected_scalars(
     row, column = expected.row_variance_DN2, expected.column_variance_DN2
     mean_q, mean_w = quantum_mean(expected, good)
     moving = _MovingPicture.of(expected, context)
-    total = mean_q * keep + mean_w + row + column + moving.pixels(good)
+    total = max(mean_q * keep + mean_w + row + column + moving.pixels(good), _LEAST_DN2)
     if context.frames > 2:
         for label, name in enumerate(context.label_names):
             mask = good & (context.labels == label)
             q, w = quantum_mean(expected, mask)
             shared = moving.pixels(mask)
             here = q * keep + w + row + column + shared
-            values[f"log_variance {name}"] = math.log(max(here, 1e-12))
+            values[f"log_variance {name}"] = math.log(max(here, _LEAST_DN2))
             for dr, dc in LAGS:
                 covariance = q * keep * autocovariance(expected, dr, dc) + shared
                 covariance += (row if dr == 0 else 0) + (column if dc == 0 else 0)
-                values[f"correlation {name} ({dr},{dc})"] = covariance / max(here, 1e-12)
+                values[f"correlation {name} ({dr},{dc})"] = covariance / max(here, _LEAST_DN2)
         line_q = mean_q * keep
         values["row_ratio"] = math.log(
             max(
@@ -205,7 +206,7 @@ def expected_scalars(
             / total
         )
         temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
-        full = mean_q + mean_w + row + column + moving.pixels(good)
+        full = max(mean_q + mean_w + row + column + moving.pixels(good), _LEAST_DN2)
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
             values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(good, step)) / full

@@ -12,6 +12,7 @@ from ..generator.series import SeriesRequest
 
 _REMEMBERED = 3  # series before one's own whose trapped charge may still be there
 _GAP_S = 1.0  # between series whose times are not stated
+_ONE_RATE = 1.25  # largest over smallest level a unit of exposure that one unknown tube load can have
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +70,68 @@ def calibrating_names(series: Sequence[Series]) -> frozenset[str]:
     return frozenset(chosen)
 
 
+def _mean_DN(item: Series) -> float:
+    """Mean over frames and pixels, DN."""
+    total, count = 0.0, 0
+    for piece in item.iter_frames():
+        total += float(piece.sum(dtype=np.float64))
+        count += piece.size
+    return total / count
+
+
+def measured_levels(series: Sequence[Series]) -> dict[str, float]:
+    """Open-field level (DN) of one exposure for lit series that do not state kV or tube load, by name.
+
+    What is not stated is taken to be the same in all series of equal kV (or none), filters and distance, so that the level goes
+    as the exposure time, or as the photons where they were counted: the rate is that of the flats which calibrate. Where
+    these contradict one rate, each flat has its own level, and says nothing about linearity or drift.
+    """
+    unknown = [
+        item
+        for item in series
+        if item.kind in ("flat", "object")
+        and item.exposure_ms
+        and (item.setting is None or item.setting.tube_load_mAs is None)
+        and "log" not in item.corrected
+    ]
+    if not unknown:
+        return {}
+    darks = sorted((item.exposure_ms, _mean_DN(item)) for item in series if item.kind == "dark" and item.exposure_ms)
+    calibrating = calibrating_names(series)
+
+    def beam(item: Series) -> tuple[object, ...]:
+        return (item.kV, item.filters, item.current_mA, item.power_W, item.source_detector_mm)
+
+    def amount(item: Series, counted: bool) -> float:
+        return float((item.photons_per_pixel if counted else item.exposure_ms) or 0.0)
+
+    result: dict[str, float] = {}
+    for key in dict.fromkeys(beam(item) for item in unknown):
+        members = [item for item in unknown if beam(item) == key]
+        levels: dict[str, float] = {}
+        for item in members:
+            if item.kind != "flat" or not (darks or "offset" in item.corrected):
+                continue
+            dark = 0.0
+            if "offset" not in item.corrected:
+                dark = float(np.interp(item.exposure_ms or 0.0, *zip(*darks, strict=True)))
+            levels[item.name] = _mean_DN(item) - dark
+        levels = {name: level for name, level in levels.items() if level > 0}
+        counted = all((item.photons_per_pixel or 0.0) > 0 for item in members)
+        first = [item for item in members if item.name in levels and item.name in calibrating]
+        first = first or [item for item in members if item.name in levels]
+        if not first:
+            continue
+        rates = np.array([levels[item.name] / amount(item, counted) for item in first])
+        if float(rates.max()) > _ONE_RATE * float(rates.min()):
+            result |= levels
+            continue
+        weights = np.array([levels[item.name] for item in first])
+        rate = float(np.sum(weights * rates) / np.sum(weights))
+        result |= {item.name: rate * amount(item, counted) for item in members if amount(item, counted) > 0}
+    return result
+
+
 def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
@@ -86,6 +149,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
     stated = any(item.role == "calibration" for item in ordered)
     calibrating = frozenset() if calibrated_elsewhere and not stated else calibrating_names(ordered)
     instrument = acquisition.instrument
+    levels = measured_levels(ordered)
     clock = 0.0
     result: list[SessionSeries] = []
     requests: list[SeriesRequest] = []
@@ -123,6 +187,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             kind=item.kind,
             setting=item.setting,
             frames=item.n_frames,
+            averaged=item.averaged,
             exposure_ms=exposure_ms,
             frame_interval_ms=interval_ms,
             start_s=start,
@@ -135,6 +200,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             belt_axis=instrument.belt_axis or "row",
             panel_rotation_deg=item.panel_rotation_deg,
             after_calibration=after,
+            open_signal_DN=levels.get(item.name),
             previous=tuple(replace(before, previous=()) for before in requests[-_REMEMBERED:]),
         )
         requests.append(request)

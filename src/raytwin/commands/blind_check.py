@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ._answer import answer, jsonable, say
+from ._folder import check_effects, written_folder
 
 EXAMPLE = """examples:
   raytwin blind-check -n 600 --seed 123456 -o blind --train-cases 300 --workers 2
@@ -93,7 +94,9 @@ def run(arguments: argparse.Namespace) -> int:
     from ..campaign.blind_results import case_rows, score_check, write_cases
     from ..errors import InputError
     from ..files import whole_file
+    from ..generator.effects import EFFECTS
 
+    check_effects("--without", arguments.without, tuple(EFFECTS))
     if arguments.workers < 1:
         raise InputError("--workers", received=arguments.workers, expected="1 or more")
     options = BlindOptions(
@@ -108,6 +111,8 @@ def run(arguments: argparse.Namespace) -> int:
         second_day=arguments.second_day,
     )
     folder: Path = arguments.output
+    with written_folder(folder):
+        pass
     seal, cases = begin_check(folder, options, development=arguments.development)
     say(f"sealed: {len(cases)} labels, sha256 {seal}")
     sys.stderr.flush()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ._answer import answer, jsonable, say
+from ._folder import check_effects, written_folder
 
 if TYPE_CHECKING:
     from ..acquisition.acquisition_io import AcquisitionFile
@@ -92,8 +93,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin diagnose`."""
-    from difflib import get_close_matches
+    from ..errors import InputError
+    from ..generator.effects import EFFECTS
+    from ..generator.twin_io import read_twin
 
+    check_effects("--without", arguments.without, tuple(EFFECTS))
+    if arguments.seed < 0:
+        raise InputError("--seed", received=arguments.seed, expected="a whole number of 0 or more")
+    twin = None if arguments.twin is None else read_twin(arguments.twin)
+    with written_folder(arguments.output):
+        return _plan(arguments, twin) if arguments.plan else _diagnose(arguments, twin)
+
+
+def _diagnose(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     import numpy as np
     from tqdm import tqdm
 
@@ -101,25 +113,9 @@ def run(arguments: argparse.Namespace) -> int:
     from ..diagnosis.diagnose import diagnose, diagnosis_answer
     from ..diagnosis.explanation import paragraph, task_text
     from ..diagnosis.report import write_report
-    from ..errors import InputError
     from ..files import sha256_of_file, whole_file
-    from ..generator.effects import EFFECTS
-    from ..generator.twin_io import read_twin, write_twin
+    from ..generator.twin_io import write_twin
 
-    for name in arguments.without:
-        if name not in EFFECTS:
-            near = get_close_matches(name, EFFECTS, 3, 0.4) + [item for item in EFFECTS if name.lower() in item]
-            raise InputError(
-                "--without",
-                received=name,
-                expected="one of " + ", ".join(EFFECTS),
-                remedy="did you mean " + " or ".join(dict.fromkeys(near)) + "?" if near else "",
-            )
-    if arguments.output.exists() and not arguments.output.is_dir():
-        raise InputError("-o", received=f"{arguments.output}, a file", expected="a folder, which may not exist yet")
-    twin = None if arguments.twin is None else read_twin(arguments.twin)
-    if arguments.plan:
-        return _plan(arguments, twin)
     task = _task_of(arguments)
     with _opened(arguments) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         result = diagnose(
@@ -140,7 +136,6 @@ def run(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
     }
     data = diagnosis_answer(result, inputs=inputs)
-    arguments.output.mkdir(parents=True, exist_ok=True)
     with whole_file(arguments.output / "twin.h5") as temporary:
         write_twin(temporary, result.twin)
 
@@ -262,7 +257,6 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         "between": found.between.tolist(),
         "cannot_be_judged": dict(problem.missing_effects),
     }
-    arguments.output.mkdir(parents=True, exist_ok=True)
     with whole_file(arguments.output / "plan.json") as temporary:
         temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     missing = [f"{effect} cannot be judged: {reason}" for effect, reason in problem.missing_effects.items()]

@@ -1,0 +1,161 @@
+"""Labels that the frames contradict are found and said; effects at the ends of their ranges are not taken for wrong labels."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition
+from raytwin.cli import main
+from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, check_plausibility
+from raytwin.diagnosis.session import calibrating_names
+
+SIZE = ["--size", "48", "--frames", "10"]
+FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"
+
+
+def found_in(path):
+    with open_acquisition(path) as acquisition:
+        return check_plausibility(acquisition, calibrating=calibrating_names(acquisition.series))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plausibility") / "session.h5"
+    assert main(["lab", "-o", str(path), "--protocol", "short", "--seed", "31", "--products", "3", *SIZE]) == 0
+    return path
+
+
+@pytest.fixture
+def changed(session, tmp_path):
+    """A copy of the session after a change of its file."""
+
+    def make(change):
+        path = tmp_path / "changed.h5"
+        shutil.copy(session, path)
+        with h5py.File(path, "r+") as file:
+            change(file)
+        return path
+
+    return make
+
+
+def exchange(first, second, *attributes):
+    def change(file):
+        one, other = file["series"][first], file["series"][second]
+        for name in attributes:
+            one.attrs[name], other.attrs[name] = other.attrs[name], one.attrs[name]
+        if not attributes:
+            frames = one["frames"][:], other["frames"][:]
+            for node, values in zip((other, one), frames, strict=True):
+                node["frames"][:] = values
+
+    return change
+
+
+def label(name, **attributes):
+    return lambda file: file["series"][name].attrs.update(attributes)
+
+
+def exchange_everywhere(*kinds):
+    def change(file):
+        for node in file["series"].values():
+            if node.attrs["kind"] in kinds:
+                node.attrs["kV"] = 130.0 - node.attrs["kV"]
+
+    return change
+
+
+def maps(scene, change):
+    def apply(file):
+        group = file["scenes"][scene]["thickness_mm"]
+        for material in group:
+            group[material][...] = change(group[material][:])
+
+    return apply
+
+
+def exchange_maps(file):
+    file.move("scenes/product1/thickness_mm", "kept")
+    file.move("scenes/product2/thickness_mm", "scenes/product1/thickness_mm")
+    file.move("kept", "scenes/product2/thickness_mm")
+
+
+def test_right_labels_raise_no_doubt(session):
+    found = found_in(session)
+    assert found.suspects == ()
+    assert found.unusable == {}
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        ["kv_error=5@calibration", "nonlinearity=5@always"],
+        ["excess_noise=100@calibration", "filtration_error=1@calibration", "heel=20@calibration"],
+        ["object_scatter=45", "output_drift=3", "dark_drift=100"],
+    ],
+)
+def test_effects_at_the_end_of_their_range_are_not_taken_for_wrong_labels(tmp_path, effects):
+    path = tmp_path / "session.h5"
+    planted = [word for effect in effects for word in ("--effect", effect)]
+    words = ["lab", "-o", str(path), "--protocol", "short", "--seed", "44", "--products", "2", *SIZE, *planted]
+    assert main(words) == 0
+    assert found_in(path).suspects == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "series", "words"),
+    [
+        (exchange(FLAT_40, FLAT_90, "kV"), {FLAT_40, FLAT_90}, "tube voltage were exchanged"),
+        (exchange(f"{FLAT_40}_2", f"{FLAT_90}_2"), {f"{FLAT_40}_2", f"{FLAT_90}_2"}, "setting were exchanged"),
+        (
+            exchange("product1_40kV_100ms", "product1_90kV_100ms", "kV"),
+            {"product1_40kV_100ms", "product1_90kV_100ms"},
+            "tube voltage were exchanged",
+        ),
+        (exchange_everywhere("object"), None, "exchanged in all objects"),
+        (label(f"{FLAT_40}_2", filter=""), {f"{FLAT_40}_2"}, "is labelled no filter, but looks like Cu:0.05"),
+        (label(f"{FLAT_40}_2", exposure_ms=100.0), {f"{FLAT_40}_2"}, "is labelled 100 ms, but looks like 25 ms"),
+        (
+            label("dark_25ms_2", kind="flat", kV=40.0, power_W=82.0, filter="Cu:0.05"),
+            {"dark_25ms_2"},
+            "labelled flat, but shows no beam",
+        ),
+        (label(f"{FLAT_40}_2", kind="dark"), {f"{FLAT_40}_2"}, "labelled dark, but lies"),
+        (maps("product1", lambda image: image[::-1]), None, "mirrored top to bottom would"),
+        (maps("product1", lambda image: 1.3 * image), None, "fit its frames only if all path lengths are 0.7"),
+        (maps("product1", lambda image: 0 * image), None, "are empty, but its frames show a shadow"),
+        (exchange_maps, None, "the maps of product2 would"),
+    ],
+)
+def test_wrong_label_is_found_and_named(changed, change, series, words):
+    found = found_in(changed(change)).suspects
+    assert len(found) in (1, 2)
+    assert any(words in item.text for item in found), [item.text for item in found]
+    if series is not None:
+        assert set(found[0].series) == series
+    assert all(item.evidence > LEAST_EVIDENCE for item in found)
+
+
+def test_series_without_light_or_saturated_is_not_usable_and_does_not_cast_doubt_on_others(changed):
+    def change(file):
+        file["series"][FLAT_40]["frames"][...] = 0
+        frames = file["series"][f"{FLAT_90}_2"]["frames"]
+        frames[...] = np.minimum(frames[:].astype(np.int64) * 15 // 2, 65535).astype(np.uint16)
+
+    found = found_in(changed(change))
+    assert found.suspects == ()
+    assert found.unusable[FLAT_40] == "every pixel of every frame is 0 DN"
+    assert found.unusable[f"{FLAT_90}_2"].startswith("saturated: ")
+
+
+def test_weak_flat_of_a_short_exposure_is_no_dark(changed):
+    def change(file):
+        node = file["series"][f"{FLAT_40}_2"]
+        dark = file["series"]["dark_25ms"]["frames"][:].mean()
+        weak = dark + (node["frames"][:] - dark) / 100.0
+        node["frames"][...] = np.rint(weak).astype(np.uint16)
+        node.attrs["exposure_ms"] = 0.25
+
+    assert not any("shows no beam" in item.text for item in found_in(changed(change)).suspects)

@@ -58,6 +58,8 @@ TRIALS = (
 )
 _FEWEST_TO_LEARN = 8  # measured images with a foreign object, below which networks of their own are not trained
 _FEWEST_TO_TRY = 5  # objects
+_AT_ONCE = 8  # images through a network
+_NEAR_PX = 3  # a mark this close to an object belongs to it
 _START_AVERAGED = 16  # the common start learns from images of as many frames: noisy ones teach a new network nothing
 
 
@@ -69,7 +71,8 @@ class TaskPlan:
     crop_px (side of the squares round the objects that networks learn from, 0 = whole images); draws (images of each known
     product, each with its own noise; of measured ones: at most as many frames); images (for training and again for trying,
     where products come from a description or from reference images); test_share, validation_share of the measured
-    products, where the file does not say; size (`size_mm` or `contrast`); seed.
+    products, where the file does not say; marked_share (of the images a network learnt from that may show a mark away from
+    objects: sets its threshold); size (`size_mm` or `contrast`); seed.
     """
 
     networks: int = 3
@@ -81,6 +84,7 @@ class TaskPlan:
     images: int = 120
     test_share: float = 0.5
     validation_share: float = 0.1
+    marked_share: float = 0.1
     size: str = "contrast"
     seed: int = 0
 
@@ -96,6 +100,8 @@ class TaskPlan:
         ):
             if getattr(self, name) < least:
                 raise InputError(name, received=getattr(self, name), expected=f"a whole number, {least} or more")
+        if not 0 < self.marked_share < 1:
+            raise InputError("marked_share", received=self.marked_share, expected="a share between 0 and 1")
         if self.size not in SIZES:
             raise InputError("size of the objects", received=self.size, expected="one of " + ", ".join(SIZES))
 
@@ -187,7 +193,11 @@ def run_task(
         name = f"{networks}_on_{images}"
         table = directory / f"hits_{name}.csv"
         tell(f"networks of {networks} on images of {images}")
-        _detect(runs[networks], dataset, table, sizes, device=device)
+        learnt_from = measured.path if networks == "measured" else directory / f"{networks}_train.h5"
+        thresholds = _thresholds(
+            runs[networks], learnt_from, directory / f"thresholds_{networks}.json", plan.marked_share, device=device
+        )
+        _detect(runs[networks], dataset, table, sizes, thresholds, device=device)
         answers[name] = _curve(table, plan.size)
     if same:
         for images in ("after", "measured"):
@@ -734,7 +744,51 @@ def _train_on(
         )
 
 
-def _detect(runs_path: Path, dataset_path: Path, out: Path, contrast: Mapping[str, float], *, device: str) -> None:
+def _thresholds(runs_path: Path, learnt_from: Path, out: Path, share: float, *, device: str) -> dict[int, float]:
+    """Probability above which each network's pixels are marked, by network.
+
+    Networks that learnt little differ in how readily they mark. Each gets the threshold at which `share` of the images that
+    it learnt from show a mark away from objects: something its owner knows, whatever images it is tried on later.
+    """
+    from scipy.ndimage import binary_dilation
+
+    from ..segmentation import build_network, finished_networks, open_runs, predict_probabilities, read_weights
+
+    if out.exists():
+        return {int(number): float(value) for number, value in json.loads(out.read_text(encoding="utf-8")).items()}
+    runs = open_runs(runs_path)
+    found: dict[int, float] = {}
+    with read_dataset(learnt_from) as dataset:
+        numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
+        for network_number in finished_networks(runs):
+            _, weights = read_weights(runs.path / f"network_{network_number:03d}" / "weights.pt")
+            network = build_network(runs.recipe, seed=0, pretrained=False)
+            network.load_state_dict(weights)
+            network = network.to(device)
+            highest = []
+            for first in range(0, len(numbers), _AT_ONCE):
+                part = numbers[first : first + _AT_ONCE]
+                maps = predict_probabilities(network, dataset.images(part), recipe=runs.recipe, device=device)
+                for values, mask in zip(maps, dataset.foreign_object_masks(part), strict=True):
+                    away = (
+                        ~binary_dilation(mask, iterations=_NEAR_PX) if mask.any() else np.ones(mask.shape, dtype=bool)
+                    )
+                    highest.append(float(values[away].max()) if away.any() else 0.0)
+            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 0.9999))
+    with whole_file(out) as temporary:
+        temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
+    return found
+
+
+def _detect(
+    runs_path: Path,
+    dataset_path: Path,
+    out: Path,
+    contrast: Mapping[str, float],
+    thresholds: Mapping[int, float],
+    *,
+    device: str,
+) -> None:
     """Hit table of all networks on the images of split test; images of one scene share its name."""
     from ..segmentation import Detection, detect_with_networks, open_runs, write_detections
 
@@ -742,11 +796,15 @@ def _detect(runs_path: Path, dataset_path: Path, out: Path, contrast: Mapping[st
         return
 
     def rows(dataset: Dataset, numbers: NDArray[np.intp]) -> Iterator[Detection]:
-        for found in detect_with_networks(open_runs(runs_path), dataset, numbers, device=device):
-            scene = scene_of(found.image)
-            value = contrast.get(scene, found.contrast)
-            known = value is not None and math.isfinite(value) and found.recall is not None
-            yield replace(found, image=scene, contrast=value if known else None)
+        runs = open_runs(runs_path)
+        for network, threshold in thresholds.items():
+            for found in detect_with_networks(
+                runs, dataset, numbers, networks=[network], threshold=threshold, device=device
+            ):
+                scene = scene_of(found.image)
+                value = contrast.get(scene, found.contrast)
+                known = value is not None and math.isfinite(value) and found.recall is not None
+                yield replace(found, image=scene, contrast=value if known else None)
 
     with read_dataset(dataset_path) as dataset:
         write_detections(out, rows(dataset, dataset.indices(split="test")))

@@ -131,7 +131,7 @@ def stand_in(monkeypatch):
         trained.append(list(arms))
         return {arm: directory / f"networks_{arm}" for arm in arms}
 
-    def detect(runs, dataset_path, out, contrast, *, device):
+    def detect(runs, dataset_path, out, contrast, thresholds, *, device):
         arm = runs.name.removeprefix("networks_")
         rng = np.random.default_rng(7)
         with read_dataset(dataset_path) as dataset, open(out, "w", newline="", encoding="utf-8") as stream:
@@ -152,6 +152,7 @@ def stand_in(monkeypatch):
 
     monkeypatch.setattr(task_module, "_train", train)
     monkeypatch.setattr(task_module, "_detect", detect)
+    monkeypatch.setattr(task_module, "_thresholds", lambda *words, **options: {0: 0.5, 1: 0.5})
     monkeypatch.setattr(task_module, "_FEWEST_TO_LEARN", 3)
     return limits, trained
 
@@ -199,7 +200,7 @@ def test_an_effect_that_changes_no_image_leaves_a90_as_it_was_and_says_so(line, 
 
 
 def test_sizes_that_all_are_detected_at_give_null_with_a_warning(line, twin, tmp_path, stand_in, monkeypatch):
-    def always(runs, dataset_path, out, contrast, *, device):
+    def always(runs, dataset_path, out, contrast, thresholds, *, device):
         with read_dataset(dataset_path) as dataset, open(out, "w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             writer.writerow(["size_mm", "hit", "network", "image"])
@@ -269,7 +270,7 @@ def test_a_dataset_needs_something_to_generate_from(line, twin, tmp_path, stand_
     assert found["curves"]["before_on_before"]["objects"] >= 1
 
 
-def _by_row(runs, dataset_path, out, contrast, *, device):
+def _by_row(runs, dataset_path, out, contrast, thresholds, *, device):
     with read_dataset(dataset_path) as dataset, open(out, "w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(["size_mm", "hit", "network", "image"])

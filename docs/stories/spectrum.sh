@@ -6,8 +6,7 @@ raytwin diagnose session.h5 -o first
 # what the answer asks for, on another day: flats at two voltages behind a known filter, two materials of known thickness
 raytwin lab -o more.h5 --protocol full --session 1 --only wedge --only filtered_flats \
   --effect filtration_error=0.1@always --seed 33
-raytwin diagnose session.h5 -o second --also more.h5
-# what it means for detection: products of a third day
-raytwin lab -o products.h5 --protocol products --session 2 --products 72 --frames 20 --bones-mm 1,1.5,2,2.5,3,4 \
+# products of a third day, for what it means for detection
+raytwin lab -o products.h5 --protocol products --session 2 --products 96 --frames 20 --bones-mm 1,1.5,2,2.5,3,4 \
   --effect filtration_error=0.1@always --seed 33
-raytwin diagnose session.h5 -o with_pod --also more.h5 --task products.h5
+raytwin diagnose session.h5 -o second --also more.h5 --task products.h5

@@ -154,6 +154,7 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(task_module, "_detect", detect)
     monkeypatch.setattr(task_module, "_thresholds", lambda *words, **options: {0: 0.5, 1: 0.5})
     monkeypatch.setattr(task_module, "_FEWEST_TO_LEARN", 3)
+    monkeypatch.setattr(task_module, "_START_AVERAGED", 1)
     return limits, trained
 
 

@@ -71,17 +71,19 @@ def prepare_session(
         )
     acquisition = replace(acquisition, series=kept)
     elsewhere = twin is not None
+    suspects = found.suspects
     if twin is None:
         tell("calibration")
         try:
             twin = calibrated_twin(acquisition, rng=rng, progress=progress)
         except (InputError, FitError) as error:
-            raise _not_calibrated(acquisition, found.suspects, error) from error
+            raise _not_calibrated(acquisition, suspects, error) from error
+        suspects = suspects or _without_spectrum(acquisition, twin)
     return PreparedSession(
         acquisition=acquisition,
         twin=twin,
         calibrated_elsewhere=elsewhere,
-        suspects=found.suspects,
+        suspects=suspects,
         left_out=tuple(left_out),
     )
 
@@ -93,6 +95,26 @@ def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> 
         received="; ".join(item.text for item in suspects),
         expected="labels that the frames agree with",
         remedy="correct the labels of these series, or leave them out",
+    )
+
+
+def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Suspect, ...]:
+    """Flats that state kV and tube load, and yet fit no spectrum."""
+    names = calibrating_names(acquisition.series)
+    stated = [
+        item.name
+        for item in acquisition.of_kind("flat")
+        if item.name in names and item.setting is not None and item.setting.tube_load_mAs is not None
+    ]
+    if twin.spectral is not None or not stated:
+        return ()
+    reason = next((line for line in twin.warnings if line.startswith("no spectral part")), "no spectral part")
+    return (
+        Suspect(
+            series=tuple(stated),
+            text=f"levels and noise of the flats fit no tube and scintillator at the kV, filters and load they state ({reason})",
+            evidence=0.0,
+        ),
     )
 
 

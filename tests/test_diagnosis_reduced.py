@@ -1,0 +1,217 @@
+"""Poor sessions: an answer about what they allow, or one line that says what is missing; never a name they cannot carry."""
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition
+from raytwin.cli import main
+from raytwin.diagnosis.session import measured_levels, read_session
+from raytwin.generator.effects import EFFECTS
+from raytwin.generator.twin_io import read_twin
+
+FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory):
+    """A folder with a session without effects and the twin calibrated from it."""
+    folder = tmp_path_factory.mktemp("reduced")
+    words = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "10", "--products", "1"]
+    assert main(["lab", "-o", str(folder / "session.h5"), *words]) == 0
+    assert main(["calibrate", str(folder / "session.h5"), "-o", str(folder / "twin.h5")]) == 0
+    return folder
+
+
+@pytest.fixture
+def diagnosed(line, tmp_path, capsys):
+    """Run `raytwin diagnose` on a changed copy: (exit code, answer or None, lines on standard error)."""
+
+    def run(change, *words):
+        path = tmp_path / "changed.h5"
+        shutil.copy(line / "session.h5", path)
+        with h5py.File(path, "r+") as file:
+            change(file)
+        capsys.readouterr()
+        code = main(["diagnose", str(path), "-o", str(tmp_path / "answer"), "--json", *words])
+        printed = capsys.readouterr()
+        return code, json.loads(printed.out) if code == 0 else None, printed.err.strip().splitlines()
+
+    return run
+
+
+def only(*kinds):
+    def change(file):
+        for name in list(file["series"]):
+            if file["series"][name].attrs["kind"] not in kinds:
+                del file["series"][name]
+
+    return change
+
+
+def without(*attributes):
+    def change(file):
+        for node in file["series"].values():
+            for name in attributes:
+                node.attrs.pop(name, None)
+
+    return change
+
+
+def single_frames(file):
+    for node in file["series"].values():
+        for name in ("frames", "time_s"):
+            values = node[name][:1]
+            del node[name]
+            node[name] = values
+
+
+def averages(file):
+    for node in file["series"].values():
+        frames = node["frames"][:].astype(np.float32).mean(axis=0, keepdims=True)
+        count = len(node["frames"])
+        for name in ("frames", "time_s"):
+            del node[name]
+        node["frames"] = frames
+        node.attrs["averaged"] = count
+
+
+def untested(answer):
+    return {item["effect"] for item in answer["not_tested"]}
+
+
+@pytest.mark.parametrize(
+    ("change", "mention"),
+    [
+        (only("flat"), "flats without a dark series"),
+        (only("dark"), "no flat series that may calibrate"),
+        (single_frames, "a single frame has no noise"),
+    ],
+)
+def test_session_that_cannot_calibrate_says_what_is_missing_and_what_a_twin_would_allow(diagnosed, change, mention):
+    code, _, lines = diagnosed(change)
+    assert code == 2
+    assert len(lines) == 1
+    assert mention in lines[0]
+    assert "--twin" in lines[0]
+
+
+def test_darks_alone_test_only_what_darks_can_show(diagnosed, line):
+    code, answer, _ = diagnosed(only("dark"), "--twin", str(line / "twin.h5"))
+    assert code == 0
+    assert answer["verdict"] == "no_gap"
+    assert {"object_scatter", "kv_error", "focal_spot", "nonlinearity"} <= untested(answer)
+    assert not {"row_noise", "dark_drift", "quantisation"} & untested(answer)
+    assert all(cause["probability"] < 0.5 for cause in answer["causes"])
+
+
+def test_single_frames_with_a_twin_cannot_show_noise_from_frame_to_frame(diagnosed, line):
+    code, answer, _ = diagnosed(single_frames, "--twin", str(line / "twin.h5"))
+    assert code == 0
+    assert answer["verdict"] != "explained"
+    assert {"row_noise", "output_drift"} <= untested(answer)
+
+
+def test_averaged_frames_of_darks_are_as_quiet_as_their_number_says(line, tmp_path):
+    path = tmp_path / "averaged.h5"
+    shutil.copy(line / "session.h5", path)
+    with h5py.File(path, "r+") as file:
+        averages(file)
+    with open_acquisition(path) as acquisition:
+        session = read_session(acquisition)
+    assert {item.request.exposures_per_frame for item in session if item.series.kind == "flat"} == {10}
+    assert all(item.request.exposures_per_frame == item.series.averaged for item in session)
+
+
+def test_session_without_kV_is_judged_by_levels_and_noise_alone(diagnosed):
+    code, answer, _ = diagnosed(without("kV"))
+    assert code == 0
+    assert answer["verdict"] == "no_gap"
+    assert {"kv_error", "filtration_error", "composition_error", "focal_spot"} <= untested(answer)
+    assert not {"excess_noise", "nonlinearity", "row_noise", "output_drift"} & untested(answer)
+    assert any("product1" in line for line in answer["warnings"])
+
+
+def test_level_without_tube_load_goes_as_the_exposure_of_the_flats_that_calibrate(line, tmp_path):
+    path = tmp_path / "unloaded.h5"
+    shutil.copy(line / "session.h5", path)
+    with h5py.File(path, "r+") as file:
+        without("power_W")(file)
+    with open_acquisition(path) as acquisition:
+        levels = measured_levels(acquisition.series)
+    for kV in (40, 90):
+        short, long = levels[f"flat_{kV}kV_25ms_Cu0.05"], levels[f"flat_{kV}kV_100ms_Cu0.05"]
+        assert long / short == pytest.approx(4.0, rel=1e-12)
+        assert levels[f"product1_{kV}kV_25ms"] == pytest.approx(short, rel=1e-12)
+    with h5py.File(path, "r") as file:
+        raw = file["series"][FLAT_40]["frames"][:].mean() - file["series"]["dark_25ms"]["frames"][:].mean()
+    # the longer exposures weigh more, and the line is straight within a few tenths of a percent
+    assert levels[FLAT_40] == pytest.approx(raw, rel=5e-3)
+
+
+def test_levels_that_no_single_tube_load_explains_are_each_their_own(line, tmp_path):
+    path = tmp_path / "several_loads.h5"
+    shutil.copy(line / "session.h5", path)
+    with h5py.File(path, "r+") as file:
+        without("power_W")(file)
+        node = file["series"]["flat_40kV_100ms_Cu0.05"]
+        node["frames"][...] = node["frames"][:] // 2
+    with open_acquisition(path) as acquisition:
+        levels = measured_levels(acquisition.series)
+    assert levels["flat_40kV_100ms_Cu0.05"] / levels[FLAT_40] < 2.5
+    assert "product1_40kV_25ms" not in levels
+
+
+def test_series_without_light_is_left_out_and_the_rest_is_judged(diagnosed):
+    def change(file):
+        file["series"][f"{FLAT_40}_2"]["frames"][...] = 0
+
+    code, answer, lines = diagnosed(change)
+    assert code == 0
+    assert answer["verdict"] == "no_gap"
+    assert answer["warnings"] == [f"{FLAT_40}_2: every pixel of every frame is 0 DN"]
+    assert lines == [f"not used: {FLAT_40}_2: every pixel of every frame is 0 DN"]
+
+
+def test_lines_are_not_pictures(diagnosed):
+    def change(file):
+        for node in file["series"].values():
+            frames = node["frames"][:, :4]
+            del node["frames"]
+            node["frames"] = frames
+        del file["scenes"]
+
+    code, _, lines = diagnosed(change)
+    assert code == 2
+    assert len(lines) == 1
+    assert "frames of 4 x 48; expected at least 16 rows and columns" in lines[0]
+
+
+def test_wrong_label_is_said_first_and_no_effect_is_named(diagnosed, tmp_path):
+    def change(file):
+        one, other = (file["series"][name].attrs for name in (FLAT_40, FLAT_90))
+        one["kV"], other["kV"] = 90.0, 40.0
+
+    code, answer, lines = diagnosed(change)
+    assert code == 0
+    assert answer["verdict"] == "unknown_effect"
+    assert answer["causes"] == []
+    assert answer["probability_unknown"] == 1.0
+    assert sum(item["probability"] for item in answer["hypotheses"]) == pytest.approx(1.0)
+    assert set(answer["mislabelled"][0]["series"]) == {FLAT_40, FLAT_90}
+    assert "tube voltage were exchanged" in answer["warnings"][0]
+    assert lines[0].startswith("label in doubt: ")
+    page = (tmp_path / "answer" / "report.html").read_text(encoding="utf-8")
+    assert "Labels look wrong" in page
+    assert "tube voltage were exchanged" in page
+    assert read_twin(tmp_path / "answer" / "twin.h5").effects == ()
+
+
+def test_what_a_session_cannot_show_is_listed_with_reasons(diagnosed):
+    code, answer, _ = diagnosed(only("dark", "flat"))
+    assert code == 0
+    assert set(EFFECTS) >= untested(answer) >= {"object_scatter", "motion_blur", "misregistration"}
+    assert all(item["reason"] for item in answer["not_tested"])

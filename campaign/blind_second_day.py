@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import Problem, build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
-from ..diagnosis.diagnose import folds_of
+from ..diagnosis.diagnose import folds_of, left_over
+from ..diagnosis.inference import Curve
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 
@@ -46,15 +47,12 @@ def second_day_shrinkage(
         variants=[*catalogue_variants(without=without), *own],
         calibrated_elsewhere=True,
     )
-    response = np.zeros(len(problem.residual))
-    for curve in problem.curves:
-        if curve.variant == _NAME:
-            response += curve.response(float(curve.strengths[0]))
-    return shrinkage(problem, response)
+    own_curves = [(curve, float(curve.strengths[0])) for curve in problem.curves if curve.variant == _NAME]
+    return shrinkage(problem, own_curves)
 
 
-def shrinkage(problem: Problem, response: NDArray[np.float64]) -> dict[str, float] | None:
-    """Share of the gap above noise that a response (probe,) takes away, with its 95 % interval over series.
+def shrinkage(problem: Problem, effects: Sequence[tuple[Curve, float]]) -> dict[str, float] | None:
+    """Share of the gap above noise that effects at given strengths take away, with its 95 % interval over series.
 
     None where the gap is no more than three standard errors above noise.
     """
@@ -63,8 +61,8 @@ def shrinkage(problem: Problem, response: NDArray[np.float64]) -> dict[str, floa
     for fold in (0, 1):
         fit = folds != fold
         if fit.any() and not fit.all():
-            for row, residual in enumerate((problem.residual, problem.residual - response)):
-                squares[row, ~fit] = _left_over(problem, residual, fit) ** 2
+            for row, added in enumerate(((), effects)):
+                squares[row, ~fit] = left_over(problem, fit, added) ** 2
     known = np.isfinite(squares[0])
     if not known.any():
         return None
@@ -103,11 +101,3 @@ def _variant(item: AppliedEffect) -> Variant:
         strengths=(size,),
         options=dict(item.options),
     )
-
-
-def _left_over(problem: Problem, residual: NDArray[np.float64], fit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction."""
-    own, held = problem.factors[fit], problem.factors[~fit]
-    inverse = np.linalg.inv(np.eye(own.shape[1]) + own.T @ own)
-    left = residual[~fit] - held @ (inverse @ (own.T @ residual[fit]))
-    return np.asarray(left / np.sqrt(1.0 + np.einsum("pi,ij,pj->p", held, inverse, held, optimize=True)))

@@ -37,7 +37,7 @@ from .probes import (
     smooth_templates,
     transmission_templates,
 )
-from .registration import Placement, gradient, register, render_variance
+from .registration import LARGEST_PX, Placement, gradient, register, render_variance
 from .session import SessionSeries, read_session
 from .summaries import BLOCK_PX, LAGS, SeriesSummary, summarise_series
 
@@ -422,6 +422,9 @@ def build_problem(
             placement = replace(
                 rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
             )
+        if math.hypot(placement.row_px, placement.column_px) > LARGEST_PX:
+            skipped.append(f"{members[0].series.scene}: lies nowhere near its thickness maps")
+            continue
         first_of_place.add(members[0].name)
         for item in members:
             placements[item.name] = placement
@@ -1127,9 +1130,7 @@ def _local_nuisances(
     result[f"level of {series.name}"] = of_map(scales.LEVEL_OF_SERIES_SD * signal)
     result[f"tilt x of {series.name}"] = of_map(scales.TILT_SD * x * signal)
     result[f"tilt y of {series.name}"] = of_map(scales.TILT_SD * y * signal)
-    result[f"gain of {beam}"] = of_scalars(
-        lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
-    )
+    result[f"gain of {beam}"] = of_scalars(lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0)
 
     def texture(lag: tuple[int, int]) -> NDArray[np.float64]:
         ending = f"({lag[0]},{lag[1]})"

@@ -435,19 +435,30 @@ def folds_of(problem: Problem) -> NDArray[np.intp]:
     return np.array(folds, dtype=np.intp)
 
 
-def _predictive(
-    problem: Problem, fit: NDArray[np.bool_], response: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Held-out residuals (probe,) and their standard deviations, nuisances fitted on `fit` only."""
-    residual = problem.residual if response is None else problem.residual - response
-    inner = Nuisances(problem.factors[fit])
-    fitted = inner.fitted(residual[fit])
-    held = ~fit
-    from scipy.linalg import solve_triangular
+def left_over(
+    problem: Problem, fit: NDArray[np.bool_], added: Sequence[tuple[Curve, float]] = ()
+) -> NDArray[np.float64]:
+    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction.
 
-    left = residual[held] - problem.factors[held] @ fitted
-    half = solve_triangular(inner._cholesky, problem.factors[held].T, lower=True)
-    return left, np.sqrt(1.0 + np.sum(half**2, axis=0))
+    added: effects and their strengths that are taken off; what they do by chance is fitted beside the nuisances and counts as
+    noise.
+    """
+    from scipy.linalg import cho_solve, solve_triangular
+
+    residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
+    for curve, strength in added:
+        residual = residual - curve.response(strength)
+        if curve.spread is not None:
+            factors = np.concatenate([factors, strength * curve.spread], axis=1)
+        if curve.jitter is not None:
+            own = own + strength**2 * curve.jitter
+    root = np.sqrt(own)
+    residual, factors = residual / root, factors / root[:, None]
+    inner = factors[fit]
+    lower = np.linalg.cholesky(np.eye(inner.shape[1]) + inner.T @ inner)
+    left = residual[~fit] - factors[~fit] @ cho_solve((lower, True), inner.T @ residual[fit])
+    half = solve_triangular(lower, factors[~fit].T, lower=True)
+    return np.asarray(left / np.sqrt(1.0 + np.sum(half**2, axis=0)))
 
 
 def _held_out(
@@ -465,14 +476,14 @@ def _held_out(
         held = ~fit
         if not fit.any() or not held.any():
             continue
-        before[held], sds[held] = _predictive(problem, fit, None)
         inner = Nuisances(problem.factors[fit])
+        before[held] = left_over(problem, fit)
+        sds[held] = inner.predicted_sd(problem.factors[held])
         strengths = _strengths_on(problem, leading, effects, fit, inner)
-        responses = {effect: leading.variants[effect].response(strengths[effect]) for effect in effects}
-        whole = sum(responses.values(), np.zeros(size))
-        after[held] = _predictive(problem, fit, whole)[0] if effects else before[held]
-        for effect in effects:
-            alone[effect][held] = _predictive(problem, fit, responses[effect])[0]
+        added = [(leading.variants[effect], strengths[effect]) for effect in effects]
+        after[held] = left_over(problem, fit, added) if effects else before[held]
+        for one, effect in zip(added, effects, strict=True):
+            alone[effect][held] = left_over(problem, fit, [one])
     known = np.isfinite(before)
     before, after, sd, series = before[known], after[known], sds[known], problem.series_of[known]
     axes = np.array([name.axis for name in problem.names])[known]
@@ -480,11 +491,11 @@ def _held_out(
         return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
 
     def rms(values: NDArray[np.float64], chosen: NDArray[np.bool_] | None = None) -> float:
-        use = values / sd if chosen is None else (values / sd)[chosen]
+        use = values if chosen is None else values[chosen]
         return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
 
     # what a repeat of the same measurement would show: counting noise without all that the twin's nuisances allow
-    noise = problem.noise[known]
+    noise = problem.noise[known] / sd
     floor = rms(noise)
     rows = []
     for axis in dict.fromkeys(axes):
@@ -499,7 +510,7 @@ def _held_out(
         draws = []
         numbers = np.unique(series)
         members = [np.nonzero(series == number)[0] for number in numbers]
-        b2, v2 = (before / sd) ** 2, (values / sd) ** 2
+        b2, v2 = before**2, values**2
         sums = np.array([[b2[m].sum(), v2[m].sum(), len(m)] for m in members])
         for _ in range(300):
             total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)

@@ -161,6 +161,13 @@ class Nuisances:
 
         return np.asarray(cho_solve((self._cholesky, True), self.factors.T @ vector))
 
+    def predicted_sd(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviations (probe,) of other probes with these factors, once the nuisances are fitted on the own ones."""
+        from scipy.linalg import solve_triangular
+
+        half = solve_triangular(self._cholesky, factors.T, lower=True)
+        return np.asarray(np.sqrt(1.0 + np.sum(half**2, axis=0)))
+
     def widened(self, extra: NDArray[np.float64]) -> "Nuisances":
         """With more factors (probe, extra); what is known of the old ones is used again."""
         from scipy.linalg import solve_triangular

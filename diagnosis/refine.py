@@ -149,7 +149,8 @@ def _newton(
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
     by _LAW_ERROR, each parameter within about its range.
     """
-    strength = here.best
+    # a share of photons beyond what is plausible asks for another shape, not for more photons
+    strength = min(max(here.best, variant.low), variant.high)
     at = np.asarray(here.curve.response(strength))
     rows, kept = [at], []
     for item in inner:
@@ -163,7 +164,7 @@ def _newton(
     left, slopes, wide = widened_for(residual - at, np.stack(rows), here.curve, strength, nuisances, groups, _LAW_ERROR)
     normal = wide.inner(slopes, slopes)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
-    normal[0, 0] += 1e-9
+    normal[0, 0] += 1e-9 if strength == here.best else 1e12
     solved = np.linalg.solve(normal, wide.inner(slopes, left[None, :])[:, 0])
     return {item.name: 0.0 for item in inner} | {
         name: float(np.clip(solved[1 + number], -_FARTHEST, _FARTHEST)) for number, name in enumerate(kept)

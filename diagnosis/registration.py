@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
 _CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
-_LARGEST_PX = 6.0
+LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
+_STRAY_PX = 2.0  # radius over which light that strays is taken as even
 _WEAK = 0.05
 _FAR_SHARES = ((9, 0.01), (25, 0.003))  # (pixels, share)
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
@@ -83,7 +84,7 @@ def register(
     *,
     prior_px: float = 1.0,
 ) -> Placement:
-    """Placement of a scene from the pictures of all its series: Gauss-Newton, the level left free.
+    """Placement of a scene from the pictures of all its series: Gauss-Newton, level and smooth light left free.
 
     Args:
         measured, expected: signals (row, column), DN, of each series.
@@ -110,7 +111,7 @@ def register(
             weight = (inner / (noise + doubt))[inner] * share
             design = np.stack([dy[inner], dx[inner]])
             level = np.asarray(model, dtype=np.float64)[inner]
-            residual = (moved - model)[inner]
+            residual = (moved - model - _stray(moved - model, inner / (noise + 100.0 * doubt)))[inner]
             level_weight = float((level * weight) @ level) + 1e-30
             cross = (design * weight) @ level
             normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
@@ -122,8 +123,16 @@ def register(
         covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
         # where the measured picture still lies further on than the model, the residual falls along the model's slope
         step = -((vectors * inverse) @ vectors.T) @ right
-        current = np.clip(current + np.clip(step, -1.0, 1.0), -_LARGEST_PX, _LARGEST_PX)
+        current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
     return _placement(current, covariance)
+
+
+def _stray(residual: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smooth part of a residual, as pixels away from edges show it."""
+    from scipy.ndimage import gaussian_filter
+
+    total = gaussian_filter(weight, _STRAY_PX, mode="constant")
+    return np.asarray(gaussian_filter(weight * residual, _STRAY_PX, mode="constant") / np.maximum(total, 1e-30))
 
 
 def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:

@@ -1,6 +1,7 @@
 """Scores of a blind check against closed forms and independent software."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -537,23 +538,46 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
     )
 
 
+def an_effect(response):
+    """The effect whose response at strength 1 this is."""
+    curve = Curve(
+        effect="heel",
+        variant="",
+        parameters={},
+        low=0.1,
+        high=1.0,
+        strengths=np.array([1.0]),
+        responses=response[None, :],
+    )
+    return [(curve, 1.0)]
+
+
 def test_the_whole_response_added_takes_the_whole_gap_away():
     rng = np.random.default_rng(21)
     problem = second_day_problem(rng)
     response = 3.0 * rng.standard_normal(len(problem.residual))
     problem.residual = problem.residual + response
-    found = shrinkage(problem, response)
+    found = shrinkage(problem, an_effect(response))
     assert found["value"] == pytest.approx(1.0, abs=0.03)
     assert found["low"] <= 1.0 <= found["high"] + 0.03
     # half the response leaves rms sqrt(1 + 1.5^2) of sqrt(1 + 3^2)
-    half = shrinkage(problem, 0.5 * response)
+    half = shrinkage(problem, an_effect(0.5 * response))
     before, after = math.sqrt(10.0), math.sqrt(1 + 1.5**2)
     assert half["value"] == pytest.approx((before - after) / (before - 1.0), abs=0.04)
+
+
+def test_a_gap_that_is_chance_is_gone_once_the_chance_is_in_the_model():
+    rng = np.random.default_rng(23)
+    problem = second_day_problem(rng)
+    problem.residual = problem.residual + 2.0 * rng.standard_normal(len(problem.residual))
+    ((curve, strength),) = an_effect(np.zeros(len(problem.residual)))
+    found = shrinkage(problem, [(replace(curve, jitter=np.full(len(problem.residual), 4.0)), strength)])
+    assert found["value"] == pytest.approx(1.0, abs=0.04)
 
 
 def test_what_nuisances_take_up_is_no_gap_and_noise_has_no_shrinkage():
     rng = np.random.default_rng(22)
     problem = second_day_problem(rng)
-    assert shrinkage(problem, 0.1 * rng.standard_normal(len(problem.residual))) is None
+    assert shrinkage(problem, an_effect(0.1 * rng.standard_normal(len(problem.residual)))) is None
     problem.residual = problem.residual + problem.factors @ np.array([1.0, -1.5, 0.7])
-    assert shrinkage(problem, np.zeros(len(problem.residual))) is None
+    assert shrinkage(problem, an_effect(np.zeros(len(problem.residual)))) is None

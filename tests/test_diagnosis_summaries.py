@@ -141,6 +141,15 @@ def test_along_a_single_edge_nothing_is_claimed():
     assert found.row_px == pytest.approx(0.0, abs=0.05)
 
 
+def test_light_that_strays_over_the_picture_does_not_move_it():
+    model = scene(0.0, 0.0)
+    y, x = np.mgrid[:96, :96] / 48.0 - 1.0
+    fog = 4e3 * np.exp(-2.0 * (x - 0.3) ** 2 - 1.5 * y**2)
+    found = register([scene(0.3, -0.2) + fog], [model], [np.full(model.shape, 100.0)], np.ones(model.shape, bool))
+    assert found.row_px == pytest.approx(0.3, abs=0.2)
+    assert found.column_px == pytest.approx(-0.2, abs=0.2)
+
+
 def test_resampling_by_nothing_changes_nothing():
     image = np.random.default_rng(8).standard_normal((20, 30))
     still = Placement(row_px=0.0, column_px=0.0, row_sd_px=0.1, column_sd_px=0.1)

@@ -194,8 +194,8 @@ OBJECT_SCATTER = Effect(
             unit="",
             low=-1.5,
             high=1.5,
-            default=-0.3,
-            source="photons followed one by one behind water at 40 and 90 kV: -0.2 at 350 mm, -0.5 at 100 mm of air",
+            default=-0.1,
+            source="photons followed one by one behind water, 40 and 90 kV: 0 with 350 mm of air, -0.2 with 100 mm",
             log=False,
         ),
         Parameter(

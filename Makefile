@@ -49,7 +49,7 @@ blind-check: $(READY)
 
 # the worked stories of docs/stories, ten minutes each; what they write stands in build/stories
 stories: $(READY)
-	for story in scatter drift_and_lag spectrum; do \
+	for story in scatter drift_and_lag spectrum tie; do \
 	mkdir -p build/stories/$$story && \
 	(cd build/stories/$$story && PATH=$(CURDIR)/$(BIN):$$PATH sh $(CURDIR)/docs/stories/$$story.sh) || exit 1; done
 

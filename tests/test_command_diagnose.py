@@ -64,6 +64,8 @@ def test_an_effect_left_out_is_not_named(sessions, capsys):
     ("words", "mention"),
     [
         (["--without", "warp_drive"], "--without"),
+        (["--without", "glare"], "did you mean veiling_glare"),
+        (["--seed", "-1"], "--seed: got -1"),
         (["--twin", "missing.h5"], "missing.h5"),
     ],
 )
@@ -75,3 +77,27 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(sessions, capsys, words
     assert len(lines) == 1
     assert mention in lines[0]
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("name", ["a_file", "a_file/below"])
+def test_folder_that_cannot_be_written_is_said_before_the_work_begins(sessions, tmp_path, capsys, name):
+    (tmp_path / "a_file").write_text("taken", encoding="utf-8")
+    capsys.readouterr()
+    assert main(["diagnose", str(sessions / "null.h5"), "-o", str(tmp_path / name)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert "expected a folder that can be written" in lines[0]
+    assert (tmp_path / "a_file").read_text(encoding="utf-8") == "taken"
+
+
+@pytest.mark.parametrize("content", [b"", b"no HDF5 at all", None])
+def test_file_that_is_no_acquisition_is_one_line_and_leaves_no_folder(sessions, tmp_path, capsys, content):
+    path = tmp_path / "session.h5"
+    # None: a copy that was cut off
+    path.write_bytes((sessions / "null.h5").read_bytes()[:100_000] if content is None else content)
+    capsys.readouterr()
+    assert main(["diagnose", str(path), "-o", str(tmp_path / "new" / "answer")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert "expected an acquisition file" in lines[0]
+    assert not (tmp_path / "new").exists()

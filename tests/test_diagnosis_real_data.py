@@ -17,9 +17,15 @@ NEEDS_A_SPECTRUM = {"kv_error", "filtration_error", "heel", "composition_error",
 pytestmark = pytest.mark.realdata
 
 
-def diagnosed(source, layout, folder, capsys):
+def diagnosed(source, layout, folder, capsys, *, side_px=None):
     session = folder / "session.h5"
     assert main(["import", layout, str(source), "-o", str(session)]) == 0
+    if side_px is not None:
+        with h5py.File(session, "r+") as file:
+            for node in file["series"].values():
+                frames = node["frames"][:, :side_px, :side_px]
+                del node["frames"]
+                node["frames"] = frames
     capsys.readouterr()
     assert main(["diagnose", str(session), "-o", str(folder / "answer"), "--json"]) == 0
     return session, json.loads(capsys.readouterr().out)
@@ -52,7 +58,8 @@ def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be
 
 @pytest.mark.skipif(not CCD.is_dir(), reason="the EMVA 1288 camera set is not here (shared/realdata/emva_ccd)")
 def test_ccd_camera_shows_lines_and_a_lamp_that_flickers(tmp_path, capsys):
-    session, answer = diagnosed(CCD, "emva1288", tmp_path, capsys)
+    # a corner of the sensor says the same in a twentieth of the time
+    session, answer = diagnosed(CCD, "emva1288", tmp_path, capsys, side_px=128)
     dark, flat = "dark_027_5.16ms", "flat_013_5.16ms"
     with h5py.File(session) as file:
         frames = np.diff(file["series"][dark]["frames"][:].astype(np.float64), axis=0)

@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 
 LEAST_EVIDENCE = 10.0
 _FRAMES = 8  # read of each series
+_FRAMES_OF_NOISE = 5  # that an object's series needs to say something of noise
 _PIXELS = 96  # a side that are looked at
 _CONSTANT_SD, _OWN_BEAM_SD = 10.0, 3.0  # of the common level; of a beam of unknown kV or load
 _LEVEL_SDS = {"voltage": 0.2, "voltage since": 0.2, "beam since": 0.05, "filters": 0.15, "series": 0.04}
@@ -50,6 +51,8 @@ _INHERENT_MM_AL = 1.0  # where nothing is declared
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
 _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
+_RELEASED = 0.08  # of the exposures before, which an image lag may leave in a dark
+_RELEASED_LATER, _REMEMBERED = 0.02, 3  # the same in the last frames of a lit series; from so many exposures before
 _SHADOW_IN_FLAT = 0.35  # spread of the logarithm of a flat against other flats
 _DEEPEST = 4.0  # -log T beyond which nothing is compared
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
@@ -104,7 +107,10 @@ class _Label:
 
 @dataclass(slots=True, kw_only=True)
 class _Reading:
-    """A series as it is: mean frame (row, column) of the pixels looked at, its noise, what they amount to."""
+    """A series as it is: mean frame (row, column) of the pixels looked at, its noise, what they amount to.
+
+    released: share of its level that an image lag may have brought from the exposures before.
+    """
 
     series: Series
     label: _Label
@@ -115,6 +121,7 @@ class _Reading:
     gain_DN: float = math.nan
     gain_sd: float = math.inf
     picture: FloatArray | None = None
+    released: float = 0.0
 
     @property
     def name(self) -> str:
@@ -149,7 +156,9 @@ def check_plausibility(
     for item in acquisition.series:
         if "log" in item.corrected:
             continue
-        frames = np.asarray(item.read_frames(0, _FRAMES)[:, ::stride, ::stride], dtype=np.float64)
+        # the last ones: the first may hold what the exposure before has left
+        first = max(0, item.n_frames - _FRAMES)
+        frames = np.asarray(item.read_frames(first, item.n_frames)[:, ::stride, ::stride], dtype=np.float64)
         found = _read(item, frames, acquisition, item.name not in calibrating)
         full = 0.0 if item.kind in ("dark", "afterglow") else _share_at_the_top(frames)
         if float(np.ptp(frames)) == 0.0:
@@ -185,6 +194,9 @@ def check_plausibility(
 
     read_DN2 = min((_mean(item.variance_DN2, good) for item in darks if item.variance_DN2 is not None), default=0.0)
     judged = [item for item in lit if _measure(item, dark_of(item.series), read_DN2, good)]
+    for item in judged:
+        before = [one.level_DN for one in judged if one.series.index < item.series.index][-_REMEMBERED:]
+        item.released = _RELEASED_LATER * max(before, default=0.0) / max(item.level_DN, 1e-9)
     dim, judged = _without_beam(judged)
     suspects += dim
     relative = _relative_gain([item for item in judged if item.series.kind == "flat"], good)
@@ -226,7 +238,11 @@ def _read(item: Series, frames: FloatArray, acquisition: AcquisitionFile, since:
         steps = np.diff(frames, axis=0)
         # what the output does from frame to frame is the same for all pixels, in proportion to their signal: small beside noise
         steps = steps - np.median(steps, axis=(1, 2), keepdims=True)
-        variance = np.asarray(np.mean(steps**2, axis=0) / 2.0 * item.averaged, dtype=np.float64)
+        scale = 2.0
+        if len(steps) > 3:
+            # a ghost of the exposure before that fades is no noise: it bends little, and less and less
+            steps, scale = np.diff(steps, axis=0)[len(steps) // 2 :], 6.0
+        variance = np.asarray(np.mean(steps**2, axis=0) / scale * item.averaged, dtype=np.float64)
     load = None
     if item.power_W is not None:
         load = ("power_W", item.power_W)
@@ -275,7 +291,9 @@ def _lit_darks(darks: Sequence[_Reading], lit: Sequence[_Reading], good: NDArray
     for item, level in zip(darks, levels, strict=True):
         rest = [one for one, other in zip(levels, darks, strict=True) if other is not item]
         excess = level - float(np.median(rest))
-        if excess > _DARK_EXCESS * max(weakest - lowest, 0.0) and excess > 200.0:
+        before = [float(np.median(one.mean_DN[good])) for one in lit if one.series.index < item.series.index]
+        released = _RELEASED * max((one - lowest for one in before[-3:]), default=0.0)
+        if excess > max(_DARK_EXCESS * (weakest - lowest), released, 200.0):
             found.append(
                 Suspect(
                     series=(item.name,),
@@ -293,12 +311,14 @@ def _measure(item: _Reading, dark: FloatArray | None, read_DN2: float, good: NDA
     signal = item.mean_DN - dark
     item.picture = signal
     item.level_DN = float(np.median(signal[good]))
-    if item.variance_DN2 is not None:
+    # two or three frames behind an object may differ by the ghost of the exposure before
+    if item.variance_DN2 is not None and (item.series.kind == "flat" or item.series.n_frames >= _FRAMES_OF_NOISE):
         mean = float(np.mean(signal[good]))
         quantum = _mean(item.variance_DN2, good) - read_DN2
         if mean > 0 and quantum > 0:
             item.gain_DN = quantum / mean
             pairs = min(item.series.n_frames, _FRAMES) - 1
+            pairs = pairs if pairs < 4 else pairs // 2
             item.gain_sd = math.sqrt(4.0 / (max(pairs * 2.0 / 3.0, 1.0) * max(int(good.sum()), 1)))
     return True
 
@@ -656,7 +676,7 @@ def _features(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
     levels: dict[int, tuple[float, float]] = {}
     for index, item in enumerate(judged):
         if item.series.kind == "flat":
-            levels[index] = (math.log(item.level_DN), _LEVEL_SDS["series"])
+            levels[index] = (math.log(item.level_DN), math.hypot(_LEVEL_SDS["series"], item.released))
         else:
             depth = maps.depth(item.series.scene, item.label)
             if depth is None or item.picture is None:
@@ -665,7 +685,8 @@ def _features(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
             if beside.sum() >= max(16, 0.02 * depth.size):
                 open_DN = float(np.median(item.picture[beside]))
                 if open_DN > 0:
-                    levels[index] = (math.log(open_DN), math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA))
+                    sd = math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
+                    levels[index] = (math.log(open_DN), sd)
 
     def level_covariance(members: Sequence[int], labels: Sequence[_Label]) -> FloatArray:
         _, later = beams(members, labels)
@@ -693,7 +714,11 @@ def _features(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
     gains = {
         index: (
             math.log(item.gain_DN),
-            math.hypot(_GAIN_SDS["series"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0), item.gain_sd),
+            math.hypot(
+                _GAIN_SDS["series"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0),
+                item.gain_sd,
+                item.released,
+            ),
         )
         for index, item in enumerate(judged)
         if item.gain_DN > 0
@@ -752,8 +777,10 @@ def _attenuation(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
         places = [(judged[index].series.scene, judged[index].series.source_object_mm) for index in members]
         return np.asarray(_ATTENUATION_SDS["all"] ** 2 + _ATTENUATION_SDS["placement"] ** 2 * _same(places))
 
-    values = np.array([math.log(float(np.median(measured[covered]))) for measured, covered in shadows.values()])
-    return [_Feature(tuple(shadows), values, np.full(len(shadows), _ATTENUATION_SDS["series"]), expected, covariance)]
+    depths = np.array([float(np.median(measured[covered])) for measured, covered in shadows.values()])
+    released = np.array([judged[index].released for index in shadows])
+    sds = np.hypot(_ATTENUATION_SDS["series"], released / np.maximum(depths, 0.1))
+    return [_Feature(tuple(shadows), np.log(depths), sds, expected, covariance)]
 
 
 def _takes(label: _Label, what: str, donor: _Label) -> _Label:

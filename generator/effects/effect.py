@@ -114,7 +114,7 @@ def order_parameter(usual: float) -> Parameter:
     return Parameter(
         name="order",
         unit="",
-        low=0.3,
+        low=0.5,
         high=6.0,
         default=usual,
         source="1/2: exponential over distance, 1: Lorentzian, large: Gaussian",

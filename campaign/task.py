@@ -774,7 +774,7 @@ def _thresholds(runs_path: Path, learnt_from: Path, out: Path, share: float, *, 
                         ~binary_dilation(mask, iterations=_NEAR_PX) if mask.any() else np.ones(mask.shape, dtype=bool)
                     )
                     highest.append(float(values[away].max()) if away.any() else 0.0)
-            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 0.9999))
+            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 1.0 - 1e-6))
     with whole_file(out) as temporary:
         temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return found

@@ -194,15 +194,15 @@ def check_plausibility(
 
     read_DN2 = min((_mean(item.variance_DN2, good) for item in darks if item.variance_DN2 is not None), default=0.0)
     judged = [item for item in lit if _measure(item, dark_of(item.series), read_DN2, good)]
-    for item in judged:
-        before = [one.level_DN for one in judged if one.series.index < item.series.index][-_REMEMBERED:]
-        item.released = _RELEASED_LATER * max(before, default=0.0) / max(item.level_DN, 1e-9)
+    for reading in judged:
+        before = [one.level_DN for one in judged if one.series.index < reading.series.index][-_REMEMBERED:]
+        reading.released = _RELEASED_LATER * max(before, default=0.0) / max(reading.level_DN, 1e-9)
     dim, judged = _without_beam(judged)
     suspects += dim
     relative = _relative_gain([item for item in judged if item.series.kind == "flat"], good)
-    for item in judged:
-        if item.picture is not None and "gain" not in item.series.corrected:
-            item.picture = item.picture / relative
+    for reading in judged:
+        if reading.picture is not None and "gain" not in reading.series.corrected:
+            reading.picture = reading.picture / relative
     shadowed = _shadows_in_flats(judged, good)
     suspects += shadowed
     blamed = {name for suspect in shadowed for name in suspect.series}
@@ -665,7 +665,8 @@ def _features(judged: Sequence[_Reading], maps: _Maps) -> list[_Feature]:
     def beams(members: Sequence[int], labels: Sequence[_Label]) -> tuple[FloatArray, FloatArray]:
         keys = [label.beam for label in labels]
         later = [(key, since[index]) for key, index in zip(keys, members, strict=True)]
-        return _same(keys), _same(later) * np.outer(*(2 * [[float(since[index]) for index in members]]))
+        late = np.array([float(since[index]) for index in members])
+        return _same(keys), _same(later) * np.outer(late, late)
 
     def free(labels: Sequence[_Label]) -> FloatArray:
         """Beams whose level no model gives."""
@@ -835,14 +836,13 @@ def _relabelled(judged: Sequence[_Reading], model: SpectralModel | None, maps: _
             for index, z in feature.left_out(labels).items():
                 strange[index] = max(strange.get(index, 0.0), z)
         suspects = sorted((i for i, z in strange.items() if z > _SUSPECT_Z), key=lambda i: -strange[i])[:_MOST_SUSPECTS]
-        best, change, texts, which = 0.0, list(labels), "", ()
-        tried = 1
+        best, change, texts = 0.0, list(labels), ""
+        which: tuple[int, ...] = ()
         kinds = [item.series.kind for item in judged]
         for price, candidate, members, text in (
             *_exchanged_groups(labels, names, kinds),
             *_candidates(suspects, labels, names),
         ):
-            tried += 1
             gained = evidence(candidate) - current - price
             if gained > best:
                 best, change, texts, which = gained, candidate, text, members

@@ -114,7 +114,8 @@ def measured_levels(series: Sequence[Series]) -> dict[str, float]:
                 continue
             dark = 0.0
             if "offset" not in item.corrected:
-                dark = float(np.interp(item.exposure_ms or 0.0, *zip(*darks, strict=True)))
+                exposures_ms, levels_DN = np.array(darks).T
+                dark = float(np.interp(item.exposure_ms or 0.0, exposures_ms, levels_DN))
             levels[item.name] = _mean_DN(item) - dark
         levels = {name: level for name, level in levels.items() if level > 0}
         counted = all((item.photons_per_pixel or 0.0) > 0 for item in members)

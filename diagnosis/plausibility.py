@@ -53,6 +53,7 @@ _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
 _RELEASED = 0.08  # of the exposures before, which an image lag may leave in a dark
 _RELEASED_LATER, _REMEMBERED = 0.02, 3  # the same in the last frames of a lit series; from so many exposures before
+_WEAK = 0.1  # of the flats' usual level, below which a flat's pattern says nothing of a shadow
 _SHADOW_IN_FLAT = 0.35  # spread of the logarithm of a flat against other flats
 _DEEPEST = 4.0  # -log T beyond which nothing is compared
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
@@ -360,7 +361,10 @@ def _shadows_in_flats(judged: Sequence[_Reading], good: NDArray[np.bool_]) -> li
     if len(flats) < 3:
         return []
     found = []
+    typical = float(np.median([item.level_DN for item in flats]))
     for item in flats:
+        if item.level_DN < _WEAK * typical:
+            continue  # darks and read noise have a pattern of their own
         picture = np.maximum(np.asarray(item.picture), 1e-3)[good]
         low, high = np.quantile(np.log(picture), [0.05, 0.95])
         photons = max(item.level_DN, 1e-9) * min(item.series.n_frames, _FRAMES)

@@ -176,7 +176,7 @@ def variants_of(effect: Effect) -> list[Variant]:
         grown = [{**choice, item.name: value} for choice in choices for value in values]
         choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
     if effect.id in _CHOICES:
-        choices = [{item.name: item.default for item in inner} | choice for choice in _CHOICES[effect.id]]
+        choices = [{item.name: item.default for item in inner} | dict(choice) for choice in _CHOICES[effect.id]]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
     shares = _SHARES_OF.get(effect.id, STRENGTH_SHARES)

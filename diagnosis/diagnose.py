@@ -29,6 +29,8 @@ _WORST_PLACES = 30
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 _STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
+_MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
+_SHOWN = 5.0  # standard deviations from which a probe shows it
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
@@ -62,12 +64,16 @@ class Place:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gap:
-    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor."""
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
+
+    left: what is left of a typical probe that showed the gap (median of |after| over |before|); None: too few showed it.
+    """
 
     before: float
     after: float
     floor: float
     shrinks_by: tuple[float, float, float] | None
+    left: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,6 +226,7 @@ def judge(
     closer = refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in problem.variants},
+        curves=whitened,
         residual=residual,
         nuisances=shared,
         groups=problem.groups,
@@ -265,7 +272,7 @@ def judge(
             verdict = "explained"
     tell("held-out data")
     gap, held_out, shares = _held_out(problem, leading, rng)
-    if leading.effects and leading.effects != (UNKNOWN,) and _leaves_too_much(gap):
+    if leading.effects and leading.effects != (UNKNOWN,) and _leaves_too_much(gap, _plausible(leading)):
         # the best of the wrong ones
         verdict = "unknown_effect"
         moved = _VETO * (1.0 - none - unknown)
@@ -377,13 +384,24 @@ def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[s
     }
 
 
-def _leaves_too_much(gap: Gap) -> bool:
-    """Whether an explanation leaves more than _MOST_LEFT of a clear gap."""
+def _plausible(hypothesis: Hypothesis) -> bool:
+    """Whether all strengths lie within their plausible ranges."""
+    return all(
+        curve.low <= hypothesis.strengths[effect][0] <= curve.high for effect, curve in hypothesis.variants.items()
+    )
+
+
+def _leaves_too_much(gap: Gap, plausible: bool) -> bool:
+    """Whether an explanation leaves too much of a clear gap, in all and of the typical probe.
+
+    One series far outside all others may hold most of the gap: there a law that is right in kind may be off, unless its
+    strength is no `plausible` one.
+    """
     null = max(gap.floor, 1.0)
     if gap.before < 1.3 * null:
         return False
     left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
-    return left > _MOST_LEFT
+    return left > _MOST_LEFT and (not plausible or gap.left is None or gap.left > _MOST_LEFT_TYPICALLY)
 
 
 def _vetoed(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
@@ -527,7 +545,11 @@ def _held_out(
         found = share(values[known])
         if found is not None:
             shares[effect] = found
-    gap = Gap(before=rms(before), after=rms(after), floor=floor, shrinks_by=share(after) if effects else None)
+    shown = np.abs(before) > _SHOWN
+    left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
+    gap = Gap(
+        before=rms(before), after=rms(after), floor=floor, shrinks_by=share(after) if effects else None, left=left
+    )
     return gap, tuple(rows), shares
 
 

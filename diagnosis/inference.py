@@ -29,7 +29,8 @@ STRENGTH_NODES = 25
 _PAIR_NODES = 13
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
 UNKNOWN_DOUBT = 0.05  # share of what an effect of the catalogue explains that an unknown one must explain beyond it
-PAIR_DOUBT = 2e-3  # share of the stronger effect's log evidence that a second effect must bring
+PAIR_DOUBT = 3e-3  # share of the stronger effect's log evidence that a second effect must bring
+PAIR_DOUBT_ROOT = 0.6  # and so often its square root: what a slightly wrong law leaves by chance
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
@@ -521,7 +522,8 @@ def weigh_hypotheses(
             # the first's own variants were averaged above; its best stands for them. What a law that is slightly off
             # leaves of a strong effect, any second effect can take up a little of
             more = evidence_of[first] - leading.log_evidence
-            more -= PAIR_DOUBT * max(evidence_of[first], evidence_of[second], 0.0)
+            stronger = max(evidence_of[first], evidence_of[second], 0.0)
+            more -= PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
             starts.append((more, first, second, start))
     starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
     for number, (more, first, second, start) in enumerate(starts):

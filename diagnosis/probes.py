@@ -286,7 +286,8 @@ class _MovingPicture:
         if not len(self.images):
             return 0.0
         inside = self.images[:, mask]
-        return float(np.sum(self.steps * (inside @ inside.T))) / max(inside.shape[1], 1)
+        total: float = float(np.sum(self.steps * (inside @ inside.T)))
+        return total / max(int(inside.shape[1]), 1)
 
     def rows(self, good: NDArray[np.bool_]) -> float:
         """Variance of rows' means, DN^2."""
@@ -302,13 +303,15 @@ class _MovingPicture:
             return 0.0
         inside = self.images[:, good]
         early, late = self.courses[:, :-step], self.courses[:, step:]
-        return float(np.sum(early @ late.T / early.shape[1] * (inside @ inside.T))) / max(inside.shape[1], 1)
+        total: float = float(np.sum(early @ late.T / early.shape[1] * (inside @ inside.T)))
+        return total / max(int(inside.shape[1]), 1)
 
     def _lines(self, good: NDArray[np.bool_], axis: int) -> float:
         if not len(self.images):
             return 0.0
         means = self.images.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1)
-        return float(np.sum(self.steps * (means @ means.T))) / means.shape[1]
+        total: float = float(np.sum(self.steps * (means @ means.T)))
+        return total / int(means.shape[1])
 
 
 def frame_profile(expected: ExpectedSeries, good: NDArray[np.bool_]) -> NDArray[np.float64]:

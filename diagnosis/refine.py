@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.effects.effect import Parameter
 from .changes import Variant
-from .inference import UNKNOWN, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
+from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
+_STARTS = 2
 _ROUNDS = 5
 _ENOUGH = 1.0  # gain of log evidence below which the search ends
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
@@ -43,6 +44,7 @@ def refine(
     hypotheses: Sequence[Hypothesis],
     *,
     variants: Mapping[tuple[str, str], Variant],
+    curves: Sequence[Curve],
     residual: NDArray[np.float64],
     nuisances: Nuisances,
     groups: NDArray[np.intp],
@@ -54,6 +56,7 @@ def refine(
     Args:
         hypotheses: of the first weighing, with whitened curves.
         variants: of the grid, by effect and name.
+        curves: of the grid, whitened.
         residual, nuisances, groups: whitened, as weighed.
         respond: asks the forward model.
         whitener: of responses.
@@ -70,15 +73,17 @@ def refine(
             for other in hypothesis.effects:
                 if other != effect:
                     rest -= hypothesis.variants[other].response(hypothesis.strengths[other][0])
-            curve = hypothesis.variants[effect]
-            fit = fit_curve(rest, curve, nuisances, groups)
             done.add(effect)
-            response = curve.response(fit.best)
-            if float(response @ nuisances.solve(response)) < REFINED_FROM**2:
-                continue
-            found = _refined(variants[effect, curve.variant], fit, rest, nuisances, groups, respond, whitener)
-            if found is not None:
-                result.append(found)
+            fits = [fit_curve(rest, curve, nuisances, groups) for curve in curves if curve.effect == effect]
+            # the best start on the grid is not always the one that leads furthest
+            for fit in sorted(fits, key=lambda item: -item.log_evidence)[:_STARTS]:
+                response = fit.curve.response(fit.best)
+                if float(response @ nuisances.solve(response)) < REFINED_FROM**2:
+                    continue
+                variant = variants[effect, fit.curve.variant]
+                found = _refined(variant, fit, rest, nuisances, groups, respond, whitener)
+                if found is not None:
+                    result.append(found)
     return result
 
 

@@ -207,7 +207,7 @@ def smooth_map(cells: Array, shape: tuple[int, int]) -> Array:
 
     def powers(count: int, places: int) -> Array:
         x = (np.arange(places) + 0.5) / places * 2.0 - 1.0
-        result: Array = np.polynomial.legendre.legvander(x, min(MODES, count) - 1)
+        result: Array = np.asarray(np.polynomial.legendre.legvander(x, min(MODES, count) - 1), dtype=np.float64)
         return result
 
     up = powers(rows, shape[0]) @ np.linalg.pinv(powers(rows, rows))

@@ -121,13 +121,14 @@ def test_refinement_finds_an_inner_parameter_between_the_grid_s():
     found = refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in variants},
+        curves=curves,
         residual=residual,
         nuisances=nuisances,
         groups=groups,
         respond=answer,
         whitener=SimpleNamespace(apply=lambda vectors: vectors),
     )
-    assert len(found) == 1
+    assert len(found) == 2  # from the two best starts
     closer, responses = found[0]
     assert abs(np.log(closer.parameters["length_mm"] / true)) < 0.5 * abs(np.log(lengths[0] / true))
     assert responses.shape == (3, PROBES)
@@ -138,7 +139,15 @@ def test_refinement_finds_an_inner_parameter_between_the_grid_s():
     ("before", "after", "vetoed"), [(30.0, 16.0, True), (30.0, 4.0, False), (1.1, 1.05, False), (2.5, 1.0, False)]
 )
 def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
-    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None)) is vetoed
+    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), True) is vetoed
+
+
+@pytest.mark.parametrize(("left", "plausible", "vetoed"), [(0.1, True, False), (0.8, True, True), (0.1, False, True)])
+def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a_plausible_strength(
+    left, plausible, vetoed
+):
+    gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
+    assert _leaves_too_much(gap, plausible) is vetoed
 
 
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():

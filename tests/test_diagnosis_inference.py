@@ -1,5 +1,7 @@
 """Weighing hypotheses on probes whose truth is planted: no data, only vectors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -186,3 +188,24 @@ def test_a_law_off_by_a_tenth_in_places_is_still_named(setup):
     fit = fit_curve(noise(rng, factors) + wrong, curve, Nuisances(factors), GROUPS)
     _, low, high = fit.interval()
     assert high / low > 1.01
+
+
+def test_what_an_effect_does_by_chance_counts_as_its_own(setup):
+    """A pattern of independent deviations is the effect that brings such patterns, not an unknown one."""
+    _, factors, _ = setup
+    rng = np.random.default_rng(31)
+    response = np.zeros(PROBES)
+    response[0] = 30.0
+    curve = Curve(
+        effect="gain_map_error",
+        variant="",
+        parameters={},
+        low=0.1,
+        high=3.0,
+        strengths=np.array([1.0]),
+        responses=response[None, :],
+        jitter=np.where(response > 0, 0.0, 25.0),
+    )
+    residual = response + noise(rng, factors) + 5.0 * rng.standard_normal(PROBES) * (response == 0)
+    assert weigh(residual, factors, [curve])[0].effects == ("gain_map_error",)
+    assert weigh(residual, factors, [replace(curve, jitter=None)])[0].effects == (UNKNOWN,)

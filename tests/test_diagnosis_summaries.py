@@ -1,9 +1,12 @@
 """Statistics of a series against what was planted in its frames."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from raytwin.diagnosis.probes import _MovingPicture
 from raytwin.diagnosis.registration import Placement, register, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series
 from raytwin.errors import InputError
@@ -154,3 +157,21 @@ def test_resampling_by_nothing_changes_nothing():
     image = np.random.default_rng(8).standard_normal((20, 30))
     still = Placement(row_px=0.0, column_px=0.0, row_sd_px=0.1, column_sd_px=0.1)
     assert resample(image, still) == pytest.approx(image, abs=1e-9)
+
+
+def test_a_picture_that_fades_adds_to_variances_what_it_says():
+    rows, columns, frames = 48, 64, 12
+    y, x = np.mgrid[:rows, :columns]
+    pictures = [np.where(x > 40, 30.0, 0.0) + 5.0 * (y > 20), 8.0 * np.sin(y / 7.0)]
+    courses = [np.exp(-np.arange(frames) / 2.0), 1.0 / (1.0 + np.arange(frames))]
+    good = np.ones((rows, columns), bool)
+    stack = sum(image * course[:, None, None] for image, course in zip(pictures, courses, strict=True))
+    found = summarise_series([stack + 100.0], good=good, labels=np.zeros((rows, columns), np.int64))
+    expected = SimpleNamespace(
+        trend_DN=[(image, course - course.mean()) for image, course in zip(pictures, courses, strict=True)],
+        signal_DN=np.ones((1, 1)),
+    )
+    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, kind="dark"))
+    assert moving.pixels(good) == pytest.approx(float(found.label_variance_DN2[0]), rel=1e-4)
+    assert moving.rows(good) == pytest.approx(found.row_variance_DN2, rel=1e-4)
+    assert moving.columns(good) == pytest.approx(found.column_variance_DN2, rel=1e-4)

@@ -295,6 +295,19 @@ def build_problem(
             received="; ".join(skipped) or "no series",
             expected="darks and flats whose kV, exposure and tube load are stated",
         )
+
+    def summarise(item: SessionSeries, usable: NDArray[np.bool_]) -> SeriesSummary:
+        signal = np.broadcast_to(np.asarray(expected[item.name].signal_DN, dtype=np.float64), shape)
+        mean = float(signal[usable].mean())
+        return summarise_series(
+            item.series.iter_frames(),
+            good=usable,
+            labels=labels[item.name],
+            pattern=signal / mean if item.series.kind in ("flat", "object") and mean > 0 else None,
+            name=f"series {item.name}",
+            saturation_DN=None if acquisition.instrument.bits is None else 2.0**acquisition.instrument.bits - 1,
+        )
+
     tell("frames")
     summaries: dict[str, SeriesSummary] = {}
     label_names: dict[str, tuple[str, ...]] = {}
@@ -305,20 +318,8 @@ def build_problem(
         open_DN = float(signal.max())
         kind = item.series.kind
         labels[item.name], label_names[item.name] = _labels(signal, open_DN, kind, good)
-        pattern = None
-        if kind in ("flat", "object"):
-            mean = float(signal[good].mean())
-            if mean > 0:
-                pattern = signal / mean
         tell(f"frames of {item.name}")
-        summaries[item.name] = summarise_series(
-            item.series.iter_frames(),
-            good=good,
-            labels=labels[item.name],
-            pattern=pattern,
-            name=f"series {item.name}",
-            saturation_DN=None if acquisition.instrument.bits is None else 2.0**acquisition.instrument.bits - 1,
-        )
+        summaries[item.name] = summarise(item, good)
         full = summaries[item.name].saturated_share
         if full > 1e-3 and kind != "dark":
             skipped.append(f"{item.name}: saturated in {100 * full:.2g} % of the pixels")
@@ -382,6 +383,11 @@ def build_problem(
     good = good & (gain > 0.05)
     outlying = _new_outliers(kept, expected, summaries, dark_map, gain, good, shape)
     clean = good & ~outlying
+    if outlying.any():
+        # they count as outliers; what else is said of noise is said without them
+        for item in kept:
+            tell(f"frames of {item.name} without outliers")
+            summaries[item.name] = summarise(item, clean)
 
     tell("registration")
     corrected: dict[str, NDArray[np.float64]] = {}

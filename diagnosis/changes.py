@@ -96,7 +96,7 @@ KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
 UNEVEN = frozenset(("dark_drift", "heel"))
 UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
 PATTERN_WAVES = 4  # cosine waves along each side of a gain map's smooth change
-PATTERN_SMOOTH_SHARE = 0.3  # of that change's variance
+PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
 DARK_SD_DN = 0.05  # of the dark between series
 
 

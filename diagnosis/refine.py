@@ -19,6 +19,7 @@ from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curv
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
+_CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _STARTS = 2
 _ROUNDS = 5
 _ENOUGH = 1.0  # gain of log evidence below which the search ends
@@ -136,6 +137,17 @@ def _refined(
             break
     final = near(best.parameters, _NEAR)
     answer = respond([final])
+    for _ in range(_CENTRINGS):
+        if 0 not in answer:
+            return None
+        # a response that saturates is known near its nodes only: they are laid where the strength turns out to be
+        curve = final.curve(whitener.apply(answer[0]), fit.curve.spread, fit.curve.jitter)
+        found = min(max(fit_curve(residual, curve, nuisances, groups).best, variant.low), variant.high)
+        if abs(math.log(found / strength)) < _CENTRED:
+            break
+        strength = found
+        final = near(best.parameters, _NEAR)
+        answer = respond([final])
     return (final, answer[0]) if 0 in answer else None
 
 

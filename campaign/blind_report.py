@@ -52,11 +52,13 @@ def summary_text(result: CheckResult) -> str:
         return " ".join(parts)
     full = scores["full_measurement_set"]
     first, alone = share_text(full["top1"]["single_from_5_sigma"]), share_text(full["exact"]["single_from_5_sigma"])
-    parts.append(
-        "With the full measurement set, a single effect that lay 5 standard deviations or more from every other"
-        f" explanation was named first in {first}, and alone in {alone}."
-    )
-    parts.append(f"Where nothing was wrong, something was claimed in {share_text(every['none']['false_alarms'])}.")
+    if full["top1"]["single_from_5_sigma"]["n"]:
+        parts.append(
+            "With the full measurement set, a single effect that lay 5 standard deviations or more from every other"
+            f" explanation was named first in {first}, and alone in {alone}."
+        )
+    if every["none"]["false_alarms"]["n"]:
+        parts.append(f"Where nothing was wrong, something was claimed in {share_text(every['none']['false_alarms'])}.")
     if every["pairs"]["both_named"]["n"]:
         parts.append(f"Both effects of a pair were named in {share_text(every['pairs']['both_named'])}.")
     if every["unknown"]["found"]["n"]:

@@ -681,6 +681,7 @@ def build_problem(
                 scalars,
                 thicker,
                 frozenset(index for index, change in enumerate(all_changes) if change.label in scales.UNEVEN),
+                contexts[item.name].previous_signal_DN,
                 shape,
             )
         )
@@ -1004,6 +1005,7 @@ def _block(
     scalars: Sequence[dict[str, float] | None],
     thicker: dict[str, tuple[Map, dict[str, float]]],
     uneven: frozenset[int],
+    previous_DN: float | None,
     shape: tuple[int, int],
 ) -> dict[str, Any]:
     names = projection.names() + [
@@ -1040,6 +1042,7 @@ def _block(
         if image is not None and values is not None:
             responses[index] = _standardised(block, base_scalars, image, values, shape)
     block["responses"] = responses
+    block["offset"] = _offset(item, projection, scalar_probes, previous_DN, shape) * shrink
     block["pattern"], block["pattern_jitter"] = _pattern_of_gain(item, projection, signal, len(scalar_probes), shrink)
     # a panel seldom warms evenly, and no anode's heel is a straight line
     rows, columns = shape
@@ -1056,6 +1059,23 @@ def _block(
         if index in uneven and image is not None
     }
     return block
+
+
+def _offset(
+    item: SessionSeries,
+    projection: MapProjection,
+    scalar_probes: Sequence[Scalar],
+    previous_DN: float | None,
+    shape: tuple[int, int],
+) -> NDArray[np.float64]:
+    """What one DN more in every pixel of a later series does (probe,)."""
+    if item.calibrates:
+        return np.zeros(len(projection) + len(scalar_probes))
+    scalars = [
+        1.0 / previous_DN / probe.sd if previous_DN and probe.name.startswith("afterglow") else 0.0
+        for probe in scalar_probes
+    ]
+    return np.concatenate([projection.apply(np.ones(shape)), scalars])
 
 
 def _pattern_of_gain(
@@ -1350,7 +1370,7 @@ def _spread(
     """Random responses (probe, factor) a unit of strength.
 
     A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
-    a part of a gain map's change is smooth.
+    a part of a gain map's change is smooth; bits that are cut off lower every level.
     """
     if variant.effect in scales.UNEVEN:
         uneven = np.zeros((size, 2))
@@ -1358,6 +1378,9 @@ def _spread(
             if row in block["uneven"]:
                 uneven[starts[number] : starts[number + 1]] = block["uneven"][row].T
         return uneven * (scales.UNEVEN_SHARE / variant.strengths[0])
+    if variant.effect == "quantisation" and variant.since == "calibration":
+        # lost bits may be cut off or rounded away: half a step between the two
+        return np.concatenate([block["offset"] for block in blocks])[:, None] * scales.CUT_OFF_SHARE
     if variant.effect == "gain_map_error":
         return np.concatenate([block["pattern"] for block in blocks])
     if variant.effect != "output_drift":

@@ -95,6 +95,7 @@ TILT_SD = 0.0005  # of the field's gradient between series
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
 UNEVEN = frozenset(("dark_drift", "heel"))
 UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
+CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
 PATTERN_WAVES = 4  # cosine waves along each side of a gain map's smooth change
 PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
 DARK_SD_DN = 0.05  # of the dark between series

@@ -466,12 +466,12 @@ def measured_scalars(
                 math.hypot(white_sd / math.sqrt(stop - start), 0.02) / context.previous_signal_DN,
                 "afterglow",
             )
-    if context.codes_usable and summary.distinct_codes > 0:
+    if context.codes_usable and summary.distinct_codes > 1:
         add(
             "tails",
             "codes",
             "1",
-            math.log(summary.code_range / summary.distinct_codes),
+            math.log((summary.code_range - 1) / (summary.distinct_codes - 1)),
             0.0,
             "codes",
         )

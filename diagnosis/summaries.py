@@ -29,8 +29,8 @@ class SeriesSummary:
     the pixels of each noise label; row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the
     means of rows, columns and blocks of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one
     and two frames apart; kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,);
-    tile_mean_DN (n, TIME_TILES, TIME_TILES); distinct_codes, code_range: how many whole numbers occur and how many
-    there are between the 1st and 99th percentile; highest_DN, saturated_share.
+    tile_mean_DN (n, TIME_TILES, TIME_TILES); distinct_codes, code_range: how many whole numbers occur between the 1st and
+    99th percentile, and how many there are from the first to the last of them; highest_DN, saturated_share.
     """
 
     frames: int
@@ -210,7 +210,7 @@ def summarise_series(
         values = np.concatenate(code_parts)
         low, high = np.percentile(values, [1, 99]).astype(int)
         inside = values[(values >= low) & (values <= high)]
-        distinct, span = len(np.unique(inside)), int(high - low + 1)
+        distinct, span = len(np.unique(inside)), int(inside.max()) - int(inside.min()) + 1
     one = max(n_pairs, 1)
     return SeriesSummary(
         frames=frames,

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-slow validation validation-generator validation-prediction blind-check benchmark benchmark-memory check format clean
+.PHONY: demo stories test test-slow validation validation-generator validation-prediction blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)

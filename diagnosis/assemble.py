@@ -126,9 +126,12 @@ class Problem:
 
     def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
-        first = {item.effect: item for item in reversed(self.curves)}
+        # what an effect does by chance depends on its onset: lost bits lower later levels only
+        like = {(item.effect, item.since): item for item in reversed(self.curves)}
         curves = [
-            variant.curve(responses, first[variant.effect].spread, first[variant.effect].jitter)
+            variant.curve(
+                responses, like[variant.effect, variant.since].spread, like[variant.effect, variant.since].jitter
+            )
             for variant, responses in more
         ]
         return replace(
@@ -429,7 +432,9 @@ def build_problem(
                 rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
             )
         if math.hypot(placement.row_px, placement.column_px) > LARGEST_PX:
-            skipped.append(f"{members[0].series.scene}: lies nowhere near its thickness maps")
+            skipped.append(
+                f"{members[0].series.scene}: seems to lie more than {LARGEST_PX:g} px from its thickness maps; compared as they are"
+            )
             continue
         first_of_place.add(members[0].name)
         for item in members:
@@ -1086,19 +1091,22 @@ def _pattern_of_gain(
     shrink: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest."""
-    waves = [(i, k) for i in range(scales.PATTERN_WAVES + 1) for k in range(scales.PATTERN_WAVES + 1) if i or k]
+    waves = _waves(signal.shape, scales.PATTERN_WAVES + 1)
     smooth = np.zeros((len(projection) + n_scalars, len(waves)))
     rest = np.zeros(len(projection) + n_scalars)
     if item.calibrates or item.series.kind not in ("flat", "object"):
         return smooth, rest
-    rows, columns = signal.shape
-    y, x = (np.pi * (np.arange(length) + 0.5) / length for length in (rows, columns))
-    for number, (i, k) in enumerate(waves):
-        wave = np.cos(i * y)[:, None] * np.cos(k * x)[None, :]
+    for number, wave in enumerate(waves.values()):
         amount = 0.01 * math.sqrt(scales.PATTERN_SMOOTH_SHARE / len(waves) / float(np.mean(wave**2)))
         smooth[: len(projection), number] = projection.apply(amount * wave * signal)
     rest[: len(projection)] = projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
     return smooth * shrink[:, None], rest * shrink**2
+
+
+def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Products of `count` cosines along each side (row, column), by their numbers; the even field is left out."""
+    y, x = (np.cos(np.pi * np.outer(np.arange(count), (np.arange(length) + 0.5) / length)) for length in shape)
+    return {(i, k): np.outer(y[i], x[k]) for i in range(count) for k in range(count) if i or k}
 
 
 def _standardised(
@@ -1218,16 +1226,9 @@ def _of_gain_map(
     pixel_sd: relative, of one pixel's gain in sums over many pixels.
     """
     result = {}
-    rows, columns = signal.shape
-    y = np.cos(np.pi * np.outer(np.arange(_GAIN_MAP_MODES), (np.arange(rows) + 0.5) / rows))
-    x = np.cos(np.pi * np.outer(np.arange(_GAIN_MAP_MODES), (np.arange(columns) + 0.5) / columns))
-    for i in range(_GAIN_MAP_MODES):
-        for j in range(_GAIN_MAP_MODES):
-            if i + j == 0:
-                continue  # the level has nuisances of its own
-            shape = np.outer(y[i], x[j])
-            sd = pixel_sd / math.sqrt(float(np.sum(shape**2)))
-            result[f"gain map {i},{j}"] = np.concatenate([projection.apply(sd * shape * signal), np.zeros(scalars)])
+    for (i, j), wave in _waves(signal.shape, _GAIN_MAP_MODES).items():  # the level has nuisances of its own
+        sd = pixel_sd / math.sqrt(float(np.sum(wave**2)))
+        result[f"gain map {i},{j}"] = np.concatenate([projection.apply(sd * wave * signal), np.zeros(scalars)])
     return result
 
 

@@ -6,9 +6,9 @@ responses to the nuisances times their prior standard deviations. With C = L L^T
 
     none      m = 0
     effect    m = m_e(s), s the strength, log-uniform over its plausible range, the law's own inaccuracy a random factor
-              (sd LAW_ERROR) for each group of probes
+              (LAW_ERRORS) for each group of probes; what the effect does by chance is extra covariance
     pair      m = m_e(s) + m_f(t)
-    unknown   m = 0 and an extra variance tau^2 in one group of probes, tau log-uniform
+    unknown   m = 0 and an extra variance tau^2 in any number of families of probes, tau log-uniform, at a price for each
 
 Evidence of each is integrated numerically over strengths; a hypothesis' probability is prior x evidence, raised to a
 power below 1 where tests on simulated sessions showed overconfidence.

@@ -1,10 +1,12 @@
 """What a measurement set can tell apart, refinement and veto, on problems whose truth is planted."""
 
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose import Gap, _leaves_too_much
 from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
@@ -165,3 +167,18 @@ def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_giv
 
 def test_every_effect_of_the_catalogue_has_a_measurement_that_isolates_it():
     assert set(ISOLATED_BY) == set(EFFECTS)
+
+
+def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
+    """Lost bits that came after the calibration lower later levels; those that were always there do not."""
+    always = curve("quantisation", axis(0))
+    later = replace(always, since="calibration", spread=axis(1)[:, None])
+    of_session = problem([always, later])
+    variant = next(
+        item for item in catalogue_variants() if item.effect == "quantisation" and item.since == "calibration"
+    )
+    names = [item.name for item in fields(Problem)]
+    whole = Problem(**{name: getattr(of_session, name, None) for name in names} | {"variants": ()})
+    found = whole.with_variants([(variant, np.stack([axis(0)] * len(variant.strengths)))]).curves[-1]
+    assert found.since == "calibration"
+    np.testing.assert_array_equal(found.spread, later.spread)

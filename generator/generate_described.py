@@ -26,6 +26,7 @@ from .render import (
     RenderedScene,
     TracedScene,
     geometry_of,
+    refuse_without_spectrum,
     render_scene,
     sample_expected,
     trace_scene,
@@ -66,13 +67,7 @@ class DescribedScenes:
         supersampling: int = SUPERSAMPLING,
     ) -> None:
         refuse_binning(low, high)
-        if twin.spectral is None:
-            raise InputError(
-                "twin",
-                received="a twin without spectral part",
-                expected="one that knows its spectrum, to project materials through",
-                remedy="calibrate from flats that state kV and tube load, or generate from reference images",
-            )
+        refuse_without_spectrum(twin)
         if bad_pixels not in BAD_PIXELS:
             raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
         if high.kV <= low.kV:

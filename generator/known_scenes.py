@@ -22,7 +22,7 @@ from .generate import ChannelModel, effect_warnings, effects_provenance
 from .image_effects import AffectedImage, ImageEffects
 from .predict import predict_flatfield
 from .present_line import present_line
-from .render import _moments_behind, geometry_of
+from .render import geometry_of, moments_behind, refuse_without_spectrum
 from .transfer import Channel
 from .twin import Twin
 
@@ -52,12 +52,10 @@ class KnownScenes:
 
     def __init__(self, twin: Twin, *, low: Setting, high: Setting, product_material: str) -> None:
         refuse_binning(low, high)
-        if twin.spectral is None:
+        refuse_without_spectrum(twin)
+        if high.kV <= low.kV:
             raise InputError(
-                "twin",
-                received="a twin without spectral part",
-                expected="one that knows its spectrum, to project materials through",
-                remedy="calibrate from flats that state kV and tube load",
+                "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
             )
         line = present_line(twin)
         self.twin = line.twin
@@ -93,7 +91,7 @@ class KnownScenes:
                 )
         stack = np.stack([np.asarray(thickness_mm[name], dtype=np.float32) for name in names])
         scale = self._effects[0].attenuation_scale(names)
-        moments = _moments_behind(stack, names, twin=self.twin, channels=self._channels, scale=scale)
+        moments = moments_behind(stack, names, twin=self.twin, channels=self._channels, scale=scale)
         lengths = {name: np.asarray(thickness_mm[name], dtype=np.float64) for name in names}
         images = []
         for effects, planes in zip(self._effects, moments, strict=True):

@@ -143,7 +143,7 @@ def render_expected(
     if wrong or not lengths_mm:
         raise InputError("path lengths", received=wrong or "none", expected=f"maps of {shape} (rows, columns)")
     stack = np.stack([np.asarray(one, dtype=np.float32) for one in lengths_mm.values()])
-    moments = _moments_behind(stack, tuple(lengths_mm), twin=twin, channels=channels)
+    moments = moments_behind(stack, tuple(lengths_mm), twin=twin, channels=channels)
     return images_of_moments(moments, twin=twin, channels=channels, geometry=geometry, supersampling=supersampling)
 
 
@@ -228,7 +228,7 @@ def trace_scene(
     every = np.concatenate([coarse, *pieces], axis=1)[:, None]
     moments = []
     scale = {} if attenuation_scale is None else attenuation_scale(names)
-    for signal, variance in _moments_behind(every, names, twin=twin, channels=channels, scale=scale):
+    for signal, variance in moments_behind(every, names, twin=twin, channels=channels, scale=scale):
         planes = []
         for values in (signal[0], variance[0]):
             plane = values[: coarse.shape[1]].reshape(geometry.rows, geometry.columns)
@@ -275,7 +275,18 @@ def _tiles_with_edges(scene: Scene, rays: Rays, inside: NDArray[np.bool_]) -> li
 Moments = Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
-def _moments_behind(
+def refuse_without_spectrum(twin: Twin) -> None:
+    """Raise InputError where the twin cannot project materials."""
+    if twin.spectral is None:
+        raise InputError(
+            "twin",
+            received="a twin without spectral part",
+            expected="one that knows its spectrum, to project materials through",
+            remedy="calibrate from flats that state kV and tube load, or generate from reference images",
+        )
+
+
+def moments_behind(
     stack: NDArray[np.float32],
     names: Sequence[str],
     *,

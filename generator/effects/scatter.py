@@ -195,7 +195,7 @@ OBJECT_SCATTER = Effect(
             low=-1.5,
             high=1.5,
             default=-0.1,
-            source="photons followed one by one behind water, 40 and 90 kV: 0 with 350 mm of air, -0.2 with 100 mm",
+            source="photons followed one by one, one line, 40 and 90 kV: -0.1 with 350 mm of air, -0.4 with 100 mm",
             log=False,
         ),
         Parameter(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -704,7 +705,7 @@ def build_problem(
                 for item, block in zip(kept, blocks, strict=True):
                     found = move(item, change, taken)
                     if found is not None:
-                        parts.append(_standardised(block, base_scalars[item.name], found[0], found[1], shape))
+                        parts.append(_standardised(block, base_scalars[item.name], [found[0]], [found[1]], shape)[0])
                 if not change.failed:
                     rows.append(np.concatenate(parts))
             if len(rows) == len(variant.strengths):
@@ -1040,9 +1041,14 @@ def _block(
         * shrink,
     }
     responses = np.zeros((len(maps), len(residual)))
-    for index, (image, values) in enumerate(zip(maps, scalars, strict=True)):
-        if image is not None and values is not None:
-            responses[index] = _standardised(block, base_scalars, image, values, shape)
+    known = [
+        (index, image, values)
+        for index, (image, values) in enumerate(zip(maps, scalars, strict=True))
+        if image is not None and values is not None
+    ]
+    if known:
+        found = _standardised(block, base_scalars, [one[1] for one in known], [one[2] for one in known], shape)
+        responses[[one[0] for one in known]] = found
     block["responses"] = responses
     block["offset"] = _offset(item, projection, scalar_probes, previous_DN, shape) * shrink
     block["pattern"], block["pattern_jitter"] = _pattern_of_gain(item, projection, signal, len(scalar_probes), shrink)
@@ -1050,13 +1056,11 @@ def _block(
     rows, columns = shape
     ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
     block["uneven"] = {
-        index: np.stack(
-            [
-                np.concatenate([projection.apply(np.broadcast_to(image * ramp, shape)), np.zeros(len(scalar_probes))])
-                * shrink
-                for ramp in ramps
-            ]
+        index: np.pad(
+            projection.apply(np.stack([np.broadcast_to(image * ramp, shape) for ramp in ramps])),
+            ((0, 0), (0, len(scalar_probes))),
         )
+        * shrink
         for index, image in enumerate(maps)
         if index in uneven and image is not None
     }
@@ -1093,13 +1097,14 @@ def _pattern_of_gain(
     rest = np.zeros(len(projection) + n_scalars)
     if item.calibrates or item.series.kind not in ("flat", "object"):
         return smooth, rest
-    for number, wave in enumerate(waves.values()):
-        amount = 0.01 * math.sqrt(scales.PATTERN_SMOOTH_SHARE / len(waves) / float(np.mean(wave**2)))
-        smooth[: len(projection), number] = projection.apply(amount * wave * signal)
+    share = scales.PATTERN_SMOOTH_SHARE / len(waves)
+    amounts = [0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave for wave in waves.values()]
+    smooth[: len(projection)] = projection.apply(np.stack(amounts) * signal).T
     rest[: len(projection)] = projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
     return smooth * shrink[:, None], rest * shrink**2
 
 
+@lru_cache(maxsize=8)
 def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Products of `count` cosines along each side (row, column), by their numbers; the even field is left out."""
     y, x = (np.cos(np.pi * np.outer(np.arange(count), (np.arange(length) + 0.5) / length)) for length in shape)
@@ -1109,22 +1114,23 @@ def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[
 def _standardised(
     block: dict[str, Any],
     base_scalars: Mapping[str, float],
-    image: Map,
-    values: Mapping[str, float],
+    images: Sequence[Map],
+    values: Sequence[Mapping[str, float]],
     shape: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Response (probe,) of one series' probes to a change of its mean frame and scalars."""
+    """Responses (change, probe) of one series' probes to changes of its mean frame and scalars."""
     projection: MapProjection = block["projection"]
-    moved = (
-        projection.apply(np.broadcast_to(image, shape))
-        if image.shape == shape or float(image.flat[0]) != 0.0
-        else np.zeros(len(projection))
-    )
-    scalar = [
-        (values.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd
-        for probe in block["scalar_probes"]
-    ]
-    return np.asarray(np.concatenate([moved, scalar]) * block["shrink"])
+    moved = np.zeros((len(images), len(projection)))
+    seen = [number for number, image in enumerate(images) if image.shape == shape or float(image.flat[0]) != 0.0]
+    if seen:
+        moved[seen] = projection.apply(np.stack([np.broadcast_to(images[number], shape) for number in seen]))
+    scalar = np.array(
+        [
+            [(own.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd for own in values]
+            for probe in block["scalar_probes"]
+        ]
+    ).reshape(-1, len(images))
+    return np.asarray(np.concatenate([moved, scalar.T], axis=1) * block["shrink"])
 
 
 def _local_nuisances(
@@ -1137,13 +1143,14 @@ def _local_nuisances(
 ) -> dict[str, NDArray[np.float64]]:
     """Factors of one series, by name; equal names in several series are one nuisance."""
     series = item.series
-    pad = np.zeros(len(scalar_probes))
-
-    def of_map(image: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.concatenate([projection.apply(image), pad])
+    images: dict[str, NDArray[np.floating]] = {}  # of nuisances that change the mean frame alone
 
     def of_scalars(change: Callable[[Scalar], float]) -> NDArray[np.float64]:
         return np.concatenate([np.zeros(len(projection)), [change(probe) / probe.sd for probe in scalar_probes]])
+
+    def projected(images: Mapping[str, NDArray[np.floating]]) -> dict[str, NDArray[np.float64]]:
+        found = projection.apply(np.stack(list(images.values())).astype(np.float32))
+        return dict(zip(images, np.pad(found, ((0, 0), (0, len(scalar_probes)))), strict=True))
 
     result: dict[str, NDArray[np.float64]] = {}
     result["shape of the noise"] = of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
@@ -1151,16 +1158,16 @@ def _local_nuisances(
     y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
     x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
     if series.kind in ("dark", "afterglow"):
-        result[f"dark of {series.name}"] = of_map(np.full(signal.shape, scales.DARK_SD_DN))
-        return result
+        images[f"dark of {series.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
+        return result | projected(images)
     # without a voltage the noise of a beam is known only from its own series
     voltage = f"unknown kV ({series.current_mA}, {series.power_W})" if series.kV is None else f"{series.kV:g} kV"
     gain_sd = _UNKNOWN_GAIN_SD if series.kV is None else scales.GAIN_OF_BEAM_SD
     beam = f"{voltage} " + "+".join(str(layer) for layer in series.filters)
-    result[f"level of {beam}"] = of_map(scales.LEVEL_OF_BEAM_SD * signal)
-    result[f"level of {series.name}"] = of_map(scales.LEVEL_OF_SERIES_SD * signal)
-    result[f"tilt x of {series.name}"] = of_map(scales.TILT_SD * x * signal)
-    result[f"tilt y of {series.name}"] = of_map(scales.TILT_SD * y * signal)
+    images[f"level of {beam}"] = scales.LEVEL_OF_BEAM_SD * signal
+    images[f"level of {series.name}"] = scales.LEVEL_OF_SERIES_SD * signal
+    images[f"tilt x of {series.name}"] = scales.TILT_SD * x * signal
+    images[f"tilt y of {series.name}"] = scales.TILT_SD * y * signal
     result[f"gain of {beam}"] = of_scalars(lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0)
 
     def texture(lag: tuple[int, int]) -> NDArray[np.float64]:
@@ -1179,23 +1186,24 @@ def _local_nuisances(
         dy, dx = gradient(signal)
         scene = series.scene
         place = f"{scene} at {series.source_object_mm or 0:g}"
-        result[f"column of {place}"] = of_map(scales.REGISTERED_SD_PX * dx)
-        result[f"row of {place}"] = of_map(scales.REGISTERED_SD_PX * dy)
-        result[f"outline of {place}"] = of_map(scales.OUTLINE_SD_PX * np.asarray(np.hypot(dy, dx)))
+        images[f"column of {place}"] = scales.REGISTERED_SD_PX * dx
+        images[f"row of {place}"] = scales.REGISTERED_SD_PX * dy
+        images[f"outline of {place}"] = scales.OUTLINE_SD_PX * np.asarray(np.hypot(dy, dx))
         row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
         across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
-        result[f"magnification of {place}"] = of_map(scales.MAGNIFICATION_SD * (row * dy + across * dx))
-        result[f"rotation of {place}"] = of_map(scales.MAGNIFICATION_SD * (across * dy - row * dx))
-        for label, image in _edge_profiles(dy, dx):
-            column_of = of_map(image)
+        images[f"magnification of {place}"] = scales.MAGNIFICATION_SD * (row * dy + across * dx)
+        images[f"rotation of {place}"] = scales.MAGNIFICATION_SD * (across * dy - row * dx)
+        profiles = projected(dict(_edge_profiles(dy, dx)))
+        for label, column_of in profiles.items():
             result[f"edges, {label}, of {place}"] = column_of
             # the pixels that an edge cuts are not rendered quite alike for different beams
             result[f"edges, {label}, of {series.name}"] = scales.EDGE_OF_SERIES * column_of
             # nor quite truly anywhere, and not the same where a pixel is another size in the object
             result[f"edges, {label}"] = scales.EDGE_OF_ALL * column_of
             result[f"edges, {label}, at {series.source_object_mm or 0:g}"] = scales.EDGE_OF_ALL * column_of
-        for number, field in enumerate(_rough_edges(dy, dx, place)):
-            result[f"rough edge {number} of {place}"] = of_map(field)
+        slope = np.hypot(dy, dx)
+        for number, field in enumerate(_rough_fields(signal.shape, place)):
+            images[f"rough edge {number} of {place}"] = slope * field
         for material, (moved, values) in thicker.items():
             # less light is less noise, too
             quieter = [
@@ -1212,7 +1220,7 @@ def _local_nuisances(
             result[f"attenuation of {material} at {voltage}"] = response * (
                 scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
             )
-    return result
+    return result | projected(images)
 
 
 def _of_gain_map(
@@ -1222,11 +1230,10 @@ def _of_gain_map(
 
     pixel_sd: relative, of one pixel's gain in sums over many pixels.
     """
-    result = {}
-    for (i, j), wave in _waves(signal.shape, _GAIN_MAP_MODES).items():  # the level has nuisances of its own
-        sd = pixel_sd / math.sqrt(float(np.sum(wave**2)))
-        result[f"gain map {i},{j}"] = np.concatenate([projection.apply(sd * wave * signal), np.zeros(scalars)])
-    return result
+    waves = _waves(signal.shape, _GAIN_MAP_MODES)  # the level has nuisances of its own
+    amounts = [pixel_sd / math.sqrt(float(np.sum(wave**2))) * wave for wave in waves.values()]
+    found = np.pad(projection.apply(np.stack(amounts) * signal), ((0, 0), (0, scalars)))
+    return {f"gain map {i},{j}": column for (i, j), column in zip(waves, found, strict=True)}
 
 
 def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> list[tuple[str, NDArray[np.float64]]]:
@@ -1246,20 +1253,19 @@ def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> list[tup
     ]
 
 
-def _rough_edges(dy: NDArray[np.float64], dx: NDArray[np.float64], place: str) -> list[NDArray[np.float64]]:
-    """Fields along edges, the same for every series of a place: what rendering gets wrong from pixel to pixel."""
+@lru_cache(maxsize=2)
+def _rough_fields(shape: tuple[int, ...], place: str) -> NDArray[np.float32]:
+    """Fields (number, row, column) over the local slope, the same for every series of a place: rendering from pixel to pixel."""
     from zlib import crc32
 
     from scipy.ndimage import gaussian_filter
 
     # fixed fields, not draws: the same scene always has the same ones
     rng = np.random.default_rng(crc32(place.encode()))
-    slope = np.hypot(dy, dx)
-    result = []
+    result = np.empty((scales.ROUGH_FIELDS, *shape), np.float32)
     for number in range(scales.ROUGH_FIELDS):
-        field = gaussian_filter(rng.standard_normal(slope.shape), (0.7, 2.0, 5.0)[number % 3])
-        field /= float(np.std(field))
-        result.append(scales.ROUGH_SHARE / math.sqrt(scales.ROUGH_FIELDS) * slope * field)
+        field = gaussian_filter(rng.standard_normal(shape), (0.7, 2.0, 5.0)[number % 3])
+        result[number] = scales.ROUGH_SHARE / math.sqrt(scales.ROUGH_FIELDS) / float(np.std(field)) * field
     return result
 
 

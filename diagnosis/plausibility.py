@@ -402,6 +402,7 @@ class _Maps:
         self._weights: dict[tuple[object, ...], FloatArray | None] = {}
         self._depths: dict[tuple[object, ...], FloatArray | None] = {}
         self._thickness: dict[str, dict[str, FloatArray]] = {}
+        self._points: dict[str, tuple[FloatArray, NDArray[np.intp]]] = {}
 
     def weights(self, label: _Label) -> FloatArray | None:
         """(3, energy) of a beam, or None where the label does not say enough."""
@@ -460,11 +461,14 @@ class _Maps:
             mu = np.stack([self.model.mu(material)[: weights.shape[1]] for material in maps])
         except InputError:
             return None
-        points = np.stack([image.ravel() for image in maps.values()], axis=1)
-        distinct, place = np.unique(np.round(factor * points, 3), axis=0, return_inverse=True)
+        if scene not in self._points:
+            points = np.stack([image.ravel() for image in maps.values()], axis=1)
+            distinct, place = np.unique(np.round(points, 3), axis=0, return_inverse=True)
+            self._points[scene] = (distinct, place.reshape(-1))
+        distinct, place = self._points[scene]
         share = weights[0] / weights[0].sum()
-        transmission = np.exp(-np.minimum(distinct @ mu, 700.0)) @ share
-        depth = -np.log(np.maximum(transmission, 1e-30))[place.reshape(-1)]
+        transmission = np.exp(-np.minimum(factor * (distinct @ mu), 700.0)) @ share
+        depth = -np.log(np.maximum(transmission, 1e-30))[place]
         return np.asarray(depth.reshape(next(iter(maps.values())).shape), dtype=np.float64)
 
 
@@ -590,12 +594,18 @@ def _scales_of_map(item: _Reading, maps: _Maps) -> list[float]:
     for half in halves:
         if half.sum() < 30:
             continue
-        left = []
-        for log_factor in _LOG_FACTORS:
-            other = maps.depth(item.series.scene, item.label, math.exp(log_factor))
+
+        def left(place: int, half: NDArray[np.bool_] = half) -> float:
+            other = maps.depth(item.series.scene, item.label, math.exp(_LOG_FACTORS[place]))
             # edges lie where they lie: the median of the differences
-            left.append(math.inf if other is None else abs(float(np.median(measured[half] - other[half]))))
-        found.append(_LOG_FACTORS[int(np.argmin(left))])
+            return math.nan if other is None else float(np.median(measured[half] - other[half]))
+
+        # longer paths leave less in every pixel: the factor that leaves nothing is found by halving
+        low, high = 0, len(_LOG_FACTORS) - 1
+        while high - low > 1:
+            middle_one = (low + high) // 2
+            low, high = (middle_one, high) if left(middle_one) > 0 else (low, middle_one)
+        found.append(_LOG_FACTORS[low if abs(left(low)) <= abs(left(high)) else high])
     return found
 
 

@@ -9,7 +9,8 @@ frames, lines, blocks, the common factor, codes, fixed pattern and outliers.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -21,8 +22,8 @@ from .summaries import BLOCK_PX, LAGS, SeriesSummary
 
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
-_NOISE_PIXELS = 65_536  # whose noise is projected at a time
 OUTLIER_SD = 7.0
+_LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
@@ -78,13 +79,6 @@ class ProbeName:
     unit: str
 
 
-def quantum_mean(expected: ExpectedSeries, mask: NDArray[np.bool_]) -> tuple[float, float]:
-    """Quantum and white variance averaged over a mask, DN^2."""
-    return float(np.mean(expected.quantum_variance_DN2[mask])), float(
-        np.mean(np.broadcast_to(expected.white_variance_DN2, mask.shape)[mask])
-    )
-
-
 def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
     """Correlation of the quantum part at a lag; 0 beyond what the model gives."""
     table = expected.noise_autocovariance
@@ -95,16 +89,58 @@ def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
 def correlation_sum(expected: ExpectedSeries, rows: int, columns: int) -> float:
     """Sum of the quantum part's correlations over lags with triangular weights of a rows x columns block."""
     table = expected.noise_autocovariance
-    total = 0.0
-    for r in range(-min(rows, table.shape[0]) + 1, min(rows, table.shape[0])):
-        for c in range(-min(columns, table.shape[1]) + 1, min(columns, table.shape[1])):
-            total += (1 - abs(r) / rows) * (1 - abs(c) / columns) * float(table[abs(r), abs(c)])
-    return total
+    return float(_triangle(rows, table.shape[0]) @ table @ _triangle(columns, table.shape[1]))
+
+
+@lru_cache(maxsize=64)
+def _triangle(length: int, lags: int) -> NDArray[np.float64]:
+    """Weights (lags,) of lags to both sides in the variance of a sum of `length` neighbours, over that of one."""
+    lag = np.arange(lags)
+    return np.asarray(np.where(lag == 0, 1.0, 2.0 * np.maximum(1.0 - lag / length, 0.0)))
 
 
 def _lag_loss(expected: ExpectedSeries) -> float:
     correlation = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
     return 1.0 - float(correlation[0]) if correlation.size else 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Areas:
+    """The good pixels of a frame, those of one label together.
+
+    Fields: order (pixel,): flat indices, those without label first; parts: where each label's lie in it.
+    """
+
+    order: NDArray[np.intp]
+    parts: tuple[slice, ...]
+
+    @staticmethod
+    def of(good: NDArray[np.bool_], labels: NDArray[np.int64], count: int) -> "Areas":
+        """Of good pixels (row, column) and their labels from 0 to `count`; other labels are none."""
+        inside = np.flatnonzero(good)
+        own = labels.ravel()[inside]
+        own = np.where((own >= 0) & (own < count), own, -1)
+        ends = np.searchsorted(np.sort(own), np.arange(count + 1))
+        order = inside[np.argsort(own, kind="stable")]
+        return Areas(order, tuple(slice(int(start), int(stop)) for start, stop in pairwise(ends)))
+
+    def means(self, image: NDArray[np.floating]) -> tuple[float, NDArray[np.float64]]:
+        """Means of a map, (row, column) or (1, 1), over all good pixels and over each label's (label,)."""
+        if image.size == 1:
+            return float(image.flat[0]), np.full(len(self.parts), float(image.flat[0]))
+        values = image.ravel()[self.order]
+        return float(values.mean()), np.array([values[part].mean() for part in self.parts])
+
+    def mean(self, image: NDArray[np.floating] | float) -> float:
+        """Mean of a map over all good pixels."""
+        whole = np.asarray(image)
+        return float(whole.flat[0]) if whole.size == 1 else float(whole.ravel()[self.order].mean())
+
+
+@lru_cache(maxsize=64)
+def _noise_names(label: str) -> tuple[str, tuple[str, ...]]:
+    """Names of a label's variance and of its correlation at each of LAGS."""
+    return f"log_variance {label}", tuple(f"correlation {label} ({dr},{dc})" for dr, dc in LAGS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +150,7 @@ class ScalarContext:
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
     base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise_DN2,
     block_noise_DN2: of the corrected mean frame from pixel to pixel and of block means; quantum_DN2: the base model's quantum
-    variance of one frame; dark_DN: the base model's mean dark.
+    variance of one frame; dark_DN: the base model's mean dark; areas: the good pixels label by label.
     """
 
     kind: str
@@ -130,8 +166,13 @@ class ScalarContext:
     block_noise_DN2: float
     quantum_DN2: float
     dark_DN: float
+    areas: "Areas" = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "areas", Areas.of(self.good, self.labels, len(self.label_names)))
 
 
+@lru_cache(maxsize=64)
 def time_templates(frames: int) -> list[tuple[str, NDArray[np.float64]]]:
     """Orthonormal profiles over frames (n,), each free of the mean: early rise or fall, slow settling, linear trend."""
     if frames < 6:
@@ -161,36 +202,38 @@ def expected_scalars(
     dark_change_DN: what the effects changed in the dark that is subtracted (an afterglow is judged against it).
     """
     values: dict[str, float] = {}
-    good = context.good
-    n_good = int(good.sum())
-    rows, columns = good.shape
+    areas = context.areas
+    n_good = areas.order.size
+    rows, columns = context.good.shape
     keep = _lag_loss(expected)
     row, column = expected.row_variance_DN2, expected.column_variance_DN2
-    mean_q, mean_w = quantum_mean(expected, good)
+    mean_q, label_q = areas.means(expected.quantum_variance_DN2)
+    mean_w, label_w = areas.means(expected.white_variance_DN2)
     moving = _MovingPicture.of(expected, context)
-    total = max(mean_q * keep + mean_w + row + column + moving.pixels(good), _LEAST_DN2)
+    moved = moving.pixels()
+    total = max(mean_q * keep + mean_w + row + column + moved, _LEAST_DN2)
     if context.frames > 2:
+        correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
+        lines = [(row if dr == 0 else 0.0) + (column if dc == 0 else 0.0) for dr, dc in LAGS]
         for label, name in enumerate(context.label_names):
-            mask = good & (context.labels == label)
-            q, w = quantum_mean(expected, mask)
-            shared = moving.pixels(mask)
-            here = q * keep + w + row + column + shared
-            values[f"log_variance {name}"] = math.log(max(here, _LEAST_DN2))
-            for dr, dc in LAGS:
-                covariance = q * keep * autocovariance(expected, dr, dc) + shared
-                covariance += (row if dr == 0 else 0) + (column if dc == 0 else 0)
-                values[f"correlation {name} ({dr},{dc})"] = covariance / max(here, _LEAST_DN2)
+            q, w = float(label_q[label]) * keep, float(label_w[label])
+            shared = moving.pixels(label)
+            here = max(q + w + row + column + shared, _LEAST_DN2)
+            variance_name, correlation_names = _noise_names(name)
+            values[variance_name] = math.log(here)
+            for known, correlation, line in zip(correlation_names, correlations, lines, strict=True):
+                values[known] = (q * correlation + shared + line) / here
         line_q = mean_q * keep
         values["row_ratio"] = math.log(
             max(
-                (row + moving.rows(good)) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w,
+                (row + moving.rows()) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w,
                 1e-12,
             )
             / total
         )
         values["column_ratio"] = math.log(
             max(
-                (column + moving.columns(good)) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w,
+                (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w,
                 1e-12,
             )
             / total
@@ -200,16 +243,16 @@ def expected_scalars(
                 line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
                 + mean_w
                 + BLOCK_PX * (row + column)
-                + BLOCK_PX**2 * moving.pixels(good),
+                + BLOCK_PX**2 * moved,
                 1e-12,
             )
             / total
         )
         temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
-        full = max(mean_q + mean_w + row + column + moving.pixels(good), _LEAST_DN2)
+        full = max(mean_q + mean_w + row + column + moved, _LEAST_DN2)
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
-            values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(good, step)) / full
+            values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
         values["kurtosis"] = 0.0
         if context.kind in ("flat", "object"):
             signal = context.reference_signal_DN
@@ -218,13 +261,13 @@ def expected_scalars(
             values["frame_factor"] = math.log(quantum + (expected.frame_factor_rms * signal) ** 2)
     profiles = time_templates(context.frames)
     if profiles and context.kind != "afterglow":
-        profile = frame_profile(expected, good)
+        profile = frame_profile(expected, areas)
         scale = 1.0 if context.kind == "dark" else 1.0 / context.reference_signal_DN
         for name, template in profiles:
             values[f"trend {name}"] = float(profile @ template) * scale / math.sqrt(context.frames)
     if context.kind == "afterglow" and context.previous_signal_DN:
-        profile = frame_profile(expected, good) + float(
-            np.mean(np.broadcast_to(expected.mean_DN + np.asarray(dark_change_DN), good.shape)[good]) - context.dark_DN
+        profile = frame_profile(expected, areas) + float(
+            areas.mean(expected.mean_DN) + areas.mean(dark_change_DN) - context.dark_DN
         )
         for start, stop in _afterglow_bins(context.frames):
             values[f"afterglow frames {start}-{stop - 1}"] = (
@@ -251,75 +294,78 @@ def expected_scalars(
 class _MovingPicture:
     """What a picture that fades from frame to frame adds to variances, once the frames' common factor is taken out.
 
-    Fields: images (trend, row, column); steps (trend, trend): half of the mean product of changes from one frame to the
+    Fields: products: mean product (trend, trend) of the pictures' pixels, of all good pixels and of each label's; lines: the
+    same of the means of rows and of columns; steps (trend, trend): half of the mean product of changes from one frame to the
     next; courses (trend, frame).
     """
 
-    images: NDArray[np.float64]
+    products: tuple[NDArray[np.float64], ...]
+    lines: tuple[NDArray[np.float64], ...]
     steps: NDArray[np.float64]
     courses: NDArray[np.float64]
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "_MovingPicture":
-        good = context.good
-        shape = np.ones(good.shape)
-        if context.kind in ("flat", "object"):
-            signal = np.broadcast_to(expected.signal_DN, good.shape)
-            shape = signal / max(float(signal[good].mean()), 1e-12)
-        images, courses = [], []
+        good, areas = context.good, context.areas
+        shape = 1.0
+        kept, courses = [], []
+        if expected.trend_DN and context.kind in ("flat", "object"):
+            signal = np.broadcast_to(expected.signal_DN, good.shape).ravel()[areas.order]
+            shape = signal / max(float(signal.mean()), 1e-12)
         for image, course in expected.trend_DN or ():
-            whole = np.broadcast_to(np.asarray(image, dtype=np.float64), good.shape)
-            own = whole - float(whole[good].mean()) * shape
+            whole = np.broadcast_to(np.asarray(image, dtype=np.float64), good.shape).ravel()[areas.order]
+            own = whole - float(whole.mean()) * shape
             profile = np.asarray(course, dtype=np.float64)
             # a hundredth of a DN adds nothing to any variance
-            if profile.size > 1 and float(np.abs(own[good]).max()) * float(np.ptp(profile)) > 0.01:
-                images.append(np.where(good, own, 0.0))
+            if profile.size > 1 and float(np.abs(own).max()) * float(np.ptp(profile)) > 0.01:
+                kept.append(own)
                 courses.append(profile - profile.mean())
-        if not images:
-            return _MovingPicture(np.zeros((0, 1, 1)), np.zeros((0, 0)), np.zeros((0, 1)))
-        profiles = np.stack(courses)
+        if not kept:
+            return _MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)))
+        pixels, profiles = np.stack(kept), np.stack(courses)
+        whole = np.zeros((len(kept), *good.shape))
+        whole.reshape(len(kept), -1)[:, areas.order] = pixels
+        means = [whole.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1) for axis in (2, 1)]
         steps = np.diff(profiles, axis=1)
-        return _MovingPicture(np.stack(images), 0.5 * steps @ steps.T / steps.shape[1], profiles)
+        return _MovingPicture(
+            tuple(_mean_product(pixels[:, part]) for part in (slice(None), *areas.parts)),
+            tuple(_mean_product(one) for one in means),
+            0.5 * steps @ steps.T / steps.shape[1],
+            profiles,
+        )
 
-    def pixels(self, mask: NDArray[np.bool_]) -> float:
-        """Variance of single pixels, DN^2."""
-        if not len(self.images):
+    def pixels(self, label: int | None = None) -> float:
+        """Variance of single pixels, DN^2: of all good ones, or of a label's."""
+        if not self.products:
             return 0.0
-        inside = self.images[:, mask]
-        total: float = float(np.sum(self.steps * (inside @ inside.T)))
-        return total / max(int(inside.shape[1]), 1)
+        return float(np.sum(self.steps * self.products[0 if label is None else 1 + label]))
 
-    def rows(self, good: NDArray[np.bool_]) -> float:
+    def rows(self) -> float:
         """Variance of rows' means, DN^2."""
-        return self._lines(good, 2)
+        return float(np.sum(self.steps * self.lines[0])) if self.lines else 0.0
 
-    def columns(self, good: NDArray[np.bool_]) -> float:
+    def columns(self) -> float:
         """Variance of columns' means, DN^2."""
-        return self._lines(good, 1)
+        return float(np.sum(self.steps * self.lines[1])) if self.lines else 0.0
 
-    def lasting(self, good: NDArray[np.bool_], step: int) -> float:
+    def lasting(self, step: int) -> float:
         """Mean product of a pixel's deviations `step` frames apart, DN^2."""
-        if not len(self.images):
+        if not self.products:
             return 0.0
-        inside = self.images[:, good]
         early, late = self.courses[:, :-step], self.courses[:, step:]
-        total: float = float(np.sum(early @ late.T / early.shape[1] * (inside @ inside.T)))
-        return total / max(int(inside.shape[1]), 1)
-
-    def _lines(self, good: NDArray[np.bool_], axis: int) -> float:
-        if not len(self.images):
-            return 0.0
-        means = self.images.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1)
-        total: float = float(np.sum(self.steps * (means @ means.T)))
-        return total / int(means.shape[1])
+        return float(np.sum(early @ late.T / early.shape[1] * self.products[0]))
 
 
-def frame_profile(expected: ExpectedSeries, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _mean_product(images: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean products (image, image) of images (image, pixel)."""
+    return np.asarray(images @ images.T / max(images.shape[1], 1))
+
+
+def frame_profile(expected: ExpectedSeries, areas: Areas) -> NDArray[np.float64]:
     """Change of the mean over good pixels from frame to frame (n,), DN, mean 0 as the model defines it."""
     profile = np.zeros(expected.frames)
     for image, course in expected.trend_DN or ():
-        mean = float(np.mean(np.broadcast_to(image, good.shape)[good]))
-        profile = profile + mean * np.asarray(course, dtype=np.float64)
+        profile = profile + areas.mean(image) * np.asarray(course, dtype=np.float64)
     return profile
 
 
@@ -345,7 +391,7 @@ def measured_scalars(
     """The scalar probes of measured frames with their standard deviations (sampling and floor together)."""
     result: list[Scalar] = []
     good = context.good
-    n_good = int(good.sum())
+    n_good = context.areas.order.size
     rows, columns = good.shape
     frames = summary.frames
 
@@ -354,7 +400,8 @@ def measured_scalars(
             sd = math.hypot(sampling, FLOORS[floor])
             result.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=sd, sampling_sd=sampling))
 
-    mean_q, mean_w = quantum_mean(base, good)
+    mean_q, label_q = context.areas.means(base.quantum_variance_DN2)
+    mean_w, label_w = context.areas.means(base.white_variance_DN2)
     if frames > 2:
         freedom = 2.0 * (frames - 1) ** 2 / (3.0 * frames - 4.0)
         for label, name in enumerate(context.label_names):
@@ -362,8 +409,7 @@ def measured_scalars(
             pixels = int(summary.label_pixels[label])
             if not variance > 0 or pixels < 16:
                 continue
-            mask = good & (context.labels == label)
-            q, w = quantum_mean(base, mask)
+            q, w = float(label_q[label]), float(label_w[label])
             share = q / max(q + w, 1e-12)
             shared = 1.0 + share**2 * (_squared_correlations(base) - 1.0)
             add(
@@ -520,85 +566,71 @@ class MapProjection:
         tolerance: float = 1e-3,
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
-        from scipy.ndimage import convolve
-
-        self.mask = mask
-        inside = mask.astype(np.float64)
-        total = np.asarray(quantum_DN2 + white_DN2, dtype=np.float64)
-        weight = np.where(mask, 1.0 / np.maximum(total, 1e-30), 0.0)
-        table = np.asarray(autocovariance_table, dtype=np.float64)
-        kernel = np.concatenate([table[:0:-1], table], axis=0)
-        kernel = np.concatenate([kernel[:, :0:-1], kernel], axis=1)
-        chosen: list[Template] = []
-        rows: list[NDArray[np.float64]] = []
-        spread: list[NDArray[np.float64]] = []
-        lower = np.zeros((0, 0))
-        for template in templates:
-            image = np.where(mask, template.image, 0.0).astype(np.float64)
-            norm = math.sqrt(float(np.sum(image**2 * weight)))
-            if not (norm > 0 and math.isfinite(norm)):
-                continue
-            weighted = weight * image / norm
-            part = weighted * np.sqrt(np.maximum(quantum_DN2, 0.0))
-            covered = np.sqrt(np.maximum(quantum_DN2, 0.0)) * convolve(part, kernel, mode="constant")
-            covered = (covered + weighted * white_DN2) * inside
-            own = float(np.sum(weighted * covered))
-            flat = weighted[mask]
-            cross = np.array([float(other @ flat) for other in spread]) if spread else np.zeros(0)
-            if len(cross):
-                from scipy.linalg import solve_triangular
-
-                solved = solve_triangular(lower, cross, lower=True)
-                rest = own - float(solved @ solved)
-            else:
-                solved, rest = cross, own
-            if not rest > tolerance * own:
-                continue
-            size = len(chosen)
-            grown = np.zeros((size + 1, size + 1))
-            grown[:size, :size] = lower
-            grown[size, :size] = solved
-            grown[size, size] = math.sqrt(rest)
-            lower = grown
-            chosen.append(template)
-            rows.append(flat.astype(np.float32))
-            spread.append(covered[mask])
+        self._inside = np.flatnonzero(mask)
+        weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
+        images = np.stack([np.asarray(item.image, dtype=np.float64) for item in templates])
+        images *= np.sqrt(weight)
+        norm = np.sqrt(np.einsum("nrc,nrc->n", images, images))
+        used = np.flatnonzero((norm > _LEAST_NORM) & np.isfinite(norm))
+        weighted = images[used] * (np.sqrt(weight) / norm[used, None, None])
+        root = np.sqrt(np.maximum(quantum_DN2, 0.0))
+        covered = root * _correlated(weighted * root, np.asarray(autocovariance_table, dtype=np.float64))
+        covered += weighted * white_DN2
+        rows = weighted.reshape(len(used), mask.size)[:, self._inside]
+        left = rows @ covered.reshape(len(used), mask.size)[:, self._inside].T
+        own = np.diag(left).copy()
+        chosen: list[int] = []
+        columns: list[NDArray[np.float64]] = []
+        for number in range(len(used)):
+            rest = float(left[number, number])
+            if rest > tolerance * own[number]:
+                chosen.append(number)
+                columns.append(left[number] / math.sqrt(rest))
+                left -= np.outer(columns[-1], columns[-1])
         # the images are not kept: fifty a series would be most of the memory
         self._names = tuple(
-            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit) for item in chosen
+            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
+            for item in (templates[used[number]] for number in chosen)
         )
-        self._lower = lower
-        self._rows = np.stack(rows) if rows else np.zeros((0, int(mask.sum())), np.float32)
+        self._rows = np.zeros((0, self._inside.size), np.float32)
+        if chosen:
+            from scipy.linalg import solve_triangular
+
+            lower = np.tril(np.stack(columns, axis=1)[chosen])
+            self._rows = solve_triangular(lower, rows[chosen], lower=True).astype(np.float32)
 
     def __len__(self) -> int:
         return len(self._names)
 
-    def apply(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Standardised projections (probe,) of a map (row, column), DN."""
-        if not self._names:
-            return np.zeros(0)
-        from scipy.linalg import solve_triangular
-
-        q = (self._rows @ np.asarray(image, dtype=np.float32)[self.mask]).astype(np.float64)
-        return np.asarray(solve_triangular(self._lower, q, lower=True))
+    def apply(self, images: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Standardised projections (..., probe) of maps (..., row, column), DN."""
+        pixels = images.reshape(*images.shape[:-2], -1)[..., self._inside].astype(np.float32, copy=False)
+        return np.asarray(pixels @ self._rows.T, dtype=np.float64)
 
     def pixel_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
         """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
-        if not self._names:
-            return np.zeros(0)
-        from scipy.linalg import solve_triangular
-
-        inverse = solve_triangular(self._lower, np.eye(len(self)), lower=True)
-        variance = np.asarray(sd_DN, dtype=np.float32)[self.mask] ** 2
-        total = np.zeros(len(self))
-        for start in range(0, variance.size, _NOISE_PIXELS):
-            part = slice(start, start + _NOISE_PIXELS)
-            total += (inverse @ self._rows[:, part]) ** 2 @ variance[part]
-        return total
+        variance = np.asarray(sd_DN, dtype=np.float32).ravel()[self._inside] ** 2
+        return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
 
     def names(self) -> list[ProbeName]:
         """One name a probe."""
         return list(self._names)
+
+
+def _correlated(images: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Maps (n, row, column) convolved with the autocovariance of which `table` (lag, lag) is a quarter; 0 outside.
+
+    As a sum of products of a row and a column: a spread that no effect has changed is one such product.
+    """
+    from scipy.ndimage import correlate1d
+
+    across, sizes, along = np.linalg.svd(table)
+    result = np.zeros_like(images)
+    for number in np.flatnonzero(sizes > 1e-12 * sizes[0]):
+        row, column = across[:, number] * sizes[number], along[number]
+        part = correlate1d(images, np.concatenate([row[:0:-1], row]), axis=1, mode="constant")
+        result += correlate1d(part, np.concatenate([column[:0:-1], column]), axis=2, mode="constant")
+    return result
 
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:

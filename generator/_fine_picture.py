@@ -6,7 +6,8 @@ follow the slope of their neighbourhood. Blur, the averaging over the pixel and 
 cosines up to 1.5 cycles a pixel; a picture cut off at half a cycle would ring beside every edge.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -22,15 +23,15 @@ class Borders:
     """Pixels that the border of an object cuts: the signal is shared between the neighbours on either side.
 
     Fields: pixel, thick, thin (n,): flat indices of the pixel and of its most and least attenuating neighbour; covered
-    (n,): share of the pixel behind the thick one; cells (n, 3, 3): the same of each of its cells; sharpness (n,): 1 a
-    step, 0 a slope; any_steps: whether the picture has steps at all, pixels that are cut or not.
+    (n,): share of the pixel behind the thick one; normal (2, n): direction along rows and columns to the thick side, any
+    length; sharpness (n,): 1 a step, 0 a slope; any_steps: whether the picture has steps at all, pixels that are cut or not.
     """
 
     pixel: NDArray[np.intp]
     thick: NDArray[np.intp]
     thin: NDArray[np.intp]
     covered: FloatArray
-    cells: FloatArray
+    normal: FloatArray
     sharpness: FloatArray
     any_steps: bool
 
@@ -60,7 +61,7 @@ def find_borders(depth: FloatArray, *, least_depth: float) -> Borders:
     row, column = np.nonzero(steps)
     if row.size == 0:
         none = np.zeros(0, dtype=np.intp)
-        return Borders(none, none, none, np.zeros(0), np.zeros((0, FINE, FINE)), np.zeros(0), any_steps)
+        return Borders(none, none, none, np.zeros(0), np.zeros((2, 0)), np.zeros(0), any_steps)
     around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     near_row = np.clip(row[:, None] + around[:, 0], 0, rows - 1)
     near_column = np.clip(column[:, None] + around[:, 1], 0, columns - 1)
@@ -80,7 +81,7 @@ def find_borders(depth: FloatArray, *, least_depth: float) -> Borders:
         thick=index[every, most][inside],
         thin=index[every, least][inside],
         covered=covered[inside],
-        cells=cell_coverage(normal_row, normal_column, covered[inside]),
+        normal=np.stack([normal_row, normal_column]),
         sharpness=sharpness[row, column][inside],
         any_steps=any_steps,
     )
@@ -139,13 +140,16 @@ def _least_slope(picture: FloatArray, axis: int) -> FloatArray:
     return np.asarray(np.where(before * after > 0, np.sign(before) * np.minimum(np.abs(before), np.abs(after)), 0.0))
 
 
-def fine_cells(picture: FloatArray, thick: FloatArray, thin: FloatArray, borders: Borders) -> FloatArray:
+def fine_cells(
+    picture: FloatArray, thick: FloatArray, thin: FloatArray, borders: Borders, share: FloatArray
+) -> FloatArray:
     """Cells (3 row, 3 column) of a picture (row, column): mean over a pixel's cells is the pixel.
 
     Args:
         picture: pixel means.
         thick, thin: (n,) values of the plateaus on either side of each border pixel.
         borders: where they are.
+        share: (n, 3, 3) covered share of their cells.
     """
     rows, columns = picture.shape
     place = (np.arange(FINE) - 0.5 * (FINE - 1)) / FINE
@@ -157,7 +161,6 @@ def fine_cells(picture: FloatArray, thick: FloatArray, thin: FloatArray, borders
     )
     if borders.pixel.size:
         row, column = np.divmod(borders.pixel, columns)
-        share = borders.cells
         shared = share * thick[:, None, None] + (1.0 - share) * thin[:, None, None]
         smooth = cells[row, :, column, :]
         cells[row, :, column, :] = smooth + borders.sharpness[:, None, None] * (shared - smooth)
@@ -170,16 +173,39 @@ def pixel_means(cells: FloatArray) -> FloatArray:
     return np.asarray(cells.reshape(rows, FINE, columns, FINE).mean(axis=(1, 3)))
 
 
-def transform_of_cells(cells: FloatArray) -> FloatArray:
+@dataclass(frozen=True, slots=True)
+class FineCells:
+    """Cells (3 row, 3 column) of a picture, and what was made of them.
+
+    drawn: pixels (row, column) by what they were drawn with; filled by those who draw.
+    """
+
+    cells: NDArray[np.floating]
+    drawn: dict[object, NDArray[np.floating]] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def transform(self) -> NDArray[np.floating]:
+        """Cosine transform (3 row, 3 column), the averaging over pixels in it."""
+        if "transform" not in self.drawn:
+            self.drawn["transform"] = transform_of_cells(self.cells).astype(self.cells.dtype, copy=False)
+        return self.drawn["transform"]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that cells and transform take."""
+        return 2 * self.cells.nbytes
+
+
+def transform_of_cells(cells: NDArray[np.floating]) -> FloatArray:
     """Cosine transform (3 row, 3 column) of the cells, the averaging over pixels in it."""
     from scipy.fft import dctn
 
     found = dctn(cells, type=2, axes=(-2, -1))
-    return np.asarray(found * _averaging(cells.shape[0])[:, None] * _averaging(cells.shape[1])[None, :])
+    return np.asarray(found * averaging(cells.shape[0])[:, None] * averaging(cells.shape[1])[None, :])
 
 
 @lru_cache(maxsize=32)
-def _averaging(length: int) -> FloatArray:
+def averaging(length: int) -> FloatArray:
     """What the mean of three neighbouring cells leaves of each cosine (length,)."""
     return np.asarray((1.0 + 2.0 * np.cos(np.pi * np.arange(length) / length)) / FINE)
 
@@ -198,83 +224,36 @@ def kept_cosines(length: int, psf_sigma_px: float, least: float = 1e-5) -> int:
     return int(min(FINE * length, max(np.ceil(2.0 * length * highest), length + 1)))
 
 
-def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float) -> tuple[FloatArray, ...]:
-    """Amplitudes of the cosines, and of the sines where `shift_px` is not 0, of a picture sampled at the pixels.
+@lru_cache(maxsize=16)
+def cosines_at_pixels(length: int, points: int, count: int, shift_px: float) -> FloatArray:
+    """Pixels (length,) from the first `count` amplitudes of a cosine transform over `points`: (length, count).
 
-    A picture moved on by d is cos(w (x - d)) = cos(w x) cos(w d) + sin(w x) sin(w d) for each of its cosines. What no
-    pixel can tell apart (frequencies beyond half a cycle a pixel) is added up.
-
-    Args:
-        transform: cosine transform whose `axis` has `length` amplitudes (pixels), or more, up to three times as many
-            (the first of those over cells).
-        length: pixels along the axis.
-        shift_px: displacement.
-
-    Returns:
-        Amplitudes for `scipy.fft.idct`, and for `idst` after a shift, `length` along the axis.
+    The picture is moved on by `shift_px`, and mirrors at its borders. What no pixel can tell apart (frequencies beyond half
+    a cycle a pixel) adds up.
     """
-    found = np.moveaxis(transform, axis, 0)
-    if shift_px == 0.0:
-        return (np.moveaxis(_fold(found, length, -1.0), 0, axis),)
-    phase = np.pi * shift_px * np.arange(found.shape[0]) / length
-    along = (slice(None), *([None] * (found.ndim - 1)))
-    odd = _fold(found * np.sin(phase)[along], length, 1.0)
-    sines = np.zeros_like(odd)
-    sines[:-1] = odd[1:]
-    if found.shape[0] > length:
-        sines[-1] = 2.0 / FINE * found[length] * np.sin(phase[length])
-    return (
-        np.moveaxis(_fold(found * np.cos(phase)[along], length, -1.0), 0, axis),
-        np.moveaxis(sines, 0, axis),
-    )
-
-
-def _fold(found: FloatArray, length: int, sign: float) -> FloatArray:
-    """Amplitudes 0..length-1 with those above added: 2 length - k with `sign`, 2 length + k taken off."""
-    count = found.shape[0]
-    if count == length:
-        return found
-    result = found[:length] / FINE
-    middle = found[length + 1 : 2 * length + 1] * (sign / FINE)  # k = length + 1 ... stands at 2 length - k
-    result[length - middle.shape[0] :] += middle[::-1]
-    if count > 2 * length:
-        result[: count - 2 * length] -= found[2 * length :] / FINE
-    return result
+    angle = np.pi * np.outer((np.arange(length) + 0.5 - shift_px) / length, np.arange(count))
+    return np.asarray(np.cos(angle) * np.where(np.arange(count) == 0, 0.5, 1.0) / points)
 
 
 def sampled_picture(
-    transforms: list[tuple[FloatArray, FloatArray | None]],
+    transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
     shape: tuple[int, int],
     shift_px: tuple[float, float],
-    along_columns: list[FloatArray | None] | None = None,
 ) -> FloatArray:
     """Pixels (row, column) of the sum of pictures given by their cosine transforms, blurred and displaced.
 
     Args:
-        transforms: (transform over pixels or cells, transfer function of its shape or None) each.
+        transforms: (the first amplitudes of a transform over pixels or cells, transfer function of its shape or None) each.
         shape: rows and columns of the pixels.
         shift_px: displacement along rows and columns.
-        along_columns: a factor (1, columns of the transform) for each transform; it acts after the rows are folded, on a
-            third of the numbers.
     """
-    from scipy.fft import idct, idst
-
-    inverse = (idct, idst)
-    rows: list[list[FloatArray]] = [[], []]
-    for number, (transform, filters) in enumerate(transforms):
-        found = transform if filters is None else transform * filters
-        factor = None if along_columns is None else along_columns[number]
-        for kind, part in enumerate(sampled_terms(found, shape[0], 0, shift_px[0])):
-            rows[kind].append(part if factor is None else part * factor)
     result = np.zeros(shape)
-    for kind, parts in enumerate(rows):
-        if not parts:
-            continue
-        sums: list[FloatArray | None] = [None, None]
-        for part in parts:
-            for other, term in enumerate(sampled_terms(part, shape[1], 1, shift_px[1])):
-                before = sums[other]
-                sums[other] = term if before is None else before + term
-        lines = sum(inverse[other](term, type=2, axis=1) for other, term in enumerate(sums) if term is not None)
-        result += inverse[kind](lines, type=2, axis=0)
+    for transform, filters in transforms:
+        found = transform if filters is None else transform * filters
+        fine = FINE if found.shape[0] > shape[0] else 1  # of cells, more amplitudes are given than there are pixels
+        rows, columns = (
+            cosines_at_pixels(length, fine * length, count, shift)
+            for length, count, shift in zip(shape, found.shape, shift_px, strict=True)
+        )
+        result += rows @ found @ columns.T
     return result

@@ -4,7 +4,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ._fine_picture import (
     Borders,
+    FineCells,
+    cell_coverage,
     find_borders,
     fine_cells,
-    transform_of_cells,
 )
 from .line_state import FinePicture, FloatArray
 from .projection import project_polychromatic
@@ -37,6 +38,7 @@ _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
+_MOST_SPREADS = 16  # that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,7 @@ class _Scene:
     thickness_mm: NDArray[np.float64]  # (material, point): the distinct points where that saves work
     inverse: NDArray[np.intp] | None
     borders: Borders
+    covered_cells: FloatArray  # (border pixel, 3, 3)
     shape: tuple[int, int]
 
 
@@ -87,13 +90,24 @@ class ModelCache:
     budget_bytes: int = _BUDGET_BYTES
     draft: bool = False
     _scenes: "OrderedDict[int, _Scene]" = field(default_factory=OrderedDict)
-    _maps: "OrderedDict[tuple[object, ...], tuple[FloatArray, FloatArray | None]]" = field(default_factory=OrderedDict)
+    _maps: "OrderedDict[tuple[object, ...], tuple[FloatArray, FineCells | None]]" = field(default_factory=OrderedDict)
     _held: int = 0
     _numbers: int = 0
     _levels: dict[tuple[object, ...], tuple[object, float, float, float]] = field(default_factory=dict)
     _spectra: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
     _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
     _lit_held: int = 0
+    _spreads: "OrderedDict[tuple[object, ...], tuple[Twin, dict[object, Any]]]" = field(default_factory=OrderedDict)
+
+    def spread(self, key: tuple[object, ...], twin: Twin) -> dict[object, Any]:
+        """What was kept of a spread of light, the same behind all scenes; filled by those who ask."""
+        found = self._spreads.get(key)
+        if found is None or found[0] is not twin:
+            self._spreads[key] = found = (twin, {})
+            while len(self._spreads) > _MOST_SPREADS:
+                self._spreads.popitem(last=False)
+        self._spreads.move_to_end(key)
+        return found[1]
 
     def lit(self, key: tuple[object, ...]) -> object | None:
         """What was kept of a series up to the spread of light, or None."""
@@ -141,11 +155,11 @@ class ModelCache:
         scene = None
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
-        maps, transform = self.project(key, "signal", weights, model, scene, attenuation_scale)
+        maps, fine = self.project(key, "signal", weights, model, scene, attenuation_scale)
         signal = signal_scale * maps[0]
         picture = None
-        if transform is not None and twin.noise.psf_model == "aperture":
-            picture = FinePicture(transform=transform, scale=signal_scale, signal_DN=signal)
+        if fine is not None and twin.noise.psf_model == "aperture":
+            picture = FinePicture(fine=fine, scale=signal_scale, signal_DN=signal)
         return BeamProjection(
             model=model,
             weights=weights,
@@ -310,13 +324,15 @@ class ModelCache:
             if distinct.shape[1] < 0.7 * points.shape[1]:
                 points, inverse = distinct.astype(np.float64), where.reshape(-1)
         self._numbers += 1
+        borders = find_borders(depth, least_depth=_BORDER_DEPTH)
         scene = _Scene(
             thickness_mm,
             self._numbers,
             materials,
             points,
             inverse,
-            find_borders(depth, least_depth=_BORDER_DEPTH),
+            borders,
+            cell_coverage(*borders.normal, borders.covered),
             shape,
         )
         self._scenes[number] = scene
@@ -332,12 +348,12 @@ class ModelCache:
         model: SpectralModel,
         scene: _Scene | None,
         attenuation_scale: Mapping[str, float],
-    ) -> tuple[FloatArray, FloatArray | None]:
+    ) -> tuple[FloatArray, FineCells | None]:
         """Weights (k, energy) behind a scene, kept under key and name.
 
         Returns:
-            Maps (k, row, column), or (k, 1, 1) in the open field; and the cosine transform over cells of the first one
-            where the scene has steps and the name is `signal`, else None.
+            Maps (k, row, column), or (k, 1, 1) in the open field; and the cells of the first one where the scene has steps
+            and the name is `signal`, else None.
         """
         if scene is None:
             return np.asarray(weights.sum(axis=1)[:, None, None]), None
@@ -351,7 +367,7 @@ class ModelCache:
         flat = project_polychromatic(scene.thickness_mm, mu, weights).astype(np.float64)
         if scene.inverse is not None:
             flat = flat[:, scene.inverse]
-        result = _with_borders(flat, scene, transformed=name == "signal")
+        result = _with_borders(flat, scene, fine=name == "signal")
         self._maps[whole] = result
         self._held += _bytes(result)
         while self._held > self.budget_bytes and len(self._maps) > 1:
@@ -359,11 +375,11 @@ class ModelCache:
         return result
 
 
-def _bytes(kept: tuple[FloatArray, FloatArray | None]) -> int:
+def _bytes(kept: tuple[FloatArray, FineCells | None]) -> int:
     return kept[0].nbytes + (0 if kept[1] is None else kept[1].nbytes)
 
 
-def _with_borders(flat: FloatArray, scene: _Scene, *, transformed: bool) -> tuple[FloatArray, FloatArray | None]:
+def _with_borders(flat: FloatArray, scene: _Scene, *, fine: bool) -> tuple[FloatArray, FineCells | None]:
     """Maps (k, row, column) of what was projected pixel by pixel (k, pixel), with the pixels that borders cut shared."""
     borders = scene.borders
     thick, thin = flat[:, borders.thick], flat[:, borders.thin]
@@ -371,12 +387,10 @@ def _with_borders(flat: FloatArray, scene: _Scene, *, transformed: bool) -> tupl
         shared = borders.covered * thick + (1.0 - borders.covered) * thin
         flat[:, borders.pixel] += borders.sharpness * (shared - flat[:, borders.pixel])
     maps = flat.reshape(len(flat), *scene.shape)
-    if not (transformed and borders.any_steps):
+    if not (fine and borders.any_steps):
         return maps, None
-    transform = transform_of_cells(fine_cells(maps[0], thick[0], thin[0], borders))
-    if transform.size > _SINGLE_PRECISION_CELLS:
-        transform = transform.astype(np.float32)
-    return maps, transform
+    cells = fine_cells(maps[0], thick[0], thin[0], borders, scene.covered_cells)
+    return maps, FineCells(cells.astype(np.float32) if cells.size > _SINGLE_PRECISION_CELLS else cells)
 
 
 def _no_level(request: "SeriesRequest") -> InputError:

@@ -1,13 +1,14 @@
 """Blur and noise correlation of one series: transfer functions on cosine transforms, whose borders mirror."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ._fine_picture import fine_frequencies, kept_cosines, sampled_picture
+from ._fine_picture import averaging, cosines_at_pixels, fine_frequencies, kept_cosines, sampled_picture
 from .line_state import FloatArray, LineState
 from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
 
@@ -155,11 +156,17 @@ def _frequencies(length: int) -> NDArray[np.float64]:
     return np.arange(length) / (2.0 * length)
 
 
-@lru_cache(maxsize=32)
-def _base_filters(shape: tuple[int, int], psf_model: str, psf_sigma_px: float) -> tuple[FloatArray, FloatArray]:
-    f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
-    picture = base_transfer_1d(psf_model, psf_sigma_px, f_row) * base_transfer_1d(psf_model, psf_sigma_px, f_column)
-    return picture, _base_pattern(psf_model, psf_sigma_px).squared_transfer(f_row, f_column)
+@lru_cache(maxsize=8)
+def _drawing(
+    length: int, points: int, kept: int, psf_model: str, psf_sigma_px: float, shift_px: float
+) -> NDArray[np.float64]:
+    """What the calibrated spread and a displacement make of pixels or cells along one axis: (length, points)."""
+    order = np.arange(kept)
+    transfer = base_transfer_1d(psf_model, psf_sigma_px, order / (2.0 * length))
+    if points > length:
+        transfer = transfer * averaging(points)[:kept]
+    cosines = 2.0 * np.cos(np.pi / points * np.outer(order, np.arange(points) + 0.5))
+    return np.asarray((cosines_at_pixels(length, points, kept, shift_px) * transfer) @ cosines)
 
 
 def _object_transfer(state: LineState, f_row: FloatArray, f_column: FloatArray) -> FloatArray | None:
@@ -179,51 +186,68 @@ def spread_maps(
     psf_model: str,
     psf_sigma_px: float,
     draft: bool = False,
+    known: dict[object, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Picture after all blur (DN), and quantum variance after blur of the object and spread of the quanta (DN^2).
 
     draft: a third of the work for pictures that are compared with each other: the variance is not blurred (it is right
-    away from edges), and cosines that the spread leaves below 1e-3 are left out.
+    away from edges), and cosines that the spread leaves below 1e-3 are left out. known: transfer functions of earlier
+    calls with the same blur and spread.
     """
     if signal_DN.shape == (1, 1):
         return signal_DN, pattern.share * variance_DN2
     shape = (signal_DN.shape[0], signal_DN.shape[1])
-    f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
-    if state.tails or state.optical_transfers or state.power_transfers:
-        picture = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
-        power = pattern.squared_transfer(f_row, f_column)
-    else:
-        picture, power = _base_filters(shape, psf_model, psf_sigma_px)
-    blur = _object_transfer(state, f_row, f_column)
-    if blur is not None:
-        picture, power = picture * blur, power * blur
     from scipy.fft import dctn
 
-    signals: list[tuple[FloatArray, FloatArray | None]] = []
-    along_columns: list[FloatArray | None] = []
-    if state.picture is not None:
-        # a tail holds a share of light that reaches further up than the calibrated spread
-        kept = [kept_cosines(length, 0.0 if state.tails else psf_sigma_px, 1e-3 if draft else 1e-5) for length in shape]
-        fine = fine_frequencies(shape[0])[: kept[0], None], fine_frequencies(shape[1])[None, : kept[1]]
-        sharp = state.picture.transform[: kept[0], : kept[1]]
-        blur = _object_transfer(state, *fine)
-        if state.tails or state.optical_transfers:
-            whole = optical_transfer(state, psf_model, psf_sigma_px, *fine) * state.picture.scale
-            signals.append((sharp, whole if blur is None else whole * blur))
-            along_columns.append(None)
-        else:
-            rows, columns = (base_transfer_1d(psf_model, psf_sigma_px, frequency) for frequency in fine)
-            rows = rows * state.picture.scale
-            signals.append((sharp, rows if blur is None else rows * blur))
-            along_columns.append(columns)
-    if state.picture is None or signal_DN is not state.picture.signal_DN:
-        rest = signal_DN if state.picture is None else signal_DN - state.picture.signal_DN
-        signals.append((dctn(rest, type=2), picture))
-        along_columns.append(None)
-    blurred = sampled_picture(signals, shape, state.shift_px, along_columns)
+    fine = state.picture
+    # a tail holds a share of light that reaches further up than the calibrated spread
+    kept = [kept_cosines(length, 0.0 if state.tails else psf_sigma_px, 1e-3 if draft else 1e-5) for length in shape]
+    rest = signal_DN if fine is None else None if signal_DN is fine.signal_DN else signal_DN - fine.signal_DN
+    blurred = np.zeros(shape)
+    if not (state.object_transfers or state.tails or state.optical_transfers):
+
+        def drawn(picture: NDArray[np.floating], counts: Sequence[int]) -> FloatArray:
+            rows, columns = (
+                _drawing(length, points, count, psf_model, psf_sigma_px, shift)
+                for length, points, count, shift in zip(shape, picture.shape, counts, state.shift_px, strict=True)
+            )
+            return np.asarray(rows @ picture @ columns.T)
+
+        if fine is not None:
+            key = (psf_model, psf_sigma_px, state.shift_px, *kept)
+            if key not in fine.fine.drawn:
+                fine.fine.drawn[key] = drawn(fine.fine.cells, kept)
+            blurred = fine.scale * fine.fine.drawn[key]
+        if rest is not None:
+            blurred = blurred + drawn(rest, shape)
+    else:
+        transfers: dict[object, FloatArray] = {} if known is None else known
+
+        def transfer(counts: Sequence[int]) -> FloatArray:
+            key = (shape, *counts)
+            if key not in transfers:
+                frequency = [fine_frequencies(length)[:count] for length, count in zip(shape, counts, strict=True)]
+                f_row, f_column = frequency[0][:, None], frequency[1][None, :]
+                whole = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
+                blur = _object_transfer(state, f_row, f_column)
+                transfers[key] = whole if blur is None else whole * blur
+            return transfers[key]
+
+        pictures: list[tuple[NDArray[np.floating], FloatArray]] = []
+        if fine is not None:
+            sharp = fine.scale * fine.fine.transform[: kept[0], : kept[1]]
+            pictures.append((sharp, transfer(kept)))
+        if rest is not None:
+            pictures.append((dctn(rest, type=2), transfer(shape)))
+        blurred = sampled_picture(pictures, shape, state.shift_px)
     if draft:
         return blurred, pattern.share * variance_DN2
-    spread = sampled_picture([(dctn(variance_DN2, type=2), power)], shape, state.shift_px)
+    f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
+    power = pattern.squared_transfer(f_row, f_column)
+    blur = _object_transfer(state, f_row, f_column)
+    spread = sampled_picture(
+        [(dctn(variance_DN2, type=2), power if blur is None else power * blur)], shape, state.shift_px
+    )
     return blurred, np.maximum(spread, 0.0)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from ._fine_picture import pixel_means, transform_of_cells
+from ._fine_picture import FineCells, pixel_means
 from ._spread import NoisePattern, base_transfer_1d, blurred_object, noise_pattern, optical_transfer, spread_maps
 from .effects import AppliedEffect, effect_of, in_order
 from .flat_change import ABSORBED
@@ -246,9 +246,7 @@ class ImageEffects:
             attenuation_scale=self.attenuation_scale(tuple(thickness_mm)),
         )
         if self.twin.noise.psf_model == "aperture":
-            state = replace(
-                state, picture=FinePicture(transform=transform_of_cells(cells), scale=level, signal_DN=means)
-            )
+            state = replace(state, picture=FinePicture(fine=FineCells(cells), scale=level, signal_DN=means))
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
         state = self._through(state, later, thickness_mm)
         if focal_blur_px > 0 and all(item.id != "focal_spot" for item in self.effects):

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from ._fine_picture import FineCells
     from .series import SeriesRequest
     from .spectral_signal import SpectralModel
     from .twin import Twin
@@ -66,12 +67,12 @@ class FixedPattern:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinePicture:
-    """A picture with sharp borders: cosine transform over cells finer than pixels, see `_fine_picture`.
+    """A picture with sharp borders: cells finer than pixels, see `_fine_picture`.
 
-    Fields: transform (3 row, 3 column); scale: DN a unit of it; signal_DN (row, column): its pixel means.
+    Fields: fine; scale: DN a unit of it; signal_DN (row, column): its pixel means.
     """
 
-    transform: FloatArray
+    fine: "FineCells"
     scale: float
     signal_DN: FloatArray
 

@@ -12,6 +12,7 @@ s g V. Light that leaves the field is replaced by as much that enters: borders m
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,8 @@ __all__ = [
 KINDS = ("dark", "flat", "object", "afterglow")
 _LAGS = 3
 _BEFORE_EXPOSURE = frozenset(("beam", "arrivals", "object_blur", "quanta", "optics"))
-_OF_THE_LIGHT = (
+# what a series is called and when it was taken does not change the light
+_OF_THE_SPREAD = (
     "kind",
     "exposure_ms",
     "source_object_mm",
@@ -47,11 +49,8 @@ _OF_THE_LIGHT = (
     "belt_speed_mm_s",
     "belt_axis",
     "panel_rotation_deg",
-    "open_signal_DN",
-    "product_material",
-    "scene_kind",
-    "displacement_px",
 )
+_OF_THE_LIGHT = (*_OF_THE_SPREAD, "open_signal_DN", "product_material", "scene_kind", "displacement_px")
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
 
@@ -331,15 +330,17 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
                 received=f"shape {values.shape}",
                 expected=f"{twin.spectral.best.shape}: one value for each of {', '.join(twin.spectral.names)}",
             )
-    key = (
+    of_the_line = (
         id(twin),
+        None if values is None else values.tobytes(),
+        tuple((item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early),
+    )
+    key = (
+        *of_the_line,
         id(request.thickness_mm),
         request.setting,
-        None if values is None else values.tobytes(),
         choice.use_measured_level,
-        # what a series is called and when it was taken does not change the light
         tuple(getattr(request, name) for name in _OF_THE_LIGHT),
-        tuple((item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early),
     )
     kept = cache.lit(key)
     if isinstance(kept, _Lit) and kept.twin is twin and kept.thickness_mm is request.thickness_mm:
@@ -379,7 +380,17 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
         for applied, effect, numbers in early:
             if effect.stage != "beam":
                 state = effect.change(state, numbers, _context(twin, request, applied, projection))
-    charge = _charge(twin, request, state, draft=cache.draft)
+    # light spreads alike behind all scenes
+    spread = cache.spread(
+        (
+            *of_the_line,
+            None if request.setting is None else (request.setting.kV, request.setting.filters),
+            bool(request.thickness_mm),
+            tuple(getattr(request, name) for name in _OF_THE_SPREAD),
+        ),
+        twin,
+    )
+    charge = _charge(twin, request, state, spread, draft=cache.draft)
     lit = _Lit(twin, request.thickness_mm, state, projection, charge)
     cache.keep_lit(key, lit, sum(item.nbytes for item in (charge.mean, charge.correlated, charge.white)))
     return lit, late
@@ -400,9 +411,14 @@ def _quanta(state: LineState) -> LineState:
     return replace(state, variance_DN2=state.variance_DN2 - white)
 
 
-def _charge(twin: Twin, request: SeriesRequest, state: LineState, *, draft: bool = False) -> _Charge:
+def _charge(
+    twin: Twin, request: SeriesRequest, state: LineState, spread: dict[object, Any], *, draft: bool = False
+) -> _Charge:
+    """Light spread over the pixels; `spread` holds what earlier series of the same beam and spread have left."""
     shape, relative = _illumination(twin, request)
-    pattern = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
+    if "pattern" not in spread:
+        spread["pattern"] = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
+    pattern: NoisePattern = spread["pattern"]
     if not request.beam_on:
         nothing = np.zeros(twin.maps.shape)
         return _Charge(state, nothing, nothing, nothing, shape, relative, pattern)
@@ -415,6 +431,7 @@ def _charge(twin: Twin, request: SeriesRequest, state: LineState, *, draft: bool
         psf_model=twin.noise.psf_model,
         psf_sigma_px=twin.noise.psf_sigma_px.value,
         draft=draft,
+        known=spread.setdefault("transfers", {}),
     )
     lit = shape * state.flat_factor
     scale = lit * relative

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.diagnosis.probes import _MovingPicture
+from raytwin.diagnosis.probes import Areas, _MovingPicture
 from raytwin.diagnosis.registration import Placement, register, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series
 from raytwin.errors import InputError
@@ -171,7 +171,20 @@ def test_a_picture_that_fades_adds_to_variances_what_it_says():
         trend_DN=[(image, course - course.mean()) for image, course in zip(pictures, courses, strict=True)],
         signal_DN=np.ones((1, 1)),
     )
-    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, kind="dark"))
-    assert moving.pixels(good) == pytest.approx(float(found.label_variance_DN2[0]), rel=1e-4)
-    assert moving.rows(good) == pytest.approx(found.row_variance_DN2, rel=1e-4)
-    assert moving.columns(good) == pytest.approx(found.column_variance_DN2, rel=1e-4)
+    areas = Areas.of(good, np.zeros((rows, columns), np.int64), 1)
+    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, areas=areas, kind="dark"))
+    assert moving.pixels() == moving.pixels(0)
+    assert moving.pixels() == pytest.approx(float(found.label_variance_DN2[0]), rel=1e-4)
+    assert moving.rows() == pytest.approx(found.row_variance_DN2, rel=1e-4)
+    assert moving.columns() == pytest.approx(found.column_variance_DN2, rel=1e-4)
+
+
+def test_means_over_areas_are_those_over_their_masks():
+    rng = np.random.default_rng(12)
+    image, good = rng.standard_normal((20, 30)), rng.random((20, 30)) > 0.1
+    labels = rng.integers(-1, 3, (20, 30))
+    areas = Areas.of(good, labels, 3)
+    whole, own = areas.means(image)
+    assert whole == pytest.approx(float(image[good].mean()), rel=1e-12)
+    assert own == pytest.approx([float(image[good & (labels == label)].mean()) for label in range(3)], rel=1e-12)
+    assert areas.means(np.full((1, 1), 4.0))[0] == areas.mean(4.0) == 4.0

@@ -32,6 +32,7 @@ _BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a p
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
 
 
+@lru_cache(maxsize=8)
 def _block_means(length: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """(block mean (cell, pixel), linear interpolation back (pixel, cell), pixels a cell) along one axis."""
     cells = min(_COARSE, length)
@@ -53,35 +54,43 @@ def _block_means(length: int) -> tuple[NDArray[np.float64], NDArray[np.float64],
 @lru_cache(maxsize=64)
 def _kernel_transform(
     shape: tuple[int, int], cell_mm: tuple[float, float], half_height_mm: float
-) -> tuple[NDArray[np.complex128], float]:
-    """FFT of the kernel on the doubled coarse grid, and what an evenly scattering field gives at its centre."""
+) -> NDArray[np.complex128]:
+    """FFT of the kernel on the doubled coarse grid, half of it (even in both directions)."""
     rows, columns = 2 * shape[0], 2 * shape[1]
-    row = np.asarray(np.fft.fftfreq(rows, 1.0 / rows) * cell_mm[0], dtype=np.float64)
-    column = np.asarray(np.fft.fftfreq(columns, 1.0 / columns) * cell_mm[1], dtype=np.float64)
-
-    # exact integral over each cell, from the solid angle of a rectangle
-    def corner(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        h = half_height_mm
-        return np.asarray(np.arctan2(y * x, h * np.sqrt(h**2 + y**2 + x**2)) / (2.0 * np.pi))
-
-    y, x = row[:, None], column[None, :]
+    y = np.asarray(np.fft.fftfreq(rows, 1.0 / rows) * cell_mm[0], dtype=np.float64)[:, None]
+    x = np.asarray(np.fft.fftfreq(columns, 1.0 / columns) * cell_mm[1], dtype=np.float64)[None, :]
     up, left = cell_mm[0] / 2, cell_mm[1] / 2
-    kernel = corner(y + up, x + left) - corner(y - up, x + left) - corner(y + up, x - left) + corner(y - up, x - left)
-    y0, x0 = shape[0] * up, shape[1] * left
-    centre = 4.0 * float(corner(np.array(y0), np.array(x0)))
-    return np.fft.fft2(kernel), centre
+    kernel = sum(
+        sign_y * sign_x * _corner(y + sign_y * up, x + sign_x * left, half_height_mm)
+        for sign_y in (1.0, -1.0)
+        for sign_x in (1.0, -1.0)
+    )
+    return np.fft.rfft2(kernel)
 
 
-def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) -> tuple[NDArray[np.float64], float]:
-    """Maps (k, row, column) spread by the kernel, and the share that the centre of an even field gets."""
+def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) -> NDArray[np.float64]:
+    """Maps (k, row, column) spread by the kernel."""
     row_mean, row_back, row_step = _block_means(field.shape[-2])
     column_mean, column_back, column_step = _block_means(field.shape[-1])
     coarse = row_mean @ field @ column_mean.T
     shape = (coarse.shape[-2], coarse.shape[-1])
-    transform, centre = _kernel_transform(shape, (row_step * pitch_mm, column_step * pitch_mm), half_height_mm)
-    wide = np.fft.fft2(coarse, s=(2 * shape[0], 2 * shape[1]), axes=(-2, -1)) * transform
-    spread = np.fft.ifft2(wide, axes=(-2, -1)).real[..., : shape[0], : shape[1]]
-    return row_back @ spread @ column_back.T, centre
+    transform = _kernel_transform(shape, (row_step * pitch_mm, column_step * pitch_mm), half_height_mm)
+    doubled = (2 * shape[0], 2 * shape[1])
+    wide = np.fft.rfft2(coarse, s=doubled, axes=(-2, -1)) * transform
+    spread = np.fft.irfft2(wide, s=doubled, axes=(-2, -1))[..., : shape[0], : shape[1]]
+    return np.asarray(row_back @ spread @ column_back.T)
+
+
+def _corner(y_mm: NDArray[np.float64], x_mm: NDArray[np.float64], half_height_mm: float) -> NDArray[np.float64]:
+    """Integral of the kernel over a rectangle from its centre to (y, x): the solid angle, over 2 pi."""
+    h = half_height_mm
+    return np.asarray(np.arctan2(y_mm * x_mm, h * np.sqrt(h**2 + y_mm**2 + x_mm**2)) / (2.0 * np.pi))
+
+
+def _share_at_centre(shape: tuple[int, ...], pitch_mm: float, half_height_mm: float) -> float:
+    """What the centre of an evenly scattering field gets."""
+    y, x = (np.array(0.5 * length * pitch_mm) for length in shape)
+    return 4.0 * float(_corner(y, x, half_height_mm))
 
 
 def _mean_energy_keV(context: LineContext) -> float:
@@ -152,8 +161,8 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     source = depth if own == 0 else depth * (1.0 + own * (_scattering_share(context, energy_keV) - 1.0))
     field = np.stack([signal * source, np.broadcast_to(state.variance_DN2, shape) * source])
     field = _shared_at_borders(field, signal, depth)
-    scattered, _ = _spread(field, pitch, half_height)
-    _, centre = _spread(field[:1], pitch, at_usual_gap)
+    scattered = _spread(field, pitch, half_height)
+    centre = _share_at_centre(context.shape, pitch, at_usual_gap)
     weights = context.weights[0]
     top = weights.size
     water = context.model.mu("water_liquid")[:top]

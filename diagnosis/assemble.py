@@ -24,6 +24,7 @@ from ..generator.twin import Twin
 from . import changes as scales
 from .changes import TwinChange, Variant, smooth_twin, twin_changes
 from .inference import Curve
+from .output_course import OutputCourse
 from .probes import (
     OUTLIER_SD,
     MapProjection,
@@ -36,6 +37,7 @@ from .probes import (
     expected_scalars,
     measured_scalars,
     smooth_templates,
+    time_templates,
     transmission_templates,
 )
 from .registration import LARGEST_PX, Placement, gradient, register, render_variance
@@ -127,14 +129,12 @@ class Problem:
 
     def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""
-        # what an effect does by chance depends on its onset: lost bits lower later levels only
-        like = {(item.effect, item.since): item for item in reversed(self.curves)}
-        curves = [
-            variant.curve(
-                responses, like[variant.effect, variant.since].spread, like[variant.effect, variant.since].jitter
-            )
-            for variant, responses in more
-        ]
+        curves = []
+        for variant, responses in more:
+            # what an effect does by chance depends on its onset (lost bits lower later levels only), and may on the rest
+            alike = [item for item in self.curves if (item.effect, item.since) == (variant.effect, variant.since)]
+            like = next((item for item in alike if item.parameters == variant.parameters), alike[0])
+            curves.append(variant.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact))
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
         )
@@ -458,6 +458,7 @@ def build_problem(
     mean_signal: dict[str, float] = {}
     for item in kept:
         mean_signal[item.name] = float(np.mean(np.broadcast_to(expected[item.name].signal_DN, shape)[clean]))
+    counting = _counting_series(kept)
     for position, item in enumerate(kept):
         model = expected[item.name]
         before = next(
@@ -485,6 +486,7 @@ def build_problem(
             block_noise_DN2=block_noise,
             quantum_DN2=float(np.mean(np.broadcast_to(model.quantum_variance_DN2, shape)[clean])),
             dark_DN=float(np.mean(np.broadcast_to(model.dark_DN, shape)[clean])),
+            counts_all_outliers=item.name == counting,
         )
         base_scalars[item.name] = expected_scalars(model, contexts[item.name])
 
@@ -633,6 +635,7 @@ def build_problem(
             fixed_pattern_DN2=pattern_DN2,
             block_pattern_DN2=block_DN2,
             outliers=outliers,
+            all_outliers=int(np.count_nonzero(outlying)),
         )
         scalar_probes = [probe for probe in scalar_probes if probe.name in base_scalars[item.name]]
         if lies is not None and item.name in first_of_place:
@@ -987,6 +990,12 @@ def _new_outliers(
     return outlying if outlying.sum() < 0.1 * good.sum() else np.zeros(shape, dtype=bool)
 
 
+def _counting_series(kept: Sequence[SessionSeries]) -> str:
+    """The later series that pixels standing out anywhere are counted with; empty where dead or hot ones cannot show."""
+    later = [item for item in kept if not item.calibrates and item.series.kind in ("dark", "flat")]
+    return later[-1].name if {item.series.kind for item in later} == {"dark", "flat"} else ""
+
+
 def _half_difference(item: SessionSeries, summary: SeriesSummary) -> float:
     """Scatter of the mean frame as repeats show it, over what differences of frames predict (1 = noise only)."""
     if summary.frames < 4:
@@ -1097,8 +1106,11 @@ def _pattern_of_gain(
     rest = np.zeros(len(projection) + n_scalars)
     if item.calibrates or item.series.kind not in ("flat", "object"):
         return smooth, rest
-    share = scales.PATTERN_SMOOTH_SHARE / len(waves)
-    amounts = [0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave for wave in waves.values()]
+    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
+    amounts = []
+    for numbers, wave in waves.items():
+        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
+        amounts.append(0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave)
     smooth[: len(projection)] = projection.apply(np.stack(amounts) * signal).T
     rest[: len(projection)] = projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
     return smooth * shrink[:, None], rest * shrink**2
@@ -1315,11 +1327,14 @@ def _join(
         if not float(np.max(np.abs(block_responses))) > 1e-3:
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
-        spread = _spread(variant, blocks, starts, len(residual), rows[0])
+        spread = _spread(variant, blocks, starts, len(residual), rows[0], base.instrument.readout_ms)
         jitter = None
         if variant.effect == "gain_map_error":
             jitter = np.concatenate([block["pattern_jitter"] for block in blocks])
-        curves.append(variant.curve(block_responses, spread, jitter))
+        exact = None
+        if variant.effect in scales.DEFINED_BY:
+            exact = np.array([name.statistic == scales.DEFINED_BY[variant.effect] for name in names])
+        curves.append(variant.curve(block_responses, spread=spread, jitter=jitter, exact=exact))
         chosen.append(variant)
     for curve in curves:
         missing.pop(curve.effect, None)
@@ -1369,7 +1384,12 @@ def _join(
 
 
 def _spread(
-    variant: Variant, blocks: Sequence[dict[str, Any]], starts: NDArray[np.intp], size: int, row: int
+    variant: Variant,
+    blocks: Sequence[dict[str, Any]],
+    starts: NDArray[np.intp],
+    size: int,
+    row: int,
+    readout_ms: float | None,
 ) -> NDArray[np.float64] | None:
     """Random responses (probe, factor) a unit of strength.
 
@@ -1389,23 +1409,35 @@ def _spread(
         return np.concatenate([block["pattern"] for block in blocks])
     if variant.effect != "output_drift":
         return None
+    lit = [number for number, block in enumerate(blocks) if block["item"].series.kind in ("flat", "object")]
+    if not lit:
+        return None
+    wanders = OutputCourse(variant.parameters["correlation_s"], variant.parameters["jitter_share"])
     columns = []
-    for number, block in enumerate(blocks):
-        series = block["item"].series
-        if series.kind not in ("flat", "object"):
-            continue
+    means = wanders.means([blocks[number]["item"].request for number in lit], readout_ms)
+    for shares in means.T:
         level = np.zeros(size)
-        level[starts[number] : starts[number + 1]] = block["local"][f"level of {series.name}"] * (
-            0.007 / scales.LEVEL_OF_SERIES_SD
-        )
+        for number, share in zip(lit, shares, strict=True):
+            block = blocks[number]
+            column = block["local"][f"level of {block['item'].series.name}"]
+            level[starts[number] : starts[number + 1]] = column * (0.01 * share / scales.LEVEL_OF_SERIES_SD)
         columns.append(level)
+    for number in lit:
+        block = blocks[number]
+        request = block["item"].request
+        profiles = dict(time_templates(request.frames))
         for index, name in enumerate(block["names"]):
-            if name.statistic.startswith("trend") or name.statistic == "frame_factor":
-                column = np.zeros(size)
-                amount = 0.005 if name.statistic.startswith("trend") else 0.5
-                column[starts[number] + index] = amount / block["sd"][index]
-                columns.append(column)
-    return np.stack(columns, axis=1) if columns else None
+            if name.statistic.startswith("trend"):
+                along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
+                amount = 0.01 * along / math.sqrt(request.frames)
+            elif name.statistic == "frame_factor":
+                amount = 0.5
+            else:
+                continue
+            column = np.zeros(size)
+            column[starts[number] + index] = amount / block["sd"][index]
+            columns.append(column)
+    return np.stack(columns, axis=1)
 
 
 def _thicker(

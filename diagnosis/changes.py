@@ -44,6 +44,7 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
         *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
         *({"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)),
     ],
+    "output_drift": [{"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)],
     "veiling_glare": [{"length_mm": 2.1}, {"length_mm": 9.5}],
     "mtf_tail": [{"reach_px": 0.84}, {"reach_px": 2.4}],
     "k_fluorescence": [{"range_mm": 0.15}, {"range_mm": 0.33}],
@@ -54,6 +55,18 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
         {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
     ],
 }
+# probes that a strength is defined by: there no law can be far off
+DEFINED_BY: Mapping[str, str] = {
+    "gain_map_error": "fixed_pattern",
+    "image_lag": "afterglow frames 0-0",
+    "quantisation": "codes",
+    "bad_pixels": "outliers in any series",
+}
+MEASURED_OUTRIGHT = frozenset(
+    ("quantisation", "bad_pixels", "image_lag")
+)  # by that probe alone, whatever the law's shape
+# what these do by chance hangs on their inner parameters: they stay those of the grid
+KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(
     (
         "mtf_tail",
@@ -96,7 +109,7 @@ KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
 UNEVEN = frozenset(("dark_drift", "heel"))
 UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
 CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
-PATTERN_WAVES = 4  # cosine waves along each side of a gain map's smooth change
+PATTERN_WAVES = 8  # cosine waves along each side of a gain map's smooth change, the long ones the larger
 PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
 DARK_SD_DN = 0.05  # of the dark between series
 
@@ -122,10 +135,12 @@ class Variant:
     def curve(
         self,
         responses: NDArray[np.float64],
+        *,
         spread: NDArray[np.float64] | None = None,
         jitter: NDArray[np.float64] | None = None,
+        exact: NDArray[np.bool_] | None = None,
     ) -> Curve:
-        """The curve through responses (strength, probe) at this variant's strengths; spread, jitter as in `Curve`."""
+        """The curve through responses (strength, probe) at this variant's strengths; spread, jitter, exact as in `Curve`."""
         return Curve(
             effect=self.effect,
             variant=self.name,
@@ -137,6 +152,7 @@ class Variant:
             since=self.since,
             spread=spread,
             jitter=jitter,
+            exact=exact,
         )
 
     def applied(self, strength: float) -> AppliedEffect:

@@ -14,7 +14,7 @@ from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
-from .changes import catalogue_variants
+from .changes import MEASURED_OUTRIGHT, catalogue_variants
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
 from .plan import best_repeat, repeat_text
 from .plausibility import Suspect
@@ -28,6 +28,7 @@ POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest e
 _WORST_PLACES = 30
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 _STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
+_DEFINED_STRENGTH_SD = 0.06  # where a probe of the session measures what the strength means
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
@@ -296,7 +297,7 @@ def judge(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
-                strength=_with_law_error(best.strengths[effect]),
+                strength=_with_law_error(best.strengths[effect], curve),
                 unit=EFFECTS[effect].strength.unit,
                 parameters=dict(curve.parameters),
                 sign=variant.sign,
@@ -358,10 +359,12 @@ def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     return with_conditions(variant.applied(strength), problem.conditions)
 
 
-def _with_law_error(strength: tuple[float, float, float]) -> tuple[float, float, float]:
+def _with_law_error(strength: tuple[float, float, float], curve: Curve) -> tuple[float, float, float]:
     """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength."""
     value, low, high = strength
-    below, above = (math.hypot(math.log(one / value), 1.96 * _STRENGTH_LAW_SD) for one in (low, high))
+    defined = curve.effect in MEASURED_OUTRIGHT and curve.exact is not None and bool(curve.exact.any())
+    sd = _DEFINED_STRENGTH_SD if defined else _STRENGTH_LAW_SD
+    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
     return value, value * math.exp(-below), value * math.exp(above)
 
 
@@ -570,6 +573,7 @@ def _strengths_on(
                 responses=curve.responses[:, fit],
                 spread=None,
                 jitter=None if curve.jitter is None else curve.jitter[fit],
+                exact=None if curve.exact is None else curve.exact[fit],
             )
             result = fit_curve((problem.residual - others)[fit], part, inner, problem.groups[fit])
             strengths[effect] = result.best

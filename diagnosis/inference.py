@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 # relative errors of an effect's law and how probable each is: real effects follow the catalogue's laws more or less well
 LAW_ERRORS: tuple[tuple[float, float], ...] = ((0.10, 0.7), (0.30, 0.3))
 LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
+EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
@@ -66,7 +67,8 @@ class Curve:
     strength); low, high: plausible range of the strength; strengths (node,) > 0 ascending; responses (node, probe): m_e at
     the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
     that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
-    strength squared that it gives each probe by itself (a gain map that changed pixel by pixel).
+    strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
+    the strength is defined by, in which no law can be far off.
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -81,6 +83,7 @@ class Curve:
     since: str = "always"
     spread: NDArray[np.float64] | None = None
     jitter: NDArray[np.float64] | None = None
+    exact: NDArray[np.bool_] | None = None
 
     def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights (strength, node) with which the nodes' responses add up at given strengths."""
@@ -225,10 +228,6 @@ class CurveFit:
         """Strength of the highest likelihood."""
         return float(self.strengths[int(np.argmax(self.log_likelihood))])
 
-    def interval(self) -> tuple[float, float, float]:
-        """Posterior mean of the logarithm and 95 % bounds, as strengths."""
-        return _interval(self.strengths, self.log_likelihood)
-
 
 def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
     """Nodes with a finer set about `best`, 6 relative widths to each side."""
@@ -245,6 +244,18 @@ def _log_integral(
     x, y = np.log(strengths[inside]), log_likelihood[inside]
     top = float(y.max())
     return top + math.log(max(float(np.trapezoid(np.exp(y - top), x)), 1e-300) / (x[-1] - x[0]))
+
+
+def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
+    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence."""
+    top = max(fit.log_evidence for fit in fits)
+    likely = [fit for fit in fits if fit.log_evidence > top - 12.0]
+    nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
+    total = np.full(len(nodes), -np.inf)
+    for fit in likely:
+        value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood)
+        total = np.logaddexp(total, value)
+    return _interval(nodes, total)
 
 
 def _interval(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -335,6 +346,8 @@ def _law_factors(
 ) -> NDArray[np.float64]:
     """What is random about an effect at a strength (probe, factor): its law's inaccuracy, and its own spread."""
     parts = []
+    if curve.exact is not None:
+        response = np.where(curve.exact, 0.0, response)
     if float(np.max(np.abs(response), initial=0.0)) * law_error >= 0.3:
         parts.append(_group_factors(response, groups, law_error))
     if curve.spread is not None and float(np.max(np.abs(curve.spread))) * strength >= 0.3:
@@ -346,7 +359,10 @@ def _own_variance(
     curve: Curve, strength: float, effective: NDArray[np.float64], law_error: float
 ) -> NDArray[np.float64]:
     """Variance (probe,) that an effect gives each probe by itself: by its law's relative error, and by chance."""
-    own = (LAW_PROBE_SHARE * law_error * effective) ** 2
+    share: float | NDArray[np.float64] = LAW_PROBE_SHARE * law_error
+    if curve.exact is not None:
+        share = np.where(curve.exact, EXACT_LAW_ERROR, share)
+    own = (share * effective) ** 2
     return np.asarray(own if curve.jitter is None else own + strength**2 * curve.jitter)
 
 
@@ -499,7 +515,7 @@ def weigh_hypotheses(
                 (effect,),
                 evidence,
                 math.log(priors.single / n_effects),
-                {effect: best.interval()},
+                {effect: interval_of(group_fits)},
                 {effect: best.curve},
                 "",
             )

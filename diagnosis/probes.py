@@ -23,6 +23,7 @@ from .summaries import BLOCK_PX, LAGS, SeriesSummary
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
 OUTLIER_SD = 7.0
+PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
@@ -41,8 +42,8 @@ FLOORS: Mapping[str, float] = {
     "dark_trend_DN": 0.02,
     "afterglow": 2e-5,
     "codes": 0.03,
-    "fixed_pattern": 0.05,
-    "fixed_pattern blocks": 1.0,  # a pattern's grain is its own: white in the model, coarser in some panels
+    "fixed_pattern": 0.025,  # of the value, as for its blocks
+    "fixed_pattern blocks": 0.5,  # a pattern's grain is its own: white in the model, coarser in some panels
     "outliers": 0.3,
 }
 
@@ -150,7 +151,9 @@ class ScalarContext:
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
     base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise_DN2,
     block_noise_DN2: of the corrected mean frame from pixel to pixel and of block means; quantum_DN2: the base model's quantum
-    variance of one frame; dark_DN: the base model's mean dark; areas: the good pixels label by label.
+    variance of one frame; dark_DN: the base model's mean dark;
+    counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere;
+    areas: the good pixels label by label.
     """
 
     kind: str
@@ -166,6 +169,7 @@ class ScalarContext:
     block_noise_DN2: float
     quantum_DN2: float
     dark_DN: float
+    counts_all_outliers: bool
     areas: "Areas" = field(init=False)
 
     def __post_init__(self) -> None:
@@ -258,7 +262,9 @@ def expected_scalars(
             signal = context.reference_signal_DN
             quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / n_good
             quantum += row / rows + column / columns
-            values["frame_factor"] = math.log(quantum + (expected.frame_factor_rms * signal) ** 2)
+            # seen in steps from frame to frame
+            steps = 1.0 - float(expected.frame_factor_correlation[1])
+            values["frame_factor"] = math.log(quantum + steps * (expected.frame_factor_rms * signal) ** 2)
     profiles = time_templates(context.frames)
     if profiles and context.kind != "afterglow":
         profile = frame_profile(expected, areas)
@@ -274,19 +280,24 @@ def expected_scalars(
                 float(profile[start:stop].mean()) / context.previous_signal_DN
             )
     if context.codes_usable:
-        values["codes"] = math.log(max(expected.quantisation_step_DN, 1.0))
+        values["codes"] = max(expected.quantisation_step_DN, 1.0)
     if not context.calibrates and context.kind in ("flat", "dark"):
         signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
-        pattern = expected.fixed_pattern_rms**2 * signal2
+        pattern = PATTERN_PIXEL_SHARE * expected.fixed_pattern_rms**2 * signal2
         # more quanta's noise in the frames is more of it in their mean
         added = (mean_q - context.quantum_DN2) / context.frames
         neighbours = 1.0 - autocovariance(expected, 0, 1)
         lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
-        values["fixed_pattern"] = math.log(max(1.0 + (pattern + added * neighbours) / context.pattern_noise_DN2, 1e-3))
-        values["fixed_pattern blocks"] = math.log(
+        values["fixed_pattern"] = math.sqrt(max(1.0 + (pattern + added * neighbours) / context.pattern_noise_DN2, 1e-3))
+        values["fixed_pattern blocks"] = math.sqrt(
             max(1.0 + (pattern + lasting) / BLOCK_PX**2 / context.block_noise_DN2, 1e-3)
         )
-        values["outliers"] = math.sqrt(0.7 * expected.bad_pixel_share * n_good + 0.375)
+        # about half of the hot ones are lost in a flat's light
+        hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
+        seen = hot if context.kind == "dark" else bad - 0.5 * hot
+        values["outliers"] = math.sqrt(seen * n_good + 0.375)
+        if context.counts_all_outliers:
+            values["outliers in any series"] = math.sqrt(bad * n_good + 0.375)
     return values
 
 
@@ -387,8 +398,12 @@ def measured_scalars(
     fixed_pattern_DN2: float | None,
     block_pattern_DN2: float | None,
     outliers: int | None,
+    all_outliers: int,
 ) -> list[Scalar]:
-    """The scalar probes of measured frames with their standard deviations (sampling and floor together)."""
+    """The scalar probes of measured frames with their standard deviations (sampling and floor together).
+
+    outliers, all_outliers: pixels that stand out in this series, and in any.
+    """
     result: list[Scalar] = []
     good = context.good
     n_good = context.areas.order.size
@@ -513,34 +528,28 @@ def measured_scalars(
                 "afterglow",
             )
     if context.codes_usable and summary.distinct_codes > 1:
-        add(
-            "tails",
-            "codes",
-            "1",
-            math.log((summary.code_range - 1) / (summary.distinct_codes - 1)),
-            0.0,
-            "codes",
+        step_DN = (summary.code_range - 1) / (summary.distinct_codes - 1)
+        codes = Scalar(
+            axis="tails", name="codes", unit="DN", value=step_DN, sd=FLOORS["codes"] * step_DN, sampling_sd=0.0
         )
+        result.append(codes)
     if fixed_pattern_DN2 is not None and not context.calibrates:
-        add(
-            "position",
-            "fixed_pattern",
-            "1",
-            math.log(max(fixed_pattern_DN2, 1e-12) / context.pattern_noise_DN2),
-            math.sqrt(3.0 / n_good),
-            "fixed_pattern",
-        )
-        if block_pattern_DN2 is not None:
-            add(
-                "position",
-                "fixed_pattern blocks",
-                "1",
-                math.log(max(block_pattern_DN2, 1e-12) / context.block_noise_DN2),
-                math.sqrt(3.0 * BLOCK_PX**2 / n_good),
-                "fixed_pattern blocks",
-            )
+        # in units of the noise: a pattern's rms, which is what a strength means
+        for name, variance, noise, freedom in (
+            ("fixed_pattern", fixed_pattern_DN2, context.pattern_noise_DN2, n_good),
+            ("fixed_pattern blocks", block_pattern_DN2, context.block_noise_DN2, n_good / BLOCK_PX**2),
+        ):
+            if variance is not None:
+                value = math.sqrt(max(variance, 1e-12) / noise)
+                sampling = value * math.sqrt(0.75 / freedom)
+                sd = value * math.hypot(math.sqrt(0.75 / freedom), FLOORS[name])
+                pattern = Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling)
+                result.append(pattern)
     if outliers is not None and not context.calibrates:
         add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
+        if context.counts_all_outliers:
+            counted = math.sqrt(all_outliers + 0.375)
+            add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")
     return result
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
 from ..generator.effects.effect import Parameter
-from .changes import Variant
+from .changes import KEPT_AS_THEY_ARE, Variant
 from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
@@ -108,15 +108,21 @@ def _refined(
             strengths=tuple(share * strength for share in shares),
         )
 
+    def curve_of(item: Variant, responses: NDArray[np.float64]) -> Curve:
+        like = fit.curve
+        return item.curve(whitener.apply(responses), spread=like.spread, jitter=like.jitter, exact=like.exact)
+
     def tried(item: Variant) -> CurveFit | None:
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fit_curve(
-            residual, item.curve(whitener.apply(answer[0]), fit.curve.spread, fit.curve.jitter), nuisances, groups
-        )
+        return fit_curve(residual, curve_of(item, answer[0]), nuisances, groups)
 
-    inner = [item for item in EFFECTS[variant.effect].parameters[1:] if item.fitted and item.name in variant.parameters]
+    inner = [
+        item
+        for item in EFFECTS[variant.effect].parameters[1:]
+        if item.fitted and item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
+    ]
     here = tried(near(best.parameters, (1.0,)))
     if here is None:
         return None
@@ -141,7 +147,7 @@ def _refined(
         if 0 not in answer:
             return None
         # a response that saturates is known near its nodes only: they are laid where the strength turns out to be
-        curve = final.curve(whitener.apply(answer[0]), fit.curve.spread, fit.curve.jitter)
+        curve = curve_of(final, answer[0])
         found = min(max(fit_curve(residual, curve, nuisances, groups).best, variant.low), variant.high)
         if abs(math.log(found / strength)) < _CENTRED:
             break

@@ -362,7 +362,8 @@ class ImageEffects:
         interval_s = (self.setting.exposure_ms + (self.twin.instrument.readout_ms or 0.0)) / 1000.0
         lag = np.arange(1, averaged)
         rho = np.exp(-lag * interval_s / max(state.output_correlation_s, 1e-12))
-        share = float((1.0 + 2.0 * np.sum((1.0 - lag / averaged) * rho)) / averaged)
+        wandering = 1.0 - state.output_jitter_share
+        share = float((1.0 + 2.0 * wandering * np.sum((1.0 - lag / averaged) * rho)) / averaged)
         return max(1.0 + math.sqrt(share) * state.output_rms * float(rng.standard_normal()), 0.0)
 
     def _counts(

@@ -96,14 +96,16 @@ class LineState:
         tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
         power_transfers: factors on the noise power that are not the square of a transfer function.
         flat_factor: change of the illumination against the calibrated flat, map or (1, 1).
-        output_rms, output_correlation_s: common random factor of each frame, its rms and correlation time.
+        output_rms, output_correlation_s, output_jitter_share: common random factor of each exposure, its rms, correlation
+            time, and the share of its variance that is new in every exposure.
         lag: traps, or None.
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
         gain_pattern: fixed pattern of the gain that calibration does not know.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
         row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
         step_DN: of the ADC; 0: none.
-        bad_share: share of pixels that calibration does not know to be bad; bad_seed draws them.
+        bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
+            rest being dead; bad_seed draws them.
     """
 
     parameters: FloatArray | None
@@ -121,6 +123,7 @@ class LineState:
     flat_factor: FloatArray
     output_rms: float = 0.0
     output_correlation_s: float = 0.0
+    output_jitter_share: float = 0.0
     lag: LagLaw | None = None
     bend_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
@@ -129,6 +132,7 @@ class LineState:
     column_variance_DN2: float = 0.0
     step_DN: float = 0.0
     bad_share: float = 0.0
+    bad_hot_share: float = 0.5
     bad_seed: int = 0
 
 

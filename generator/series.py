@@ -175,7 +175,7 @@ class ExpectedSeries:
         frame_factor_correlation: (frames,) its correlation over 0, 1, 2... frames.
         temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
         quantisation_step_DN: of the stored numbers, before averaging; 0: none.
-        bad_pixel_share: pixels beyond the known bad ones.
+        bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
         fixed_pattern_rms: relative, of a gain pattern that no map knows.
         saturated_share: share of pixels whose mean lies at the end of the ADC's range.
         frames: in the series.
@@ -195,6 +195,7 @@ class ExpectedSeries:
     temporal_correlation: FloatArray
     quantisation_step_DN: float
     bad_pixel_share: float
+    hot_pixel_share: float
     fixed_pattern_rms: float
     saturated_share: float
     frames: int
@@ -623,6 +624,9 @@ def expected_series(
             mean = np.minimum(mean, highest)
     lags = np.arange(request.frames) * interval * averaged
     correlation = np.exp(-lags / max(state.output_correlation_s, 1e-12))
+    wandering = (1.0 - state.output_jitter_share) * _mean_of_correlated(interval, state.output_correlation_s, averaged)
+    output = wandering + state.output_jitter_share / averaged
+    correlation[1:] *= wandering / output
     return ExpectedSeries(
         mean_DN=mean,
         dark_DN=dark,
@@ -633,14 +637,12 @@ def expected_series(
         noise_autocovariance=charge.pattern.autocovariance,
         row_variance_DN2=state.row_variance_DN2 / averaged,
         column_variance_DN2=state.column_variance_DN2 / averaged,
-        frame_factor_rms=state.output_rms
-        * math.sqrt(_mean_of_correlated(interval, state.output_correlation_s, averaged))
-        if request.beam_on
-        else 0.0,
+        frame_factor_rms=state.output_rms * math.sqrt(output) if request.beam_on else 0.0,
         frame_factor_correlation=correlation,
         temporal_correlation=covariance[1:] / covariance[0],
         quantisation_step_DN=state.step_DN,
         bad_pixel_share=state.bad_share,
+        hot_pixel_share=state.bad_share * state.bad_hot_share,
         fixed_pattern_rms=0.0 if state.gain_pattern is None or not request.beam_on else state.gain_pattern.rms,
         saturated_share=saturated,
         frames=request.frames,
@@ -668,7 +670,7 @@ class _BadPixels:
 
 
 def _new_bad_pixels(state: LineState, shape: tuple[int, int]) -> _BadPixels | None:
-    """Half of them dead, half hot, a third of all in clusters of 2 x 2 and short lines."""
+    """Dead and hot ones, a third of all in clusters of 2 x 2 and short lines."""
     if state.bad_share <= 0:
         return None
     rng = np.random.default_rng([0xBAD, state.bad_seed])
@@ -680,7 +682,7 @@ def _new_bad_pixels(state: LineState, shape: tuple[int, int]) -> _BadPixels | No
         row, column = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
         kind = rng.random()
         height, width = (2, 2) if kind < 1 / 12 and left >= 4 else (1, 8) if kind < 0.125 and left >= 8 else (1, 1)
-        target = dead if rng.random() < 0.5 else hot
+        target = dead if rng.random() >= state.bad_hot_share else hot
         target[row : row + height, column : column + width] = True
     return _BadPixels(dead=dead, hot=hot & ~dead)
 
@@ -749,7 +751,10 @@ def sample_series(
                 if state.output_rms > 0:
                     carried.output_error = _next_error(carried, now, state, rng)
                     carried.output_time_s = now
-                    factor = max(1.0 + carried.output_error, 0.0)
+                    error = carried.output_error
+                    if state.output_jitter_share > 0:
+                        error += math.sqrt(state.output_jitter_share) * state.output_rms * float(rng.standard_normal())
+                    factor = max(1.0 + error, 0.0)
                 value = factor * charge.mean + math.sqrt(factor) * noise
             if trapped is not None:
                 released = (1.0 - decay) * trapped
@@ -782,7 +787,7 @@ def sample_series(
 
 def _next_error(memory: LineMemory, now_s: float, state: LineState, rng: np.random.Generator) -> float:
     """The next value of the output's AR(1) process."""
-    draw = float(rng.standard_normal())
+    draw = math.sqrt(1.0 - state.output_jitter_share) * float(rng.standard_normal())
     if memory.output_error is None:
         return state.output_rms * draw
     rho = math.exp(-max(now_s - memory.output_time_s, 0.0) / max(state.output_correlation_s, 1e-12))

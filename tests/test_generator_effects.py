@@ -921,3 +921,36 @@ def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(ser
         )
         known = share * found.noise_autocovariance[lag]
         assert abs(seen - known) < 4 * math.sqrt(max(known, 1e-6) / count), lag
+
+
+def test_a_share_of_an_output_s_drift_may_be_new_in_every_exposure(series_line):
+    effect = applied("output_drift", 2.0, correlation_s=0.1, jitter_share=0.4)
+    found = expect(series_line, request(frames=400), effect)
+    assert found.frame_factor_rms == pytest.approx(0.02)
+    assert found.frame_factor_correlation[1] == pytest.approx(0.6 * math.exp(-0.022 / 0.1))
+    averaged = expect(series_line, request(setting=f"{MEASURED},averaged=1000", frame_interval_ms=22000.0), effect)
+    variance = 0.02**2 * (0.6 * 2 * 0.1 / 22.0 + 0.4 / 1000)
+    assert averaged.frame_factor_rms == pytest.approx(math.sqrt(variance), rel=0.02)
+    frames = sample_series(series_line, request(frames=400), rng=np.random.default_rng(3), effects=effect, cache=CACHE)
+    factor = np.array([float(np.mean(frame - found.dark_DN) / np.mean(found.signal_DN)) for frame in frames])
+    steps = np.diff(factor)
+    # a first-order process and white noise: 400 frames leave some 7 % of the steps' variance open
+    assert np.mean(steps**2) / 2 == pytest.approx(0.02**2 * (1 - found.frame_factor_correlation[1]), rel=0.3)
+
+
+def test_hot_pixels_are_their_share_of_the_bad_ones(series_line):
+    effect = applied("bad_pixels", 2.0, hot_share=0.25)
+    found = expect(series_line, request("dark", setting=None), effect)
+    assert found.hot_pixel_share == pytest.approx(0.25 * found.bad_pixel_share)
+    frames = np.stack(
+        list(
+            sample_series(
+                series_line, request("dark", setting=None, frames=20), rng=np.random.default_rng(5), effects=effect
+            )
+        )
+    )
+    noise = np.sqrt(np.asarray(found.white_variance_DN2))
+    hot = float(np.mean(np.abs(frames.mean(axis=0) - found.mean_DN) > 6 * noise / math.sqrt(20)))
+    size = float(np.prod(SHAPE))
+    # lines of eight come and go together
+    assert abs(hot - found.hot_pixel_share) < 4 * math.sqrt(8 * found.hot_pixel_share / size)

@@ -2,7 +2,8 @@
 
 dark drift    + s (t_exposure / t_longest) (g(time) - g(time of calibration)),
               g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w)), T the session's length
-output drift  x (1 + e_n), e_n of standard deviation s with correlation exp(-|dt| / tau), the same for all pixels
+output drift  x (1 + e_n), e_n of standard deviation s, a share j of its variance new in every exposure, the rest with
+              correlation exp(-|dt| / tau); the same for all pixels
 """
 
 import math
@@ -91,7 +92,12 @@ DARK_DRIFT = Effect(
 
 
 def _drift_output(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    return replace(state, output_rms=parameters["strength"] / 100.0, output_correlation_s=parameters["correlation_s"])
+    return replace(
+        state,
+        output_rms=parameters["strength"] / 100.0,
+        output_correlation_s=parameters["correlation_s"],
+        output_jitter_share=parameters["jitter_share"],
+    )
 
 
 OUTPUT_DRIFT = Effect(
@@ -116,9 +122,18 @@ OUTPUT_DRIFT = Effect(
             source="from frame to frame (short) to a trend over the session (long)",
             log=True,
         ),
+        Parameter(
+            name="jitter_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="share of the variance that is new in every exposure: ripple beside what wanders",
+            log=False,
+        ),
     ),
     stage="exposure",
-    reference="AR(1) process sampled at the frames",
+    reference="AR(1) process and white noise sampled at the frames",
     after_calibration=False,
     change=_drift_output,
 )

@@ -81,7 +81,12 @@ def _spoil_pixels(state: LineState, parameters: Mapping[str, float], context: Li
     # those that calibration saw are in its map
     if parameters["strength"] == 0 or context.since == "always":
         return state
-    return replace(state, bad_share=parameters["strength"] / 100.0, bad_seed=int(parameters["pattern_seed"]))
+    return replace(
+        state,
+        bad_share=parameters["strength"] / 100.0,
+        bad_hot_share=parameters["hot_share"],
+        bad_seed=int(parameters["pattern_seed"]),
+    )
 
 
 BAD_PIXELS = Effect(
@@ -96,6 +101,15 @@ BAD_PIXELS = Effect(
             default=0.2,
             source="share of the pixels; acceptance limits of flat panels are 0.1-1 %",
             log=True,
+        ),
+        Parameter(
+            name="hot_share",
+            unit="",
+            low=0.1,
+            high=0.9,
+            default=0.5,
+            source="of them, pixels that show without beam; the rest are dead",
+            log=False,
         ),
         Parameter(
             name="pattern_seed",

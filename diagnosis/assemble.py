@@ -51,6 +51,9 @@ _LABEL_PIXELS = 150  # that a noise label needs
 _UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
 _GAIN_MAP_MODES = 3  # cosines along each side
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+_KNOW_WHEN = frozenset(
+    ("heel", "bad_pixels", "gain_map_error")
+)  # effects that look otherwise where calibration has seen them
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
     "veiling_glare": "sharpness",
@@ -262,12 +265,11 @@ def build_problem(
             skipped.append(f"{series.name}: {reason}")
         else:
             usable.append(item)
-    caches: dict[int, ModelCache] = {}
+    cache = ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
 
     def expect(request: SeriesRequest, change: _Change, unchanged: ExpectedSeries | None = None) -> ExpectedSeries:
         if unchanged is not None and not _touches(change, request):
             return unchanged
-        cache = caches.setdefault(id(change.twin), ModelCache(draft=True, budget_bytes=_CACHE_BYTES))
         return expected_series(
             change.twin,
             request,
@@ -526,8 +528,16 @@ def build_problem(
             taken = taken + np.float32(shares[item.name]) * (lit / _compact(signal_map, 1.0))
         return _Absorbed(own, own_scalars, dark_change, taken)
 
-    def move(item: SessionSeries, change: _Change, taken: _Absorbed) -> tuple[Map, dict[str, float]] | None:
-        """What a change does to the corrected mean frame of a series, DN, and its scalar probes; None: it cannot be asked."""
+    def move(
+        item: SessionSeries,
+        change: _Change,
+        taken: _Absorbed,
+        known: dict[object, tuple[ExpectedSeries, Map, dict[str, float]]],
+    ) -> tuple[Map, dict[str, float]] | None:
+        """What a change does to the corrected mean frame of a series, DN, and its scalar probes; None: it cannot be asked.
+
+        known: what other changes do to this series' frames, by what they are whenever they began.
+        """
         if change.failed:
             return None
         model = expected[item.name]
@@ -536,20 +546,23 @@ def build_problem(
         if item.calibrates:
             moved, values = taken.mean_DN[item.name], taken.scalars[item.name]
         else:
-            try:
-                changed = expect(item.request, change, model)
-            except InputError as error:
-                change.failed = str(error)
-                return None
-            if changed is model:
-                moved = nowhere
+            own = _whenever_it_began(change, item.request)
+            if own in known:
+                changed, moved, values = known[own]
             else:
-                moved = _compact(
-                    np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), max(mean_signal[item.name], 1.0)
-                )
-            if changed is model and not (kind == "afterglow" and bool(np.any(dark_shift))):
-                values = base_scalars[item.name]
-            else:
+                try:
+                    changed = expect(item.request, change, model)
+                except InputError as error:
+                    change.failed = str(error)
+                    return None
+                moved, values = nowhere, base_scalars[item.name]
+                if changed is not model:
+                    scale = max(mean_signal[item.name], 1.0)
+                    moved = _compact(np.asarray(changed.mean_DN) - np.asarray(model.mean_DN), scale)
+                    values = expected_scalars(changed, contexts[item.name])
+                if own is not None:
+                    known[own] = changed, moved, values
+            if kind == "afterglow" and bool(np.any(dark_shift)):
                 values = expected_scalars(changed, contexts[item.name], dark_change_DN=-dark_shift)
         moved = moved - dark_shift
         if item.name in placements and _only_displaces(change):
@@ -567,7 +580,6 @@ def build_problem(
 
     # 2. series by series: templates, projections, responses
     thicker_scenes: dict[tuple[str, str], dict[str, NDArray[np.floating]]] = {}
-    thicker_cache = ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
     blocks: list[dict[str, Any]] = []
     views: list[SeriesView] = []
     for item in kept:
@@ -576,9 +588,10 @@ def build_problem(
         signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float64), shape)
         kind = item.series.kind
         maps: list[Map | None] = []
+        known: dict[object, tuple[ExpectedSeries, Map, dict[str, float]]] = {}
         scalars: list[dict[str, float] | None] = []
         for change, taken in zip(all_changes, taken_in, strict=True):
-            found = move(item, change, taken)
+            found = move(item, change, taken, known)
             maps.append(None if found is None else found[0])
             scalars.append(None if found is None else found[1])
         residual_map = corrected[item.name] - signal
@@ -668,7 +681,7 @@ def build_problem(
                 base,
                 replace(item.request, thickness_mm=scene),
                 effects=(),
-                cache=thicker_cache,
+                cache=cache,
                 use_measured_level=False,
             )
             thicker[material] = (
@@ -706,7 +719,7 @@ def build_problem(
                 taken = absorb(change)
                 parts = []
                 for item, block in zip(kept, blocks, strict=True):
-                    found = move(item, change, taken)
+                    found = move(item, change, taken, {})
                     if found is not None:
                         parts.append(_standardised(block, base_scalars[item.name], [found[0]], [found[1]], shape)[0])
                 if not change.failed:
@@ -758,6 +771,16 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
             change = change - view.signal_DN * taken
         result.append(np.asarray(change, dtype=np.float32))
     return result
+
+
+def _whenever_it_began(change: _Change, request: SeriesRequest) -> object | None:
+    """What stands for a change of a series that the same effect, begun at another time, would make as well; None: only itself."""
+    if len(change.effects) != 1 or change.effects[0].id in _KNOW_WHEN or not _touches(change, request):
+        return None
+    effect = change.effects[0]
+    if effect.since == "always" and any(not item.after_calibration for item in request.previous):
+        return None  # what was exposed before calibration ended remembers when it began
+    return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
 
 
 def _touches(change: _Change, request: SeriesRequest) -> bool:
@@ -1064,15 +1087,11 @@ def _block(
     # a panel seldom warms evenly, and no anode's heel is a straight line
     rows, columns = shape
     ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
-    block["uneven"] = {
-        index: np.pad(
-            projection.apply(np.stack([np.broadcast_to(image * ramp, shape) for ramp in ramps])),
-            ((0, 0), (0, len(scalar_probes))),
-        )
-        * shrink
-        for index, image in enumerate(maps)
-        if index in uneven and image is not None
-    }
+    some = [(index, image) for index, image in enumerate(maps) if index in uneven and image is not None]
+    both = np.stack([np.broadcast_to(image * ramp, shape) for _, image in some for ramp in ramps]) if some else None
+    found = np.zeros((0, len(names))) if both is None else projection.apply(both)
+    found = np.pad(found, ((0, 0), (0, len(names) - found.shape[1]))) * shrink
+    block["uneven"] = {index: found[2 * place : 2 * place + 2] for place, (index, _) in enumerate(some)}
     return block
 
 

@@ -318,7 +318,7 @@ class _MovingPicture:
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "_MovingPicture":
         good, areas = context.good, context.areas
-        shape = 1.0
+        shape: NDArray[np.float64] | float = 1.0
         kept, courses = [], []
         if expected.trend_DN and context.kind in ("flat", "object"):
             signal = np.broadcast_to(expected.signal_DN, good.shape).ravel()[areas.order]
@@ -535,12 +535,12 @@ def measured_scalars(
         result.append(codes)
     if fixed_pattern_DN2 is not None and not context.calibrates:
         # in units of the noise: a pattern's rms, which is what a strength means
-        for name, variance, noise, freedom in (
+        for name, pattern_DN2, noise, freedom in (
             ("fixed_pattern", fixed_pattern_DN2, context.pattern_noise_DN2, n_good),
             ("fixed_pattern blocks", block_pattern_DN2, context.block_noise_DN2, n_good / BLOCK_PX**2),
         ):
-            if variance is not None:
-                value = math.sqrt(max(variance, 1e-12) / noise)
+            if pattern_DN2 is not None:
+                value = math.sqrt(max(pattern_DN2, 1e-12) / noise)
                 sampling = value * math.sqrt(0.75 / freedom)
                 sd = value * math.hypot(math.sqrt(0.75 / freedom), FLOORS[name])
                 pattern = Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling)
@@ -577,16 +577,21 @@ class MapProjection:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
         self._inside = np.flatnonzero(mask)
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
-        images = np.stack([np.asarray(item.image, dtype=np.float64) for item in templates])
-        images *= np.sqrt(weight)
-        norm = np.sqrt(np.einsum("nrc,nrc->n", images, images))
-        used = np.flatnonzero((norm > _LEAST_NORM) & np.isfinite(norm))
-        weighted = images[used] * (np.sqrt(weight) / norm[used, None, None])
-        root = np.sqrt(np.maximum(quantum_DN2, 0.0))
-        covered = root * _correlated(weighted * root, np.asarray(autocovariance_table, dtype=np.float64))
-        covered += weighted * white_DN2
-        rows = weighted.reshape(len(used), mask.size)[:, self._inside]
-        left = rows @ covered.reshape(len(used), mask.size)[:, self._inside].T
+        sharper, root = np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0))
+        correlated = _Correlation(mask.shape, np.asarray(autocovariance_table, dtype=np.float64))
+        used: list[Template] = []
+        rows, spread = (np.empty((len(templates), self._inside.size)) for _ in range(2))
+        for template in templates:
+            image = template.image * sharper
+            norm = math.sqrt(float(np.vdot(image, image)))
+            if not (norm > _LEAST_NORM and math.isfinite(norm)):
+                continue
+            image *= sharper / norm
+            rows[len(used)] = image.ravel()[self._inside]
+            covered = root * correlated(image * root) + image * white_DN2
+            spread[len(used)] = covered.ravel()[self._inside]
+            used.append(template)
+        left = rows[: len(used)] @ spread[: len(used)].T
         own = np.diag(left).copy()
         chosen: list[int] = []
         columns: list[NDArray[np.float64]] = []
@@ -599,7 +604,7 @@ class MapProjection:
         # the images are not kept: fifty a series would be most of the memory
         self._names = tuple(
             ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
-            for item in (templates[used[number]] for number in chosen)
+            for item in (used[number] for number in chosen)
         )
         self._rows = np.zeros((0, self._inside.size), np.float32)
         if chosen:
@@ -626,20 +631,26 @@ class MapProjection:
         return list(self._names)
 
 
-def _correlated(images: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Maps (n, row, column) convolved with the autocovariance of which `table` (lag, lag) is a quarter; 0 outside.
+class _Correlation:
+    """Convolution of maps (row, column) with the autocovariance of which a table (lag, lag) is a quarter; 0 outside.
 
-    As a sum of products of a row and a column: a spread that no effect has changed is one such product.
+    As a sum of products of a matrix for rows and one for columns: a spread that no effect has changed is one such product.
     """
-    from scipy.ndimage import correlate1d
 
-    across, sizes, along = np.linalg.svd(table)
-    result = np.zeros_like(images)
-    for number in np.flatnonzero(sizes > 1e-12 * sizes[0]):
-        row, column = across[:, number] * sizes[number], along[number]
-        part = correlate1d(images, np.concatenate([row[:0:-1], row]), axis=1, mode="constant")
-        result += correlate1d(part, np.concatenate([column[:0:-1], column]), axis=2, mode="constant")
-    return result
+    def __init__(self, shape: tuple[int, ...], table: NDArray[np.float64]) -> None:
+        from scipy.linalg import toeplitz
+
+        across, sizes, along = np.linalg.svd(table)
+        self._parts = [
+            (
+                toeplitz(np.pad(across[:, number] * sizes[number], (0, shape[0]))[: shape[0]]),
+                toeplitz(np.pad(along[number], (0, shape[1]))[: shape[1]]),
+            )
+            for number in np.flatnonzero(sizes > 1e-12 * sizes[0])
+        ]
+
+    def __call__(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.asarray(sum(rows @ image @ columns for rows, columns in self._parts), dtype=np.float64)
 
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:

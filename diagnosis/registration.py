@@ -59,12 +59,12 @@ def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True) -> NDA
 
 def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """The image with pixels outside the mask taken from the median of their neighbours."""
-    from scipy.ndimage import median_filter
-
     if mask.all():
         return np.asarray(image, dtype=np.float64)
-    rough = np.where(mask, image, float(np.median(image[mask])))
-    return np.asarray(np.where(mask, image, median_filter(rough, 5)), dtype=np.float64)
+    rough = np.where(mask, image, float(np.median(image[mask]))).astype(np.float64)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(rough, 2, mode="symmetric"), (5, 5))
+    rough[~mask] = np.median(around[~mask], axis=(-2, -1))
+    return rough
 
 
 def resample(image: NDArray[np.floating], placement: Placement) -> NDArray[np.float64]:
@@ -99,19 +99,20 @@ def register(
     precision = np.eye(2) / prior_px**2
     covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
     filled = [fill(image, mask) for image in measured]
+    models = [np.asarray(model, dtype=np.float64) for model in expected]
+    slopes = [np.stack(gradient(model))[:, inner] for model in models]
+    doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
     # edges are rendered with errors that any number of series share
     share = 1.0 / max(len(measured), 1)
     for caution in _CAUTION:
         placement = _placement(current, covariance)
         normal, right = precision.copy(), precision @ current
-        for image, model, noise in zip(filled, expected, variance, strict=True):
-            moved = resample(image, placement)
-            dy, dx = gradient(model)
-            doubt = render_variance(model, far=False) * (caution / RENDER_SHARE) ** 2
-            weight = (inner / (noise + doubt))[inner] * share
-            design = np.stack([dy[inner], dx[inner]])
-            level = np.asarray(model, dtype=np.float64)[inner]
-            residual = (moved - model - _stray(moved - model, inner / (noise + 100.0 * doubt)))[inner]
+        for image, model, noise, design, doubtful in zip(filled, models, variance, slopes, doubts, strict=True):
+            apart = resample(image, placement) - model
+            doubt = doubtful * caution**2
+            weight = share / (noise + doubt)[inner]
+            level = model[inner]
+            residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
             level_weight = float((level * weight) @ level) + 1e-30
             cross = (design * weight) @ level
             normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight

@@ -4,6 +4,7 @@ The common factor of each frame (tube output, global offset) is taken out before
 kept beside it. Noise is judged from differences of successive frames, so that slow drift stays out of it.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -207,10 +208,7 @@ def summarise_series(
         )
     distinct = span = 0
     if codes is not None and code_parts:
-        values = np.concatenate(code_parts)
-        low, high = np.percentile(values, [1, 99]).astype(int)
-        inside = values[(values >= low) & (values <= high)]
-        distinct, span = len(np.unique(inside)), int(inside.max()) - int(inside.min()) + 1
+        distinct, span = _codes(np.concatenate(code_parts))
     one = max(n_pairs, 1)
     return SeriesSummary(
         frames=frames,
@@ -232,6 +230,22 @@ def summarise_series(
         highest_DN=highest,
         saturated_share=saturated / (frames * n_good),
     )
+
+
+def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
+    """How many whole numbers occur between the 1st and 99th percentile, and how many there are from first to last of them."""
+    least = int(values.min())
+    counts = np.bincount((values - values.min()).astype(np.intp))
+    below = np.cumsum(counts)
+
+    def percentile(share: float) -> float:
+        place = share * (values.size - 1)
+        first, second = np.searchsorted(below, [math.floor(place), math.ceil(place)], side="right")
+        return float(first + (second - first) * (place - math.floor(place)))
+
+    low, high = int(percentile(0.01) + least) - least, int(percentile(0.99) + least) - least
+    there = np.flatnonzero(counts[max(low, 0) : high + 1])
+    return there.size, int(there[-1] - there[0]) + 1
 
 
 def _kurtosis_excess(fourth: float, count: float, pairs: int) -> float:

@@ -224,7 +224,7 @@ def kept_cosines(length: int, psf_sigma_px: float, least: float = 1e-5) -> int:
     return int(min(FINE * length, max(np.ceil(2.0 * length * highest), length + 1)))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=32)
 def cosines_at_pixels(length: int, points: int, count: int, shift_px: float) -> FloatArray:
     """Pixels (length,) from the first `count` amplitudes of a cosine transform over `points`: (length, count).
 

@@ -38,7 +38,6 @@ _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
-_MOST_SPREADS = 16  # that are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +99,14 @@ class ModelCache:
     _spreads: "OrderedDict[tuple[object, ...], tuple[Twin, dict[object, Any]]]" = field(default_factory=OrderedDict)
 
     def spread(self, key: tuple[object, ...], twin: Twin) -> dict[object, Any]:
-        """What was kept of a spread of light, the same behind all scenes; filled by those who ask."""
+        """What was kept of a spread of light, the same behind all scenes: arrays and patterns, filled by those who ask."""
         found = self._spreads.get(key)
         if found is None or found[0] is not twin:
-            self._spreads[key] = found = (twin, {})
-            while len(self._spreads) > _MOST_SPREADS:
+            held = [sum(getattr(item, "nbytes", 0) for item in made.values()) for _, made in self._spreads.values()]
+            while sum(held) > 0.2 * self.budget_bytes:
                 self._spreads.popitem(last=False)
+                held.pop(0)
+            self._spreads[key] = found = (twin, {})
         self._spreads.move_to_end(key)
         return found[1]
 
@@ -332,7 +333,7 @@ class ModelCache:
             points,
             inverse,
             borders,
-            cell_coverage(*borders.normal, borders.covered),
+            cell_coverage(borders.normal[0], borders.normal[1], borders.covered),
             shape,
         )
         self._scenes[number] = scene

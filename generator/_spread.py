@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def _frequencies(length: int) -> NDArray[np.float64]:
     return np.arange(length) / (2.0 * length)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _drawing(
     length: int, points: int, kept: int, psf_model: str, psf_sigma_px: float, shift_px: float
 ) -> NDArray[np.float64]:
@@ -186,7 +187,7 @@ def spread_maps(
     psf_model: str,
     psf_sigma_px: float,
     draft: bool = False,
-    known: dict[object, FloatArray] | None = None,
+    known: dict[object, Any] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Picture after all blur (DN), and quantum variance after blur of the object and spread of the quanta (DN^2).
 
@@ -203,7 +204,7 @@ def spread_maps(
     # a tail holds a share of light that reaches further up than the calibrated spread
     kept = [kept_cosines(length, 0.0 if state.tails else psf_sigma_px, 1e-3 if draft else 1e-5) for length in shape]
     rest = signal_DN if fine is None else None if signal_DN is fine.signal_DN else signal_DN - fine.signal_DN
-    blurred = np.zeros(shape)
+    blurred: NDArray[np.floating] = np.zeros(shape)
     if not (state.object_transfers or state.tails or state.optical_transfers):
 
         def drawn(picture: NDArray[np.floating], counts: Sequence[int]) -> FloatArray:
@@ -221,7 +222,7 @@ def spread_maps(
         if rest is not None:
             blurred = blurred + drawn(rest, shape)
     else:
-        transfers: dict[object, FloatArray] = {} if known is None else known
+        transfers: dict[object, Any] = {} if known is None else known
 
         def transfer(counts: Sequence[int]) -> FloatArray:
             key = (shape, *counts)
@@ -231,7 +232,7 @@ def spread_maps(
                 whole = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
                 blur = _object_transfer(state, f_row, f_column)
                 transfers[key] = whole if blur is None else whole * blur
-            return transfers[key]
+            return np.asarray(transfers[key])
 
         pictures: list[tuple[NDArray[np.floating], FloatArray]] = []
         if fine is not None:
@@ -241,14 +242,14 @@ def spread_maps(
             pictures.append((dctn(rest, type=2), transfer(shape)))
         blurred = sampled_picture(pictures, shape, state.shift_px)
     if draft:
-        return blurred, pattern.share * variance_DN2
+        return np.asarray(blurred, dtype=np.float64), pattern.share * variance_DN2
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
     power = pattern.squared_transfer(f_row, f_column)
     blur = _object_transfer(state, f_row, f_column)
     spread = sampled_picture(
         [(dctn(variance_DN2, type=2), power if blur is None else power * blur)], shape, state.shift_px
     )
-    return blurred, np.maximum(spread, 0.0)
+    return np.asarray(blurred, dtype=np.float64), np.maximum(spread, 0.0)
 
 
 def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:

@@ -51,6 +51,7 @@ _OF_THE_SPREAD = (
     "panel_rotation_deg",
 )
 _OF_THE_LIGHT = (*_OF_THE_SPREAD, "open_signal_DN", "product_material", "scene_kind", "displacement_px")
+_TIMED = frozenset(("object_blur",))  # stages whose effects may depend on how long an exposure takes
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
 
@@ -313,9 +314,44 @@ class _Lit:
     projection: BeamProjection | None
     charge: "_Charge"
 
+    def times(self, factor: float) -> "_Lit":
+        """The same light, more of it."""
+        state, picture, light, charge = self.state, self.state.picture, self.projection, self.charge
+        state = replace(
+            state,
+            signal_DN=factor * state.signal_DN,
+            variance_DN2=factor * state.variance_DN2,
+            picture=None
+            if picture is None
+            else replace(picture, scale=factor * picture.scale, signal_DN=factor * picture.signal_DN),
+        )
+        return replace(
+            self,
+            state=state,
+            projection=None
+            if light is None
+            else replace(
+                light,
+                open_signal_DN=factor * light.open_signal_DN,
+                signal_DN=factor * light.signal_DN,
+                variance_DN2=factor * light.variance_DN2,
+                picture=state.picture,
+            ),
+            charge=replace(
+                charge,
+                state=state,
+                mean=factor * charge.mean,
+                correlated=factor * charge.correlated,
+                white=factor * charge.white,
+            ),
+        )
+
 
 def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCache | None) -> tuple["_Lit", "_Active"]:
-    """The line up to the spread of light, from the cache where the same was asked before, and the effects that act later."""
+    """The line up to the spread of light, from the cache where the same was asked before, and the effects that act later.
+
+    Light goes as the tube load: of series that differ in nothing else one is drawn.
+    """
     effects = twin.effects if choice.effects is None else choice.effects
     active = [item for item in in_order(effects) if item[0].since == "always" or request.after_calibration]
     early = [item for item in active if item[1].stage in _BEFORE_EXPOSURE]
@@ -331,21 +367,64 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
                 received=f"shape {values.shape}",
                 expected=f"{twin.spectral.best.shape}: one value for each of {', '.join(twin.spectral.names)}",
             )
-    of_the_line = (
-        id(twin),
-        None if values is None else values.tobytes(),
-        tuple((item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early),
-    )
-    key = (
-        *of_the_line,
-        id(request.thickness_mm),
-        request.setting,
-        choice.use_measured_level,
-        tuple(getattr(request, name) for name in _OF_THE_LIGHT),
-    )
-    kept = cache.lit(key)
-    if isinstance(kept, _Lit) and kept.twin is twin and kept.thickness_mm is request.thickness_mm:
-        return kept, late
+    once, load_mAs = _at_unit_load(request, timed=any(effect.stage in _TIMED for _, effect, _ in early))
+
+    def key(asked: SeriesRequest) -> tuple[object, ...]:
+        return (
+            id(twin),
+            id(asked.thickness_mm),
+            asked.setting,
+            None if values is None else values.tobytes(),
+            choice.use_measured_level,
+            tuple(getattr(asked, name) for name in _OF_THE_LIGHT),
+            tuple(
+                (item.id, item.since, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early
+            ),
+        )
+
+    def known(asked: SeriesRequest) -> _Lit | None:
+        kept = cache.lit(key(asked))
+        if isinstance(kept, _Lit) and kept.twin is twin and kept.thickness_mm is request.thickness_mm:
+            return kept
+        return None
+
+    def keep(asked: SeriesRequest, lit: _Lit) -> _Lit:
+        cache.keep_lit(
+            key(asked), lit, sum(item.nbytes for item in (lit.charge.mean, lit.charge.correlated, lit.charge.white))
+        )
+        return lit
+
+    found = known(request)
+    if found is None:
+        found = known(once) or keep(once, _drawn(twin, once, choice, cache, values, early))
+        if load_mAs != 1.0:
+            found = keep(request, found.times(load_mAs))
+    return found, late
+
+
+def _at_unit_load(request: SeriesRequest, *, timed: bool) -> tuple[SeriesRequest, float]:
+    """The same series at a load of 1 mAs, and its own load, mAs; as it is where the load is not what says how much light.
+
+    timed: the exposure's length matters besides.
+    """
+    load = None if request.setting is None else request.setting.tube_load_mAs
+    if not request.beam_on or request.setting is None or not load or request.open_signal_DN is not None:
+        return request, 1.0
+    exposure_ms = request.setting.exposure_ms if timed else 1000.0
+    setting = replace(request.setting, current_mA=1000.0 / exposure_ms, power_W=None, exposure_ms=exposure_ms)
+    shown_ms = request.exposure_ms if timed else exposure_ms
+    return replace(request, setting=setting, exposure_ms=shown_ms, previous=()), load
+
+
+def _drawn(
+    twin: Twin,
+    request: SeriesRequest,
+    choice: "_Choice",
+    cache: ModelCache,
+    values: NDArray[np.float64] | None,
+    early: "_Active",
+) -> "_Lit":
+    """The line up to the spread of light."""
     one = np.ones((1, 1))
     state = LineState(
         parameters=values,
@@ -381,20 +460,22 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
         for applied, effect, numbers in early:
             if effect.stage != "beam":
                 state = effect.change(state, numbers, _context(twin, request, applied, projection))
-    # light spreads alike behind all scenes
-    spread = cache.spread(
-        (
-            *of_the_line,
-            None if request.setting is None else (request.setting.kV, request.setting.filters),
-            bool(request.thickness_mm),
-            tuple(getattr(request, name) for name in _OF_THE_SPREAD),
-        ),
-        twin,
-    )
+    spread: dict[object, Any] = {}
+    if state.tails or state.optical_transfers or state.power_transfers:
+        # such light spreads alike behind all scenes, whenever it began to
+        spread = cache.spread(
+            (
+                id(twin),
+                None if values is None else values.tobytes(),
+                None if request.setting is None else (request.setting.kV, request.setting.filters),
+                tuple((item.id, tuple(numbers.items()), tuple(item.options.items())) for item, _, numbers in early),
+                tuple(getattr(request, name) for name in _OF_THE_SPREAD),
+                bool(request.thickness_mm),
+            ),
+            twin,
+        )
     charge = _charge(twin, request, state, spread, draft=cache.draft)
-    lit = _Lit(twin, request.thickness_mm, state, projection, charge)
-    cache.keep_lit(key, lit, sum(item.nbytes for item in (charge.mean, charge.correlated, charge.white)))
-    return lit, late
+    return _Lit(twin, request.thickness_mm, state, projection, charge)
 
 
 def _read_out(twin: Twin, request: SeriesRequest, found: tuple["_Lit", "_Active"]) -> LineState:
@@ -432,7 +513,7 @@ def _charge(
         psf_model=twin.noise.psf_model,
         psf_sigma_px=twin.noise.psf_sigma_px.value,
         draft=draft,
-        known=spread.setdefault("transfers", {}),
+        known=spread,
     )
     lit = shape * state.flat_factor
     scale = lit * relative

@@ -73,18 +73,47 @@ def _energy_absorption(number: int, energies_keV: FloatArray) -> FloatArray:
 
 
 def _chantler_total(number: int, energies_keV: FloatArray) -> FloatArray:
-    import xraydb
-
     # Chantler's table begins at 1.01 keV; the last hundredth of a keV is held
-    eV = 1000.0 * np.maximum(energies_keV, 1.0102)
-    return np.asarray(xraydb.mu_chantler(number, eV), dtype=float)
+    eV, total = _chantler_table(number)
+    found = np.interp(np.log(1000.0 * np.maximum(energies_keV, 1.0102)), np.log(eV), np.log(np.maximum(total, 1e-99)))
+    return np.asarray(np.exp(found), dtype=float)
+
+
+@lru_cache(maxsize=128)
+def _chantler_table(number: int) -> tuple[FloatArray, FloatArray]:
+    """Energies (eV) and mu/rho (cm2/g) of an element, read from xraydb's file: importing xraydb takes a second."""
+    import json
+    import sqlite3
+    from contextlib import closing
+    from importlib.util import find_spec
+    from pathlib import Path
+
+    import xraylib
+
+    package = find_spec("xraydb")
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("xraydb is not installed")
+    file = Path(package.origin).with_name("xraydb.sqlite").as_uri() + "?mode=ro"
+    with closing(sqlite3.connect(file, uri=True)) as tables:
+        row = tables.execute(
+            "SELECT energy, mu_total FROM Chantler WHERE element = ?", (xraylib.AtomicNumberToSymbol(number),)
+        ).fetchone()
+    if row is None:
+        raise InputError("element", received=f"Z = {number}", expected="one of Chantler's table: 1 to 92")
+    eV, total = (np.array(json.loads(column), dtype=float) for column in row)
+    return eV, total
 
 
 def _penelope_total(number: int, energies_keV: FloatArray) -> FloatArray:
+    return np.asarray(_penelope().get_mu_over_rho(number, energies_keV), dtype=float)
+
+
+@lru_cache(maxsize=1)
+def _penelope() -> Any:
+    """SpekPy's reader of PENELOPE's table, which reads three files each time it is made."""
     from spekpy.SpekTools import load_mu_data
 
-    penelope, _, _ = load_mu_data("pene")
-    return np.asarray(penelope.get_mu_over_rho(number, energies_keV), dtype=float)
+    return load_mu_data("pene")[0]
 
 
 # xraydb's Elam table is xraylib's, so it is no second opinion and is not offered.

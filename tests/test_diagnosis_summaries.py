@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.diagnosis.probes import Areas, _MovingPicture
+from raytwin.diagnosis.probes import Areas, MapProjection, Template, _MovingPicture
 from raytwin.diagnosis.registration import Placement, register, resample
-from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series
+from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
 
 SHAPE = (48, 64)
@@ -188,3 +188,48 @@ def test_means_over_areas_are_those_over_their_masks():
     assert whole == pytest.approx(float(image[good].mean()), rel=1e-12)
     assert own == pytest.approx([float(image[good & (labels == label)].mean()) for label in range(3)], rel=1e-12)
     assert areas.means(np.full((1, 1), 4.0))[0] == areas.mean(4.0) == 4.0
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_codes_are_counted_between_the_percentiles_of_the_numbers(step):
+    values = step * np.rint(np.random.default_rng(3).normal(200.0, 30.0, 5000) / step).astype(np.uint16)
+    low, high = np.percentile(values, [1, 99]).astype(int)
+    inside = values[(values >= low) & (values <= high)]
+    assert _codes(values) == (len(np.unique(inside)), int(inside.max()) - int(inside.min()) + 1)
+
+
+def _projection(rng, shape=(24, 20), templates=6):
+    images = [rng.standard_normal(shape) * 3.0**k for k in range(templates)]
+    images.append(images[0] + images[1])  # says nothing new
+    images.append(np.zeros(shape))
+    half = np.array([1.0, 0.3, 0.05, 0.0])
+    table = np.outer(half, half)
+    mask = rng.random(shape) > 0.1
+    quantum, white = 2.0 + rng.random(shape), 0.5 + rng.random(shape)
+    named = [Template(axis="level", name=str(number), unit="1", image=image) for number, image in enumerate(images)]
+    projection = MapProjection(named, mask=mask, quantum_DN2=quantum, white_DN2=white, autocovariance_table=table)
+    return projection, mask, quantum, white, table
+
+
+def test_map_probes_have_unit_noise_and_do_not_depend_on_each_other():
+    projection, mask, quantum, white, table = _projection(np.random.default_rng(4))
+    assert [name.location for name in projection.names()] == [str(number) for number in range(6)]
+    rows, columns = mask.shape
+    y, x = (index.ravel() for index in np.indices(mask.shape))
+    apart = np.abs(y[:, None] - y[None, :]), np.abs(x[:, None] - x[None, :])
+    near = (apart[0] < 4) & (apart[1] < 4)
+    shared = np.where(near, table[np.minimum(apart[0], 3), np.minimum(apart[1], 3)], 0.0)
+    covariance = np.sqrt(np.outer(quantum, quantum)) * shared + np.diag(white.ravel())
+    weights = projection.apply(np.eye(rows * columns).reshape(-1, rows, columns)).T
+    np.testing.assert_allclose(weights @ covariance @ weights.T, np.eye(6), atol=1e-5)
+    assert np.all(weights[:, ~mask.ravel()] == 0.0)
+
+
+def test_a_stack_of_maps_is_projected_as_its_maps_are_and_pixel_noise_adds_in_squares():
+    rng = np.random.default_rng(5)
+    projection, mask, _, _, _ = _projection(rng)
+    images, sd = rng.standard_normal((3, *mask.shape)), rng.random(mask.shape)
+    together = projection.apply(images)
+    np.testing.assert_allclose(together, [projection.apply(image) for image in images], rtol=1e-4, atol=1e-5)
+    weights = projection.apply(np.eye(mask.size).reshape(-1, *mask.shape))
+    np.testing.assert_allclose(projection.pixel_noise(sd), (sd.ravel() ** 2) @ weights**2, rtol=1e-4)

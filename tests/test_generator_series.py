@@ -498,3 +498,44 @@ def test_detectors_of_any_shape_take_any_effect(series_line, shape):
         assert found.mean_DN.shape == shape and np.isfinite(found.mean_DN).all(), name
         for frame in sample_series(line, asked, rng=np.random.default_rng(0), effects=effects, cache=cache):
             assert frame.shape == shape and np.isfinite(frame).all(), name
+
+
+# -------------------------------------------------------------------------------------------------- what is kept
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        None,
+        ("object_scatter", {"strength": 10.0}),
+        ("heel", {"strength": 8.0}),
+        ("motion_blur", {"strength": 3.0}),
+        ("mtf_tail", {"strength": 20.0}),
+        ("excess_noise", {"strength": 20.0}),
+    ],
+)
+def test_a_series_is_the_same_whatever_was_asked_of_the_cache_before(series_line, effect):
+    effects = () if effect is None else (AppliedEffect(id=effect[0], parameters=effect[1], since="calibration"),)
+    scene = product()
+    longer = request("object", MEASURED.replace("=20", "=50"), thickness_mm=scene, displacement_px=(0.3, -0.2))
+    cache = ModelCache()
+    asked = [longer, request("object", thickness_mm=scene, displacement_px=(0.3, -0.2)), request(), longer]
+    for item in asked:
+        kept = expected_series(series_line, item, effects=effects, cache=cache)
+        fresh = expected_series(series_line, item, effects=effects)
+        np.testing.assert_allclose(kept.mean_DN, fresh.mean_DN, rtol=1e-12)
+        np.testing.assert_allclose(kept.quantum_variance_DN2, fresh.quantum_variance_DN2, rtol=1e-12)
+        np.testing.assert_allclose(kept.white_variance_DN2, fresh.white_variance_DN2, rtol=1e-12)
+
+
+def test_light_goes_as_the_load_of_the_tube(series_line):
+    scene = product()
+    effects = (AppliedEffect(id="object_scatter", parameters={"strength": 10.0}, since="calibration"),)
+    weak, strong = (
+        expected_series(
+            series_line, request("object", MEASURED.replace("=20", f"={ms}"), thickness_mm=scene), effects=effects
+        )
+        for ms in (20, 50)
+    )
+    np.testing.assert_allclose(strong.signal_DN, 2.5 * weak.signal_DN, rtol=1e-9)
+    np.testing.assert_allclose(strong.quantum_variance_DN2, 2.5 * weak.quantum_variance_DN2, rtol=1e-9)

@@ -171,3 +171,11 @@ def test_energies_outside_the_tables_are_refused(energy_keV: float, table: str) 
 def test_an_unknown_table_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"table: got 'elam'; expected one of xraylib, chantler, penelope"):
         mu_per_mm(material_from_name("Al"), 20.0, table="elam")
+
+
+@pytest.mark.parametrize("number", [6, 13, 29, 55, 74])
+def test_chantlers_table_is_read_as_xraydb_reads_it(number: int) -> None:
+    xraydb = pytest.importorskip("xraydb")
+    energies = np.array([1.02, 5.0, 11.3, 36.0, 69.6, 160.0, 400.0])
+    found = TABLES["chantler"](number, energies)
+    np.testing.assert_allclose(found, xraydb.mu_chantler(number, 1000.0 * energies), rtol=1e-12)

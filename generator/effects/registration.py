@@ -6,6 +6,7 @@ d(r) = s [cos(b) (cos(a), sin(a)) + sin(b) (r - centre) / rms(r - centre)],  so 
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -36,21 +37,27 @@ def _displace(state: LineState, parameters: Mapping[str, float], context: LineCo
     state = replace(state, shift_px=(before[0] + shift * math.cos(direction), before[1] + shift * math.sin(direction)))
     if mix == 0:
         return state
-    from scipy.ndimage import map_coordinates
-
     down, right = displacement_px(
         context.shape,
         strength_px=parameters["strength"] * math.sin(mix),
         direction_deg=0.0,
         magnification_deg=90.0,
     )
-    row, column = np.indices(context.shape, dtype=np.float64)
-    places = np.stack([row - down, column - right])
-    moved = [
-        np.asarray(map_coordinates(values, places, order=3, mode="nearest"), dtype=np.float64)
-        for values in (state.signal_DN, state.variance_DN2)
-    ]
-    return replace(state, signal_DN=np.maximum(moved[0], 0.0), variance_DN2=np.maximum(moved[1], 0.0))
+    # a magnification moves rows alike in all columns, and columns alike in all rows
+    rows, columns = (_resampling(line.tobytes()) for line in (np.ascontiguousarray(down[:, 0]), right[0]))
+    moved = [np.maximum(rows @ values @ columns.T, 0.0) for values in (state.signal_DN, state.variance_DN2)]
+    return replace(state, signal_DN=moved[0], variance_DN2=moved[1])
+
+
+@lru_cache(maxsize=32)
+def _resampling(displacement_px: bytes) -> FloatArray:
+    """Cubic splines through the pixels of a line (pixel,), taken where each pixel comes from: (pixel, pixel)."""
+    from scipy.ndimage import map_coordinates
+
+    moved = np.frombuffer(displacement_px)
+    line, pixel = np.indices((moved.size, moved.size), dtype=np.float64)
+    places = np.stack([line - moved[:, None], pixel])
+    return np.asarray(map_coordinates(np.eye(moved.size), places, order=3, mode="nearest"), dtype=np.float64)
 
 
 MISREGISTRATION = Effect(

@@ -9,16 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.coarser import coarser
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import MEASURED_OUTRIGHT, catalogue_variants
+from .coarse import UNSEEN, coarse_factor, in_pixels
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
 from .plan import best_repeat, repeat_text
 from .plausibility import Suspect
-from .preparation import mislabelled, prepare_session
+from .preparation import calibrated_twin, mislabelled, prepare_session
 from .refine import refine
 from .whitening import Whitening
 
@@ -81,6 +83,7 @@ class Gap:
 class Diagnosis:
     """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added.
 
+    notes: how the session was looked at, where that limits the answer.
     mislabelled: series whose labels look wrong; no effect is named then. not_tested: effects that these series could not
     show, each with the reason.
     """
@@ -104,6 +107,7 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     mislabelled: tuple[Suspect, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def diagnose(
@@ -118,7 +122,8 @@ def diagnose(
     """Diagnose a session.
 
     Args:
-        acquisition: open acquisition file, anything from two flats with darks to the full protocol.
+        acquisition: open acquisition file, anything from two flats with darks to the full protocol; without a given twin,
+            frames of more than LARGEST_PIXELS are compared as means of squares of pixels.
         twin: calibrated elsewhere; absent, the session's own calibrating series make it.
         rng: source of randomness.
         without: effects to leave out of the catalogue.
@@ -128,12 +133,17 @@ def diagnose(
     Raises:
         InputError: nothing in the session can be judged.
     """
+    whole, factor = acquisition, 1
+    if twin is None and acquisition.series:
+        factor = coarse_factor(max((item.shape for item in acquisition.series), key=math.prod))
+        acquisition = coarser(acquisition, factor)
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
+    left_out = (*without, *(UNSEEN if factor > 1 else ()))
     try:
         problem = build_problem(
             session.acquisition,
             session.twin,
-            variants=catalogue_variants(without=without),
+            variants=catalogue_variants(without=left_out),
             calibrated_elsewhere=session.calibrated_elsewhere,
             progress=progress,
         )
@@ -143,7 +153,15 @@ def diagnose(
         raise
     result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
     result = replace(result, warnings=(*session.left_out, *result.warnings))
-    return _doubted(result, session.twin, session.suspects) if session.suspects else result
+    if session.suspects:
+        result = _doubted(result, session.twin, session.suspects)
+    if factor == 1:
+        return result
+    if progress is not None:
+        progress("calibration with all pixels")
+    names = {item.name for item in session.acquisition.series}
+    kept = tuple(item for item in whole.series if item.name in names)
+    return in_pixels(result, twin=calibrated_twin(replace(whole, series=kept), rng=rng), factor=factor)
 
 
 def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:
@@ -647,6 +665,6 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict
         "not_tested": [{"effect": effect, "reason": reason} for effect, reason in diagnosis.not_tested.items()],
         "mislabelled": [{"series": list(item.series), "text": item.text} for item in diagnosis.mislabelled],
         "task": None,
-        "warnings": list(diagnosis.warnings),
+        "warnings": [*diagnosis.warnings, *diagnosis.notes],
         "inputs": dict(inputs),
     }

@@ -77,6 +77,8 @@ def paragraph(diagnosis: Diagnosis) -> str:
         text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
     if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
         text += f" {compared_text(diagnosis)}"
+    for note in diagnosis.notes:
+        text += f" {note[0].upper()}{note[1:]}."
     return text
 
 

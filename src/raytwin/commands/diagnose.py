@@ -128,6 +128,8 @@ def _diagnose(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     doubts = len(result.mislabelled)
     for number, line in enumerate(result.warnings):
         say(f"label in doubt: {line}" if number < doubts else f"not used: {line}")
+    for line in result.notes:
+        say(line)
     inputs = {
         "acquisition_sha256": sha256_of_file(arguments.acquisition),
         **({"also_sha256": [sha256_of_file(path) for path in arguments.also]} if arguments.also else {}),

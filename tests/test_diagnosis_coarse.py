@@ -1,0 +1,73 @@
+"""Large panels: diagnosed with squares of pixels, answered in pixels."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from raytwin.acquisition.coarser import means_of_squares
+from raytwin.cli import main
+from raytwin.diagnosis import coarse
+from raytwin.diagnosis.coarse import LARGEST_PIXELS, coarse_factor, parameters_in_pixels
+
+
+@given(rows=st.integers(1, 5000), columns=st.integers(1, 5000))
+def test_the_factor_is_the_least_that_keeps_frames_small(rows, columns):
+    factor = coarse_factor((rows, columns))
+    assert (rows // factor) * (columns // factor) <= LARGEST_PIXELS
+    if factor > 1:
+        assert (rows // (factor - 1)) * (columns // (factor - 1)) > LARGEST_PIXELS
+
+
+def strength_in_pixels(effect, found, factor):
+    return parameters_in_pixels(effect, {"strength": found}, factor)["strength"]
+
+
+def test_strengths_found_with_squares_are_those_of_the_pixels():
+    rng, factor = np.random.default_rng(3), 4
+    shape = (800, 400)
+    # lines: rms over the read noise
+    rows, read = 0.5 * rng.standard_normal((shape[0], 1)), rng.standard_normal(shape)
+    small_rows = means_of_squares(np.broadcast_to(rows, shape), factor)
+    found = float(small_rows.std() / means_of_squares(read, factor).std())
+    assert strength_in_pixels("row_noise", found, factor) == pytest.approx(0.5, rel=4 / math.sqrt(2 * 200))
+    # a pattern from pixel to pixel: rms
+    found = float(means_of_squares(0.01 * read, factor).std())
+    assert strength_in_pixels("gain_map_error", found, factor) == pytest.approx(0.01, rel=4 / math.sqrt(2 * 20_000))
+    # single pixels: share of the squares that they spoil
+    bad = rng.random(shape) < 0.001
+    found = float(np.mean(means_of_squares(bad, factor) > 0))
+    assert strength_in_pixels("bad_pixels", found, factor) == pytest.approx(float(bad.mean()), rel=0.02)
+    # a displacement
+    assert strength_in_pixels("misregistration", 0.5, factor) == 2.0
+    # what has no pixel in it
+    assert strength_in_pixels("object_scatter", 7.0, factor) == 7.0
+    assert parameters_in_pixels("mtf_tail", {"strength": 5.0, "reach_px": 1.5}, factor) == {
+        "strength": 5.0,
+        "reach_px": 6.0,
+    }
+
+
+def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path, capsys, monkeypatch):
+    from raytwin.generator.twin_io import read_twin
+
+    session = tmp_path / "session.h5"
+    words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "12", "--products", "1"]
+    assert main(["lab", "-o", str(session), *words, "--effect", "excess_noise=60@calibration"]) == 0
+    monkeypatch.setattr(coarse, "LARGEST_PIXELS", 48 * 48)
+    capsys.readouterr()
+    assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--json"]) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert found["causes"][0]["effect"] == "excess_noise"
+    assert found["causes"][0]["strength"]["value"] == pytest.approx(60.0, rel=0.2)
+    assert "quantisation" in {item["effect"] for item in found["not_tested"]}
+    assert any("96 x 96 were compared as means of 2 x 2 pixels" in line for line in found["warnings"])
+    assert "means of 2 x 2 pixels" in printed.err
+    twin = read_twin(tmp_path / "answer" / "twin.h5")
+    assert twin.maps.shape == (96, 96)
+    assert [effect.id for effect in twin.effects] == ["excess_noise"]
+    assert "means of 2 x 2 pixels" in (tmp_path / "answer" / "report.html").read_text(encoding="utf-8")

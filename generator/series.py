@@ -367,7 +367,6 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
                 received=f"shape {values.shape}",
                 expected=f"{twin.spectral.best.shape}: one value for each of {', '.join(twin.spectral.names)}",
             )
-    once, load_mAs = _at_unit_load(request, timed=any(effect.stage in _TIMED for _, effect, _ in early))
 
     def key(asked: SeriesRequest) -> tuple[object, ...]:
         return (
@@ -396,6 +395,7 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
 
     found = known(request)
     if found is None:
+        once, load_mAs = _at_unit_load(request, timed=any(effect.stage in _TIMED for _, effect, _ in early))
         found = known(once) or keep(once, _drawn(twin, once, choice, cache, values, early))
         if load_mAs != 1.0:
             found = keep(request, found.times(load_mAs))

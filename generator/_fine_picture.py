@@ -235,6 +235,50 @@ def cosines_at_pixels(length: int, points: int, count: int, shift_px: float) -> 
     return np.asarray(np.cos(angle) * np.where(np.arange(count) == 0, 0.5, 1.0) / points)
 
 
+def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float) -> tuple[FloatArray, ...]:
+    """Amplitudes of the cosines, and of the sines where `shift_px` is not 0, of a picture sampled at the pixels.
+
+    A picture moved on by d is cos(w (x - d)) = cos(w x) cos(w d) + sin(w x) sin(w d) for each of its cosines. What no
+    pixel can tell apart (frequencies beyond half a cycle a pixel) is added up.
+
+    Args:
+        transform: cosine transform whose `axis` has `length` amplitudes (pixels), or more, up to three times as many
+            (the first of those over cells).
+        length: pixels along the axis.
+        shift_px: displacement.
+
+    Returns:
+        Amplitudes for `scipy.fft.idct`, and for `idst` after a shift, `length` along the axis.
+    """
+    found = np.moveaxis(transform, axis, 0)
+    if shift_px == 0.0:
+        return (np.moveaxis(_fold(found, length, -1.0), 0, axis),)
+    phase = np.pi * shift_px * np.arange(found.shape[0]) / length
+    along = (slice(None), *([None] * (found.ndim - 1)))
+    odd = _fold(found * np.sin(phase)[along], length, 1.0)
+    sines = np.zeros_like(odd)
+    sines[:-1] = odd[1:]
+    if found.shape[0] > length:
+        sines[-1] = 2.0 / FINE * found[length] * np.sin(phase[length])
+    return (
+        np.moveaxis(_fold(found * np.cos(phase)[along], length, -1.0), 0, axis),
+        np.moveaxis(sines, 0, axis),
+    )
+
+
+def _fold(found: FloatArray, length: int, sign: float) -> FloatArray:
+    """Amplitudes 0..length-1 with those above added: 2 length - k with `sign`, 2 length + k taken off."""
+    count = found.shape[0]
+    if count == length:
+        return found
+    result = found[:length] / FINE
+    middle = found[length + 1 : 2 * length + 1] * (sign / FINE)  # k = length + 1 ... stands at 2 length - k
+    result[length - middle.shape[0] :] += middle[::-1]
+    if count > 2 * length:
+        result[: count - 2 * length] -= found[2 * length :] / FINE
+    return result
+
+
 def sampled_picture(
     transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
     shape: tuple[int, int],
@@ -247,13 +291,23 @@ def sampled_picture(
         shape: rows and columns of the pixels.
         shift_px: displacement along rows and columns.
     """
-    result = np.zeros(shape)
+    from scipy.fft import idct, idst
+
+    inverse = (idct, idst)
+    rows: list[list[FloatArray]] = [[], []]
     for transform, filters in transforms:
-        found = transform if filters is None else transform * filters
-        fine = FINE if found.shape[0] > shape[0] else 1  # of cells, more amplitudes are given than there are pixels
-        rows, columns = (
-            cosines_at_pixels(length, fine * length, count, shift)
-            for length, count, shift in zip(shape, found.shape, shift_px, strict=True)
-        )
-        result += rows @ found @ columns.T
+        found = np.asarray(transform if filters is None else transform * filters)
+        for kind, part in enumerate(sampled_terms(found, shape[0], 0, shift_px[0])):
+            rows[kind].append(part)
+    result = np.zeros(shape)
+    for kind, parts in enumerate(rows):
+        if not parts:
+            continue
+        sums: list[FloatArray | None] = [None, None]
+        for part in parts:
+            for other, term in enumerate(sampled_terms(part, shape[1], 1, shift_px[1])):
+                before = sums[other]
+                sums[other] = term if before is None else before + term
+        lines = sum(inverse[other](term, type=2, axis=1) for other, term in enumerate(sums) if term is not None)
+        result += inverse[kind](lines, type=2, axis=0)
     return result

@@ -58,7 +58,8 @@ def means_of_squares(images: NDArray[Any], factor: int) -> NDArray[np.float32]:
     for down in range(factor):
         for right in range(factor):
             total += part[..., down::factor, right::factor]
-    return total / np.float32(factor**2)
+    total /= factor**2
+    return total
 
 
 def _smaller(shape: tuple[int, int], factor: int) -> tuple[int, int]:

@@ -62,9 +62,8 @@ DEFINED_BY: Mapping[str, str] = {
     "quantisation": "codes",
     "bad_pixels": "outliers in any series",
 }
-MEASURED_OUTRIGHT = frozenset(
-    ("quantisation", "bad_pixels", "image_lag")
-)  # by that probe alone, whatever the law's shape
+# relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
+DEFINED_SD: Mapping[str, float] = {"gain_map_error": 0.12, "image_lag": 0.08, "quantisation": 0.06}
 # what these do by chance hangs on their inner parameters: they stay those of the grid
 KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(

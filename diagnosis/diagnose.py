@@ -15,7 +15,7 @@ from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
-from .changes import MEASURED_OUTRIGHT, catalogue_variants
+from .changes import DEFINED_SD, catalogue_variants
 from .coarse import UNSEEN, coarse_factor, in_pixels
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
 from .plan import best_repeat, repeat_text
@@ -30,7 +30,7 @@ POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest e
 _WORST_PLACES = 30
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 _STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
-_DEFINED_STRENGTH_SD = 0.06  # where a probe of the session measures what the strength means
+_OUTRIGHT_NODES = 800
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
@@ -315,7 +315,7 @@ def judge(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
-                strength=_with_law_error(best.strengths[effect], curve),
+                strength=_strength_of(problem, best, effect),
                 unit=EFFECTS[effect].strength.unit,
                 parameters=dict(curve.parameters),
                 sign=variant.sign,
@@ -377,13 +377,36 @@ def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
     return with_conditions(variant.applied(strength), problem.conditions)
 
 
-def _with_law_error(strength: tuple[float, float, float], curve: Curve) -> tuple[float, float, float]:
-    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength."""
-    value, low, high = strength
-    defined = curve.effect in MEASURED_OUTRIGHT and curve.exact is not None and bool(curve.exact.any())
-    sd = _DEFINED_STRENGTH_SD if defined else _STRENGTH_LAW_SD
+def _strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
+    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength.
+
+    Where a probe of the session measures what the strength means, it is read from there, whatever the rest of the law asks for.
+    """
+    curve = hypothesis.variants[effect]
+    defined = effect in DEFINED_SD and curve.exact is not None and bool(curve.exact.any())
+    found = _outright(problem, hypothesis, effect) if defined else None
+    value, low, high = hypothesis.strengths[effect] if found is None else found
+    sd = _STRENGTH_LAW_SD if found is None else DEFINED_SD[effect]
     below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
     return value, value * math.exp(-below), value * math.exp(above)
+
+
+def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
+    """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
+    curve = hypothesis.variants[effect]
+    exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
+    left = problem.residual[exact].copy()
+    for other in hypothesis.effects:
+        if other != effect:
+            left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
+    strengths = np.geomspace(curve.low / 3.0, 1.5 * curve.high, _OUTRIGHT_NODES)
+    responses = curve.weights(strengths) @ curve.responses[:, exact]
+    distance = np.sum((left - responses) ** 2, axis=1)
+    at = int(np.argmin(distance))
+    near = distance < distance[at] + 1.96**2
+    if at in (0, len(strengths) - 1):
+        return None
+    return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
 
 
 def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[str, Any] | None:

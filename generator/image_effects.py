@@ -18,11 +18,12 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from ._fine_picture import FineCells, pixel_means
 from ._spread import NoisePattern, base_transfer_1d, blurred_object, noise_pattern, optical_transfer, spread_maps
+from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, effect_of, in_order
 from .flat_change import ABSORBED
 from .line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
 from .projection import project_polychromatic
-from .series import SeriesRequest, _new_bad_pixels, _pattern
+from .series import SeriesRequest
 from .spectral_signal import OpenBeam, SpectralModel
 from .twin import Twin
 from .twin_spectrum import spectral_model_of
@@ -372,9 +373,9 @@ class ImageEffects:
         state, shape = self._end, self.twin.maps.shape
         value = charge
         if state.gain_pattern is not None:
-            value = value * _pattern(state.gain_pattern, shape)
+            value = value * gain_pattern(state.gain_pattern, shape)
         value = value * (1.0 - state.bend_per_DN * value)
-        bad = _new_bad_pixels(state, shape)
+        bad = new_bad_pixels(state, shape)
         if bad is not None:
             value = np.where(bad.dead, 0.0, value)
         value = value + self.dark_DN + electronic

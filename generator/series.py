@@ -21,8 +21,9 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
+from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, Effect, effect_of, in_order
-from .line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineState
+from .line_state import FloatArray, LagLaw, LineContext, LineState
 from .twin import Twin
 
 __all__ = [
@@ -739,35 +740,6 @@ def _mean_of_correlated(interval_s: float, correlation_s: float, count: int) -> 
     return float((1.0 + 2.0 * np.sum((1.0 - lag / count) * rho)) / count)
 
 
-def _pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
-    rng = np.random.default_rng([0x6A17, pattern.seed])
-    return 1.0 + pattern.rms * rng.standard_normal(shape)
-
-
-@dataclass(frozen=True, slots=True)
-class _BadPixels:
-    dead: NDArray[np.bool_]
-    hot: NDArray[np.bool_]
-
-
-def _new_bad_pixels(state: LineState, shape: tuple[int, int]) -> _BadPixels | None:
-    """Dead and hot ones, a third of all in clusters of 2 x 2 and short lines."""
-    if state.bad_share <= 0:
-        return None
-    rng = np.random.default_rng([0xBAD, state.bad_seed])
-    wanted = rng.binomial(shape[0] * shape[1], min(state.bad_share, 1.0))
-    dead = np.zeros(shape, dtype=bool)
-    hot = np.zeros(shape, dtype=bool)
-    while int(np.count_nonzero(dead | hot)) < wanted:
-        left = wanted - int(np.count_nonzero(dead | hot))
-        row, column = int(rng.integers(shape[0])), int(rng.integers(shape[1]))
-        kind = rng.random()
-        height, width = (2, 2) if kind < 1 / 12 and left >= 4 else (1, 8) if kind < 0.125 and left >= 8 else (1, 1)
-        target = dead if rng.random() >= state.bad_hot_share else hot
-        target[row : row + height, column : column + width] = True
-    return _BadPixels(dead=dead, hot=hot & ~dead)
-
-
 def sample_series(
     twin: Twin,
     request: SeriesRequest,
@@ -807,8 +779,8 @@ def sample_series(
         else:
             trapped, found = _paused(state.lag, carried.trapped_DN, request.start_s - carried.time_s)
         share = np.asarray(state.lag.trapped)[:, None, None]
-    gain = None if state.gain_pattern is None or not request.beam_on else _pattern(state.gain_pattern, shape)
-    bad = _new_bad_pixels(state, shape)
+    gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
+    bad = new_bad_pixels(state, shape)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
     electronic = np.sqrt(_read_variance(twin))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0

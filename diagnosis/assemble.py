@@ -389,6 +389,7 @@ def build_problem(
     good = good & (gain > 0.05)
     outlying = _new_outliers(kept, expected, summaries, dark_map, gain, good, shape)
     clean = good & ~outlying
+    memory = {item.name: _memory(summaries[item.name], outlying) for item in kept if item.series.kind == "dark"}
     if outlying.any():
         # they count as outliers; what else is said of noise is said without them
         for item in kept:
@@ -649,6 +650,7 @@ def build_problem(
             block_pattern_DN2=block_DN2,
             outliers=outliers,
             all_outliers=int(np.count_nonzero(outlying)),
+            memory=memory.get(item.name),
         )
         scalar_probes = [probe for probe in scalar_probes if probe.name in base_scalars[item.name]]
         if lies is not None and item.name in first_of_place:
@@ -1011,6 +1013,15 @@ def _new_outliers(
     outlying &= good
     # a detector full of outliers is a pattern, not a set of defects
     return outlying if outlying.sum() < 0.1 * good.sum() else np.zeros(shape, dtype=bool)
+
+
+def _memory(summary: SeriesSummary, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
+    """Median share of outlying pixels' variance that lasts from frame to frame, and their number; None: none is noisy."""
+    stack, pair = summary.stack_variance_DN2[outlying], summary.pair_variance_DN2[outlying]
+    seen = stack > 0
+    if not seen.any():
+        return None
+    return float(np.median(1.0 - pair[seen] / stack[seen])), int(np.count_nonzero(seen))
 
 
 def _counting_series(kept: Sequence[SessionSeries]) -> str:

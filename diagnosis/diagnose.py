@@ -34,6 +34,7 @@ _OUTRIGHT_NODES = 800
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
+DOUBT = 0.08  # share of an explanation's probability: of sealed cases that were stated as certain, one in twelve was wrong in kind
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
@@ -301,6 +302,15 @@ def judge(
         leading = hypotheses[0]
         tied = []
         gap, held_out, shares = _held_out(problem, leading, rng)
+    # what the fit can no longer doubt may still be wrong in kind
+    hypotheses = _with_doubt(hypotheses)
+    leading = next(item for item in hypotheses if item.effects == leading.effects)
+    marginal = {}
+    for item in hypotheses:
+        for effect in item.effects:
+            marginal[effect] = marginal.get(effect, 0.0) + item.probability
+    none = next((item.probability for item in hypotheses if not item.effects), 0.0)
+    unknown = marginal.pop(UNKNOWN, 0.0)
     named = leading.effects if leading.effects and leading.effects != (UNKNOWN,) else ()
     order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
     listed = set(named) | {effect for item in tied for effect in item.effects}
@@ -446,6 +456,36 @@ def _leaves_too_much(gap: Gap, plausible: bool) -> bool:
         return False
     left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
     return left > _MOST_LEFT and (not plausible or gap.left is None or gap.left > _MOST_LEFT_TYPICALLY)
+
+
+def _with_doubt(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Hypotheses, most probable first, with a share of each explanation's probability given to what it may have missed.
+
+    Half of it to an unknown effect, half to the likeliest explanation with one effect more or less.
+    """
+    probability = {item.effects: item.probability for item in hypotheses}
+    unknown_known = (UNKNOWN,) in probability
+    for item in hypotheses:
+        if not item.effects or item.effects == (UNKNOWN,):
+            continue
+        taken = DOUBT * item.probability
+        near = next((other.effects for other in hypotheses if _one_apart(item.effects, other.effects)), None)
+        probability[item.effects] -= taken
+        if near is not None and unknown_known:
+            probability[near] += 0.5 * taken
+            probability[(UNKNOWN,)] += 0.5 * taken
+        elif near is not None or unknown_known:
+            probability[near if near is not None else (UNKNOWN,)] += taken
+        else:
+            probability[item.effects] += taken
+    result = (replace(item, probability=probability[item.effects]) for item in hypotheses)
+    return tuple(sorted(result, key=lambda item: -item.probability))
+
+
+def _one_apart(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
+    """Whether one explanation has all effects of the other and one more; no effect at all and the unknown are none."""
+    one, other = set(first), set(second)
+    return bool(second) and UNKNOWN not in other and len(one ^ other) == 1
 
 
 def _vetoed(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:

@@ -23,6 +23,8 @@ from .summaries import BLOCK_PX, LAGS, SeriesSummary
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
 OUTLIER_SD = 7.0
+_LEAST_FREEDOM = 5.0  # of a variance whose logarithm is still near enough a Gaussian number
+_LEAST_OUTLIERS, _LEAST_FRAMES = 5, 6  # pixels, and frames of each, that show what lasts from frame to frame
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
@@ -45,6 +47,7 @@ FLOORS: Mapping[str, float] = {
     "fixed_pattern": 0.025,  # of the value, as for its blocks
     "fixed_pattern blocks": 0.5,  # a pattern's grain is its own: white in the model, coarser in some panels
     "outliers": 0.3,
+    "memory of outliers": 0.02,
 }
 
 
@@ -298,6 +301,8 @@ def expected_scalars(
         values["outliers"] = math.sqrt(seen * n_good + 0.375)
         if context.counts_all_outliers:
             values["outliers in any series"] = math.sqrt(bad * n_good + 0.375)
+        # what bad pixels add is new in every frame
+        values["memory of outliers"] = 0.0
     return values
 
 
@@ -399,10 +404,12 @@ def measured_scalars(
     block_pattern_DN2: float | None,
     outliers: int | None,
     all_outliers: int,
+    memory: tuple[float, int] | None,
 ) -> list[Scalar]:
     """The scalar probes of measured frames with their standard deviations (sampling and floor together).
 
-    outliers, all_outliers: pixels that stand out in this series, and in any.
+    outliers, all_outliers: pixels that stand out in this series, and in any. memory: share of such pixels' variance that lasts
+    from frame to frame, and how many they are.
     """
     result: list[Scalar] = []
     good = context.good
@@ -490,17 +497,15 @@ def measured_scalars(
                     math.sqrt(40.0 / (n_good * freedom)),
                     "kurtosis",
                 )
-            if context.kind in ("flat", "object"):
+            if context.kind in ("flat", "object") and freedom >= _LEAST_FREEDOM:
+                from scipy.special import polygamma
+
                 steps = np.diff(summary.frame_mean_DN)
                 variance = float(np.mean(steps**2)) / 2.0
-                add(
-                    "time",
-                    "frame_factor",
-                    "1",
-                    math.log(max(variance, 1e-12)),
-                    math.sqrt(2.0 / freedom),
-                    "frame_factor",
-                )
+                # the logarithm of a variance that few frames show: its mean and its spread
+                bias = float(polygamma(0, freedom / 2.0)) - math.log(freedom / 2.0)
+                value = math.log(max(variance, 1e-12)) - bias
+                add("time", "frame_factor", "1", value, math.sqrt(float(polygamma(1, freedom / 2.0))), "frame_factor")
     profiles = time_templates(frames)
     if profiles and context.kind != "afterglow":
         steps = np.diff(summary.frame_mean_DN)
@@ -547,6 +552,9 @@ def measured_scalars(
                 result.append(pattern)
     if outliers is not None and not context.calibrates:
         add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
+        if memory is not None and memory[1] >= _LEAST_OUTLIERS and frames >= _LEAST_FRAMES:
+            share, count = memory
+            add("tails", "memory of outliers", "1", share, math.sqrt(1.6 / (frames * count)), "memory of outliers")
         if context.counts_all_outliers:
             counted = math.sqrt(all_outliers + 0.375)
             add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")

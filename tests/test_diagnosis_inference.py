@@ -5,7 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference import UNKNOWN, Curve, Nuisances, Priors, fit_curve, interval_of, weigh_hypotheses
+from raytwin.diagnosis.diagnose import DOUBT, _with_doubt
+from raytwin.diagnosis.inference import (
+    UNKNOWN,
+    Curve,
+    Hypothesis,
+    Nuisances,
+    Priors,
+    fit_curve,
+    interval_of,
+    weigh_hypotheses,
+)
 from raytwin.diagnosis.whitening import Whitening
 
 PROBES = 600
@@ -209,3 +219,24 @@ def test_what_an_effect_does_by_chance_counts_as_its_own(setup):
     residual = response + noise(rng, factors) + 5.0 * rng.standard_normal(PROBES) * (response == 0)
     assert weigh(residual, factors, [curve])[0].effects == ("gain_map_error",)
     assert weigh(residual, factors, [replace(curve, jitter=None)])[0].effects == (UNKNOWN,)
+
+
+def test_doubt_goes_to_the_unknown_and_to_the_nearest_explanation_and_keeps_the_sum():
+    def hypothesis(probability, *effects):
+        return Hypothesis(effects=effects, probability=probability, log_evidence=0.0)
+
+    given = [
+        hypothesis(0.95, "a", "b"),
+        hypothesis(0.03, "b"),
+        hypothesis(0.02),
+        hypothesis(0.0, "a"),
+        hypothesis(0.0, UNKNOWN),
+    ]
+    found = {item.effects: item.probability for item in _with_doubt(given)}
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert found[("a", "b")] == pytest.approx((1 - DOUBT) * 0.95 + 0.5 * DOUBT * 0.03)
+    assert found[(UNKNOWN,)] == pytest.approx(0.5 * DOUBT * 0.98)
+    assert found[("b",)] == pytest.approx((1 - DOUBT) * 0.03 + 0.5 * DOUBT * 0.95)
+    assert found[()] == 0.02  # nothing to be wrong about
+    ordered = [item.probability for item in _with_doubt(given)]
+    assert ordered == sorted(ordered, reverse=True)

@@ -498,14 +498,8 @@ def measured_scalars(
                     "kurtosis",
                 )
             if context.kind in ("flat", "object") and freedom >= _LEAST_FREEDOM:
-                from scipy.special import polygamma
-
-                steps = np.diff(summary.frame_mean_DN)
-                variance = float(np.mean(steps**2)) / 2.0
-                # the logarithm of a variance that few frames show: its mean and its spread
-                bias = float(polygamma(0, freedom / 2.0)) - math.log(freedom / 2.0)
-                value = math.log(max(variance, 1e-12)) - bias
-                add("time", "frame_factor", "1", value, math.sqrt(float(polygamma(1, freedom / 2.0))), "frame_factor")
+                value, sampling = _log_variance_of_steps(summary.frame_mean_DN, freedom)
+                add("time", "frame_factor", "1", value, sampling, "frame_factor")
     profiles = time_templates(frames)
     if profiles and context.kind != "afterglow":
         steps = np.diff(summary.frame_mean_DN)
@@ -559,6 +553,15 @@ def measured_scalars(
             counted = math.sqrt(all_outliers + 0.375)
             add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")
     return result
+
+
+def _log_variance_of_steps(values: NDArray[np.float64], freedom: float) -> tuple[float, float]:
+    """Logarithm of the variance that steps from value to value (n,) show, free of what few of them make too low; its sd."""
+    from scipy.special import polygamma
+
+    variance = float(np.mean(np.diff(values) ** 2)) / 2.0
+    bias = float(polygamma(0, freedom / 2.0)) - math.log(freedom / 2.0)
+    return math.log(max(variance, 1e-12)) - bias, math.sqrt(float(polygamma(1, freedom / 2.0)))
 
 
 def _squared_correlations(expected: ExpectedSeries) -> float:

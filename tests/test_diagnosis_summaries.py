@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.diagnosis.probes import Areas, MapProjection, Template, _MovingPicture
+from raytwin.diagnosis.assemble import _memory
+from raytwin.diagnosis.probes import Areas, MapProjection, Template, _log_variance_of_steps, _MovingPicture
 from raytwin.diagnosis.registration import Placement, register, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
@@ -233,3 +234,34 @@ def test_a_stack_of_maps_is_projected_as_its_maps_are_and_pixel_noise_adds_in_sq
     np.testing.assert_allclose(together, [projection.apply(image) for image in images], rtol=1e-4, atol=1e-5)
     weights = projection.apply(np.eye(mask.size).reshape(-1, *mask.shape))
     np.testing.assert_allclose(projection.pixel_noise(sd), (sd.ravel() ** 2) @ weights**2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [9, 30])
+def test_the_logarithm_of_a_variance_from_few_frames_is_unbiased_and_as_uncertain_as_said(frames):
+    rng, draws = np.random.default_rng(8), 4000
+    freedom = 2.0 * (frames - 1) ** 2 / (3.0 * frames - 4.0)
+    found = np.array([_log_variance_of_steps(3.0 * rng.standard_normal(frames), freedom) for _ in range(draws)])
+    sd = found[0, 1]
+    assert found[:, 0].mean() == pytest.approx(np.log(9.0), abs=4 * sd / np.sqrt(draws) + 0.01)
+    # the steps' sum of squares is not quite a chi-square of that many degrees of freedom
+    assert found[:, 0].std() == pytest.approx(sd, rel=0.06)
+
+
+def test_pixels_that_jump_and_stay_have_a_memory_and_noisy_ones_have_none():
+    rng, frames, count = np.random.default_rng(5), 12, 60
+    outlying = np.zeros(SHAPE, dtype=bool)
+    outlying.ravel()[rng.choice(outlying.size, count, replace=False)] = True
+    quiet = 100.0 + rng.standard_normal((frames, *SHAPE))
+    noisy = quiet.copy()
+    noisy[:, outlying] += 4.0 * rng.standard_normal((frames, count))
+    jumping = quiet.copy()
+    flips = rng.random((frames, count)) < 0.15
+    jumping[:, outlying] += 6.0 * (np.cumsum(flips, axis=0) % 2)
+    shares = []
+    for changed in (noisy, jumping):
+        found = _memory(summary_of(changed.astype(np.float32)), outlying)
+        assert found is not None
+        assert found[1] == count
+        shares.append(found[0])
+    assert abs(shares[0]) < 4 * np.sqrt(1.6 / (frames * count))
+    assert shares[1] > 0.25

@@ -34,6 +34,8 @@ _OUTRIGHT_NODES = 800
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
+STRAINED_FROM = 5.0
+_OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
 DOUBT = 0.08  # share of an explanation's probability: of sealed cases that were stated as certain, one in twelve was wrong in kind
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
@@ -84,7 +86,8 @@ class Gap:
 class Diagnosis:
     """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added.
 
-    notes: how the session was looked at, where that limits the answer.
+    notes: how the session was looked at, where that limits the answer. strained: nuisances that what is left pulls beyond
+    STRAINED_FROM of their standard deviations, and how far, the farthest first.
     mislabelled: series whose labels look wrong; no effect is named then. not_tested: effects that these series could not
     show, each with the reason.
     """
@@ -109,6 +112,7 @@ class Diagnosis:
     mislabelled: tuple[Suspect, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    strained: tuple[tuple[str, float], ...] = ()
 
 
 def diagnose(
@@ -379,6 +383,7 @@ def judge(
         problem=problem,
         warnings=tuple(problem.skipped),
         not_tested=_out_of_reach(problem, whitened, shared),
+        strained=_strained(problem, leading, nuisances),
     )
 
 
@@ -417,6 +422,20 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     if at in (0, len(strengths) - 1):
         return None
     return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
+
+
+def _strained(problem: Problem, leading: Hypothesis, nuisances: Nuisances) -> tuple[tuple[str, float], ...]:
+    """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
+    left = problem.residual.copy()
+    for effect, curve in leading.variants.items():
+        left -= curve.response(leading.strengths[effect][0])
+    found = zip(problem.factor_names, nuisances.fitted(left), strict=True)
+    far = [
+        (name, float(value))
+        for name, value in found
+        if abs(value) > STRAINED_FROM and not name.startswith(_OF_RENDERING)
+    ]
+    return tuple(sorted(far, key=lambda item: -abs(item[1])))
 
 
 def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[str, Any] | None:
@@ -726,6 +745,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict
             for axis, before, after, floor in diagnosis.held_out
         ],
         "not_tested": [{"effect": effect, "reason": reason} for effect, reason in diagnosis.not_tested.items()],
+        "strained": [{"nuisance": name, "sd": value} for name, value in diagnosis.strained],
         "mislabelled": [{"series": list(item.series), "text": item.text} for item in diagnosis.mislabelled],
         "task": None,
         "warnings": [*diagnosis.warnings, *diagnosis.notes],

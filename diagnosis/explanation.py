@@ -8,6 +8,7 @@ from ..generator.effects import EFFECTS
 from .diagnose import Cause, Diagnosis, Place
 
 _NAMED_DOUBTS = 3
+_NAMED_STRAINED = 3
 _NAMED_UNTESTED = 8
 _AXIS_WORDS = {
     "level": "brightness",
@@ -67,6 +68,16 @@ def compared_text(diagnosis: Diagnosis) -> str:
     return text + "."
 
 
+def strained_text(diagnosis: Diagnosis) -> str:
+    """Nuisances that the frames pull far from what is known of them; empty without any."""
+    if not diagnosis.strained:
+        return ""
+    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED_STRAINED])
+    more = len(diagnosis.strained) - _NAMED_STRAINED
+    shown += f" and {more} more" if more > 0 else ""
+    return f"Pulled far from what is known of it: {shown}. Check these maps, labels and positions."
+
+
 def paragraph(diagnosis: Diagnosis) -> str:
     """Verdict, where, which, how far; labels in doubt come first, what the session could not show comes last."""
     text = _verdict_text(diagnosis)
@@ -77,6 +88,8 @@ def paragraph(diagnosis: Diagnosis) -> str:
         text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
     if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
         text += f" {compared_text(diagnosis)}"
+    if diagnosis.strained and diagnosis.verdict != "explained":
+        text += f" {strained_text(diagnosis)}"
     for note in diagnosis.notes:
         text += f" {note[0].upper()}{note[1:]}."
     return text

@@ -1,11 +1,12 @@
 """Weighing hypotheses on probes whose truth is planted: no data, only vectors."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.diagnose import DOUBT, _with_doubt
+from raytwin.diagnosis.diagnose import DOUBT, _strained, _with_doubt
 from raytwin.diagnosis.inference import (
     UNKNOWN,
     Curve,
@@ -240,3 +241,29 @@ def test_doubt_goes_to_the_unknown_and_to_the_nearest_explanation_and_keeps_the_
     assert found[()] == 0.02  # nothing to be wrong about
     ordered = [item.probability for item in _with_doubt(given)]
     assert ordered == sorted(ordered, reverse=True)
+
+
+def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
+    rng = np.random.default_rng(2)
+    factors = rng.standard_normal((PROBES, 4))
+    names = ("thickness of PMMA in wedge", "level of flat", "rough edge 3 of disc at 900", "tilt x of flat")
+    residual = factors @ np.array([-12.0, 2.0, 20.0, 6.0]) + rng.standard_normal(PROBES)
+    problem = SimpleNamespace(residual=residual, factor_names=names)
+    nothing = Hypothesis(effects=(), probability=1.0, log_evidence=0.0)
+    found = _strained(problem, nothing, Nuisances(factors))
+    assert [name for name, _ in found] == ["thickness of PMMA in wedge", "tilt x of flat"]
+    # 600 probes of unit noise know each to 0.04
+    assert [value for _, value in found] == pytest.approx([-12.0, 6.0], abs=0.25)
+    effect = Curve(
+        effect="a",
+        variant="",
+        parameters={},
+        low=0.1,
+        high=10.0,
+        strengths=np.array([1.0]),
+        responses=(factors @ np.array([-12.0, 0.0, 0.0, 0.0]))[None, :],
+    )
+    named = Hypothesis(
+        effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (1.0, 0.9, 1.1)}, variants={"a": effect}
+    )
+    assert [name for name, _ in _strained(problem, named, Nuisances(factors))] == ["tilt x of flat"]

@@ -15,16 +15,20 @@ from ..generator.twin import Twin
 if TYPE_CHECKING:
     from .diagnose import Diagnosis
 
+LEAST_SIDE = 16  # rows and columns below which pictures say nothing
 LARGEST_PIXELS = 2**15  # of a frame that is diagnosed as it is
 UNSEEN = {"quantisation": "codes are lost where frames are averaged"}
 
 
 def coarse_factor(shape: tuple[int, int]) -> int:
-    """Pixels along each side of the squares to average, so that a frame has no more than LARGEST_PIXELS."""
+    """Pixels along each side of the squares to average, so that a frame has no more than LARGEST_PIXELS.
+
+    Fewer where a long strip would be left with less than LEAST_SIDE rows or columns.
+    """
     factor = max(1, math.floor(math.sqrt(shape[0] * shape[1] / LARGEST_PIXELS)))
     while (shape[0] // factor) * (shape[1] // factor) > LARGEST_PIXELS:
         factor += 1
-    return factor
+    return max(1, min(factor, min(shape) // LEAST_SIDE))
 
 
 def _in_pixels(effect: str, name: str, factor: int) -> float:

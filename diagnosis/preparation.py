@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.coarser import coarser
 from ..calibration.calibrate import calibrate_twin
 from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
+from .coarse import LEAST_SIDE, coarse_factor
 from .plausibility import Suspect, check_plausibility
 from .session import calibrating_names
-
-LEAST_SIDE = 16  # rows and columns below which pictures say nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,7 +21,8 @@ class PreparedSession:
     """A session ready for its diagnosis.
 
     Fields: acquisition (less the series that cannot be used); twin; calibrated_elsewhere (the twin was given); suspects
-    (series whose labels look wrong); left_out (series that are not used, each with the reason).
+    (series whose labels look wrong); left_out (series that are not used, each with the reason); factor (pixels along each
+    side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels).
     """
 
     acquisition: AcquisitionFile
@@ -29,6 +30,8 @@ class PreparedSession:
     calibrated_elsewhere: bool
     suspects: tuple[Suspect, ...]
     left_out: tuple[str, ...]
+    factor: int
+    all_pixels: AcquisitionFile
 
 
 def calibrated_twin(
@@ -49,11 +52,15 @@ def prepare_session(
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
+    Without a given twin frames of more than LARGEST_PIXELS become means of squares of pixels.
+
     Raises:
         InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
     """
     tell = progress or (lambda stage: None)
-    acquisition, left_out = _of_one_shape(acquisition, twin)
+    all_pixels, left_out = _of_one_shape(acquisition, twin)
+    factor = 1 if twin is not None else coarse_factor(all_pixels.series[0].shape)
+    acquisition = coarser(all_pixels, factor)
     names = calibrating_names(acquisition.series)
     found = check_plausibility(
         acquisition,
@@ -85,6 +92,10 @@ def prepare_session(
         calibrated_elsewhere=elsewhere,
         suspects=suspects,
         left_out=tuple(left_out),
+        factor=factor,
+        all_pixels=replace(
+            all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
+        ),
     )
 
 

@@ -11,13 +11,16 @@ from hypothesis import strategies as st
 from raytwin.acquisition.coarser import means_of_squares
 from raytwin.cli import main
 from raytwin.diagnosis import coarse
-from raytwin.diagnosis.coarse import LARGEST_PIXELS, coarse_factor, parameters_in_pixels
+from raytwin.diagnosis.coarse import LARGEST_PIXELS, LEAST_SIDE, coarse_factor, parameters_in_pixels
 
 
 @given(rows=st.integers(1, 5000), columns=st.integers(1, 5000))
 def test_the_factor_is_the_least_that_keeps_frames_small(rows, columns):
     factor = coarse_factor((rows, columns))
-    assert (rows // factor) * (columns // factor) <= LARGEST_PIXELS
+    if min(rows, columns) >= LEAST_SIDE:
+        assert min(rows, columns) // factor >= LEAST_SIDE
+    if min(rows, columns) // (factor + 1) >= LEAST_SIDE:  # no long strip
+        assert (rows // factor) * (columns // factor) <= LARGEST_PIXELS
     if factor > 1:
         assert (rows // (factor - 1)) * (columns // (factor - 1)) > LARGEST_PIXELS
 
@@ -71,3 +74,33 @@ def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path
     assert twin.maps.shape == (96, 96)
     assert [effect.id for effect in twin.effects] == ["excess_noise"]
     assert "means of 2 x 2 pixels" in (tmp_path / "answer" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_path, capsys):
+    import h5py
+
+    session = tmp_path / "session.h5"
+    words = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "10", "--products", "1"]
+    assert main(["lab", "-o", str(session), *words]) == 0
+
+    def reshaped(names, shape):
+        with h5py.File(session, "r+") as file:
+            for name in names(list(file["series"])):
+                frames = file["series"][name]["frames"][:]
+                del file["series"][name]["frames"]
+                file["series"][name]["frames"] = np.resize(frames, (len(frames), *shape))
+            if names(["one", "two"]) == ["one", "two"]:
+                del file["scenes"]
+                for name in list(file["series"]):
+                    if file["series"][name].attrs["kind"] == "object":
+                        del file["series"][name]
+
+    # one dark of another size: left out, and said
+    reshaped(lambda names: [name for name in names if name.startswith("dark")][-1:], (2, 8))
+    capsys.readouterr()
+    assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--json"]) == 0
+    assert any("frames of 2 x 8, not 48 x 48" in line for line in json.loads(capsys.readouterr().out)["warnings"])
+    # all of them lines of 70,000 pixels
+    reshaped(lambda names: names, (1, 70_000))
+    assert main(["diagnose", str(session), "-o", str(tmp_path / "line"), "--json"]) == 2
+    assert "at least 16 rows and columns" in capsys.readouterr().err

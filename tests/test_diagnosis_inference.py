@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.diagnose import DOUBT, _strained, _with_doubt
+from raytwin.diagnosis.diagnose import DOUBT, _outright, _strained, _with_doubt
 from raytwin.diagnosis.inference import (
     UNKNOWN,
     Curve,
@@ -267,3 +267,60 @@ def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (1.0, 0.9, 1.1)}, variants={"a": effect}
     )
     assert [name for name, _ in _strained(problem, named, Nuisances(factors))] == ["tilt x of flat"]
+
+
+def defined_curve(exact):
+    """An effect whose law is 30 % too strong in all probes but the five that define its strength."""
+    rng = np.random.default_rng(6)
+    responses = rng.standard_normal(PROBES) * 40.0
+    truth = np.where(np.arange(PROBES) < 5, 1.0, 0.7) * 3.0 * responses
+    curve = Curve(
+        effect="a",
+        variant="",
+        parameters={},
+        low=0.5,
+        high=50.0,
+        strengths=np.array([1.0]),
+        responses=responses[None, :],
+        exact=np.arange(PROBES) < 5 if exact else None,
+    )
+    return curve, truth + rng.standard_normal(PROBES)
+
+
+def test_a_strength_is_read_from_the_probes_that_define_it_whatever_the_rest_of_the_law_asks_for():
+    curve, residual = defined_curve(exact=True)
+    everything = Hypothesis(
+        effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (2.1, 2.0, 2.2)}, variants={"a": curve}
+    )
+    value, low, high = _outright(SimpleNamespace(residual=residual), everything, "a")
+    assert value == pytest.approx(3.0, rel=0.03)
+    assert low <= value <= high
+    # all probes together are fitted best by 0.7 of it, unless those five count as exact
+    loose, _ = defined_curve(exact=False)
+    found = [fit_curve(residual, one, Nuisances(np.zeros((PROBES, 1))), GROUPS[:PROBES]).best for one in (loose, curve)]
+    assert found[0] == pytest.approx(2.1, rel=0.05)
+    assert found[1] > found[0]
+
+
+def test_an_interval_covers_the_variants_that_are_as_likely():
+    rng = np.random.default_rng(4)
+    response = rng.standard_normal(PROBES) * 5.0
+    residual = 4.0 * response + rng.standard_normal(PROBES)
+
+    def fit(scale):
+        curve = Curve(
+            effect="a",
+            variant=str(scale),
+            parameters={},
+            low=0.5,
+            high=50.0,
+            strengths=np.array([1.0]),
+            responses=scale * response[None, :],
+        )
+        return fit_curve(residual, curve, Nuisances(np.zeros((PROBES, 1))), GROUPS, law_errors=())
+
+    # the same picture at half the size means twice the strength
+    one, both = interval_of([fit(1.0)]), interval_of([fit(1.0), fit(0.5)])
+    assert one[1] < 4.0 < one[2] < 5.0
+    assert both[1] < 4.0
+    assert both[2] > 7.5

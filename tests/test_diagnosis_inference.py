@@ -304,7 +304,7 @@ def test_a_strength_is_read_from_the_probes_that_define_it_whatever_the_rest_of_
 
 def test_an_interval_covers_the_variants_that_are_as_likely():
     rng = np.random.default_rng(4)
-    response = rng.standard_normal(PROBES) * 5.0
+    response = rng.standard_normal(PROBES) * 0.3
     residual = 4.0 * response + rng.standard_normal(PROBES)
 
     def fit(scale):

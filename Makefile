@@ -11,8 +11,10 @@ READY := $(VENV)/.ready
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,develop]'
+	$(BIN)/python -m pip install --quiet --upgrade pip || echo "pip stays as it is"
+	for try in 1 2 3 4; do \
+	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,develop]' && break; \
+	  test $$try != 4 || exit 1; echo "the install broke off; once more in $$((try * 15)) s (what is complete is kept)"; sleep $$((try * 15)); done
 	touch $(READY)
 
 demo: $(READY)

@@ -103,6 +103,7 @@ class LineState:
         gain_pattern: fixed pattern of the gain that calibration does not know.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
         row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
+        read_variance_taken_DN2: of the calibrated electronic variance, what effects that the calibration saw account for.
         step_DN: of the ADC; 0: none.
         bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
             rest being dead; bad_seed draws them.
@@ -130,6 +131,7 @@ class LineState:
     offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
     row_variance_DN2: float = 0.0
     column_variance_DN2: float = 0.0
+    read_variance_taken_DN2: float = 0.0
     step_DN: float = 0.0
     bad_share: float = 0.0
     bad_hot_share: float = 0.5

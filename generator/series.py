@@ -622,10 +622,11 @@ def _staircase(
     return shift, np.maximum(square + 2.0 * cross - shift**2, -variance_DN2)
 
 
-def _read_variance(twin: Twin) -> FloatArray:
-    """Electronic variance (row, column) of one exposure without the ADC's rounding, DN^2."""
+def _read_variance(twin: Twin, state: LineState) -> FloatArray:
+    """White electronic variance (row, column) of one exposure without the ADC's rounding, DN^2."""
     rounding = 1.0 / 12.0 if twin.noise.quantised else 0.0
-    return np.maximum(np.asarray(twin.maps.read_variance_DN2, dtype=np.float64) - rounding, 0.0)
+    calibrated = np.asarray(twin.maps.read_variance_DN2, dtype=np.float64)
+    return np.maximum(calibrated - (rounding + state.read_variance_taken_DN2), 0.0)
 
 
 def expected_series(
@@ -692,7 +693,7 @@ def expected_series(
         dark = dark + height * course.mean()
         if request.frames > 1:
             trend.append((np.full(twin.maps.shape, height), course - course.mean()))
-    electronic = _read_variance(twin)
+    electronic = _read_variance(twin, state)
     mean = dark + signal
     single = averaged * (quantum + white) + electronic + state.row_variance_DN2 + state.column_variance_DN2
     shift, rounding = _staircase(mean, single, state.step_DN)
@@ -782,7 +783,7 @@ def sample_series(
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
     bad = new_bad_pixels(state, shape)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
-    electronic = np.sqrt(_read_variance(twin))
+    electronic = np.sqrt(_read_variance(twin, state))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
     lowest = 0.0 if twin.noise.quantised else -math.inf
     scale = np.sqrt(charge.shape * charge.relative)

@@ -711,10 +711,22 @@ def test_nonlinearity_refers_to_the_full_scale_of_the_adc_unless_told(series_lin
 
 
 def test_row_noise_is_so_many_read_noises_in_rows_or_columns(series_line):
-    rows = expect(series_line, request("dark", setting=None), applied("row_noise", 0.5))
+    since = {"since": "calibration"}
+    asked = replace(request("dark", setting=None), after_calibration=True)
+    rows = expect(series_line, asked, applied("row_noise", 0.5, **since))
     assert (rows.row_variance_DN2, rows.column_variance_DN2) == (pytest.approx(36.0), 0.0)
-    columns = expect(series_line, request("dark", setting=None), applied("row_noise", 0.5, column_share=1.0))
+    columns = expect(series_line, asked, applied("row_noise", 0.5, column_share=1.0, **since))
     assert (columns.row_variance_DN2, columns.column_variance_DN2) == (0.0, pytest.approx(36.0))
+
+
+@pytest.mark.parametrize("strength", [0.1, 1.0, 2.0])
+def test_row_noise_that_was_always_there_is_part_of_the_calibrated_read_noise(series_line, strength):
+    asked = request("dark", setting=None)
+    plain, found = expect(series_line, asked), expect(series_line, asked, applied("row_noise", strength))
+    white = found.white_variance_DN2
+    # less the rounding, which is no part of the lines' reference
+    assert found.row_variance_DN2 == pytest.approx(strength**2 * np.median(white - 1.0 / 12.0), rel=1e-6)
+    np.testing.assert_allclose(white + found.row_variance_DN2, plain.white_variance_DN2, rtol=1e-6)
 
 
 def test_excess_noise_is_quantum_noise_alone(series_line):

@@ -1,6 +1,6 @@
 """Readout: noise common to a row or column, an ADC with lost bits, bad pixels that calibration has not seen.
 
-row noise      + r_i to each row (column) of a frame
+row noise      + r_i to each row (column) of a frame; the read noise of a calibration that saw it holds both
 quantisation   step in place of 1 DN
 bad pixels     dead, hot, in clusters and in lines
 """
@@ -13,10 +13,14 @@ from .effect import Effect, Parameter
 
 
 def _add_row_noise(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    variance = (parameters["strength"] * context.twin.noise.read_noise_DN.value) ** 2
+    ratio = parameters["strength"] ** 2
+    variance = ratio * context.twin.noise.read_noise_DN.value ** 2
+    if context.since == "always":
+        variance /= 1.0 + ratio  # calibrated^2 = white^2 (1 + strength^2)
     columns = parameters["column_share"]
     return replace(
         state,
+        read_variance_taken_DN2=state.read_variance_taken_DN2 + (variance if context.since == "always" else 0.0),
         row_variance_DN2=state.row_variance_DN2 + (1.0 - columns) * variance,
         column_variance_DN2=state.column_variance_DN2 + columns * variance,
     )
@@ -32,7 +36,7 @@ ROW_NOISE = Effect(
             low=0.05,
             high=2.0,
             default=0.3,
-            source="rms of the line's offset over the twin's read noise",
+            source="rms of the line's offset over the white read noise",
             log=True,
         ),
         Parameter(

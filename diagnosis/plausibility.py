@@ -237,8 +237,7 @@ def _read(item: Series, frames: FloatArray, acquisition: AcquisitionFile, since:
     variance = None
     if len(frames) > 1:
         steps = np.diff(frames, axis=0)
-        # what the output does from frame to frame is the same for all pixels, in proportion to their signal: small beside noise
-        steps = steps - np.median(steps, axis=(1, 2), keepdims=True)
+        steps = _without_common(steps, np.asarray(frames.mean(axis=0), dtype=np.float64))
         scale = 2.0
         if len(steps) > 3:
             # a ghost of the exposure before that fades is no noise: it bends little, and less and less
@@ -263,6 +262,23 @@ def _read(item: Series, frames: FloatArray, acquisition: AcquisitionFile, since:
         variance_DN2=variance,
         since=since,
     )
+
+
+def _without_common(steps: FloatArray, picture: FloatArray) -> FloatArray:
+    """Steps from frame to frame (step, row, column) less what all pixels have in common: an offset, and a share of their picture.
+
+    Where half the field lies in shadow the tube's output moves the other half alone.
+    """
+    # hot and dead pixels stand far off in both
+    low, high = np.quantile(steps, [0.05, 0.95], axis=(1, 2), keepdims=True)
+    steady = np.clip(steps, low - (high - low), high + (high - low))
+    shape = np.clip(picture, *np.quantile(picture, [0.01, 0.99]))
+    shape = shape - shape.mean()
+    steps = steps - steady.mean(axis=(1, 2), keepdims=True)
+    power = float(np.sum(shape**2))
+    if power <= 0:
+        return steps
+    return np.asarray(steps - (np.sum(steady * shape, axis=(1, 2)) / power)[:, None, None] * shape)
 
 
 def _mean(image: FloatArray | None, good: NDArray[np.bool_]) -> float:

@@ -8,7 +8,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, check_plausibility
+from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _without_common, check_plausibility
 from raytwin.diagnosis.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
@@ -159,3 +159,17 @@ def test_weak_flat_of_a_short_exposure_is_no_dark(changed):
         node.attrs["exposure_ms"] = 0.25
 
     assert not any("shows no beam" in item.text for item in found_in(changed(change)).suspects)
+
+
+def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field():
+    rng = np.random.default_rng(4)
+    picture = np.full((60, 80), 30000.0)
+    picture[:, :43] = 100.0
+    noise = np.sqrt(0.7 * picture) * rng.standard_normal((7, *picture.shape))
+    drifting = noise + 0.01 * rng.standard_normal((7, 1, 1)) * picture + rng.normal(0.0, 20.0, (7, 1, 1))
+    drifting[:, 5, 5] = 1e6 * rng.standard_normal(7)  # a pixel that is none
+    left = _without_common(drifting, picture)
+    for part in (np.s_[:, :43], np.s_[:, 43:]):
+        values = np.delete(left[:, *part].reshape(7, -1), 5 * left[:, *part].shape[2] + 5, axis=1)
+        wanted = float(np.mean(0.7 * picture[part]))
+        assert np.mean(values**2) == pytest.approx(wanted, rel=4.0 * np.sqrt(2.0 / values.size) + 2.0 / 4800)

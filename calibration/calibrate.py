@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
@@ -40,16 +40,19 @@ def calibrate_twin(
     advise: bool = True,
     spectra: Sequence[Spectrum] = (),
     estimator: str = "pairs",
+    repeated: Sequence[Series] | None = None,
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
     Args:
-        acquisition: open acquisition file; series held back for evaluation are not looked at.
+        acquisition: open acquisition file; series held back for evaluation are not looked at, but for the noise of beams
+            whose flats are single frames and that nothing else repeats.
         rng: source of randomness of the posterior's draws.
         progress: called with the name of each stage.
         provenance: kept in the twin.
         spectra: measured ones, in place of the tube model at their voltages.
         estimator: variances from `pairs` of successive frames, or from the `stack` about its mean.
+        repeated: flats and objects that the noise of single-frame flats may be read from, in place of the acquisition's.
         advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
@@ -57,7 +60,7 @@ def calibrate_twin(
     """
     tell = progress or (lambda stage: None)
     _prepare_spectra(acquisition, tell=tell, advise=advise)
-    transfer = compute_photon_transfer(acquisition, estimator=estimator, progress=tell)
+    transfer = compute_photon_transfer(acquisition, estimator=estimator, repeated=repeated, progress=tell)
     warnings = list(transfer.warnings)
     evidence = dict(transfer.evidence)
     spectral = None

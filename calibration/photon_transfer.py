@@ -5,8 +5,8 @@ neighbour covariances, once the bad pixels are known.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,17 @@ from ..generator.twin import BAD_PIXEL_CODES, DetectorMaps, Estimate, Level, Noi
 from ._kept_sums import KeptSums, SumsKeeper
 from .frame_sums import effective_frames, sum_frames
 from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covariance, fit_spread
+from .repeated_frames import (
+    RepeatedFrames,
+    beam_of,
+    bounded_read_variance,
+    evidence_of,
+    find_repeated_frames,
+    most_read_variance,
+    series_of_beams,
+    warning_of,
+    widened,
+)
 
 ESTIMATORS = ("pairs", "stack")
 COVARIANCE_FRAMES = 400
@@ -29,6 +40,7 @@ _SERIES_REPRODUCIBILITY = 1e-3  # of the level: what series of one setting are w
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
+_SINGLE = "a single frame has no noise"
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 Progress = Callable[[str], None]
@@ -39,9 +51,9 @@ class SeriesPoint:
     """One flat series as photon transfer sees it; per frame, detector means over good pixels.
 
     Fields: series, kV, filters, exposure_ms, load_mAs (None where unknown), frames, averaged, signal_DN (median),
-    mean_signal_DN, pair_variance_DN2, stack_variance_DN2 (of one single frame: averaging undone), used (False: masked,
-    with the reason in `masked`), drift_percent (change of the frame mean over the series),
-    common_mode_percent (rms output noise from frame to frame).
+    mean_signal_DN, pair_variance_DN2, stack_variance_DN2 (of one single frame: averaging undone; of a flat without a
+    second frame what other series of its beam show), used (False: masked, with the reason in `masked`), drift_percent
+    (change of the frame mean over the series), common_mode_percent (rms output noise from frame to frame).
     """
 
     series: str
@@ -301,28 +313,47 @@ def compute_photon_transfer(
     *,
     radius: int = 5,
     estimator: str = "pairs",
+    repeated: Sequence[Series] | None = None,
     progress: Progress | None = None,
 ) -> PhotonTransfer:
     """Photon transfer of the darks and flats of an acquisition that may calibrate.
+
+    Where the flats of a beam are single (averaged) frames, level and maps come from these and the noise from the repeated
+    frames of other series at the same kV and filters.
 
     Args:
         acquisition: one session, or several as one (`merge_sessions`): each then has its own darks.
         radius: largest lag of the noise covariances, px.
         estimator: where variances come from: `pairs` of successive frames, which slow drift leaves alone, or the `stack`
             about its mean, which lag lowers less. The evidence holds both.
+        repeated: flats and objects that the noise of beams with single-frame flats may be read from; None: those of the
+            acquisition, which are held back for evaluation only where there are no others.
         progress: called with the name of each stage.
 
     Raises:
-        InputError: no darks, no flats, nothing but saturated or single-frame flats, frames of several shapes, binned ones.
+        InputError: no darks, no flats, nothing but saturated flats or single frames, frames of several shapes, binned ones.
     """
     if estimator not in ESTIMATORS:
         raise InputError("estimator", received=estimator, expected="one of " + ", ".join(ESTIMATORS))
     with SumsKeeper() as keeper:
-        return _photon_transfer(acquisition, keeper, radius=radius, estimator=estimator, progress=progress)
+        return _photon_transfer(
+            acquisition,
+            keeper,
+            radius=radius,
+            estimator=estimator,
+            repeated=acquisition.series if repeated is None else repeated,
+            progress=progress,
+        )
 
 
 def _photon_transfer(
-    acquisition: AcquisitionFile, keeper: SumsKeeper, *, radius: int, estimator: str, progress: Progress | None
+    acquisition: AcquisitionFile,
+    keeper: SumsKeeper,
+    *,
+    radius: int,
+    estimator: str,
+    repeated: Sequence[Series],
+    progress: Progress | None,
 ) -> PhotonTransfer:
     tell = progress or (lambda stage: None)
     warnings: list[str] = []
@@ -381,45 +412,70 @@ def _photon_transfer(
             saturation[item.name] = full
             reason = f"saturated at {full:g} DN"
         elif total.frames < 2:
-            reason = "a single frame has no noise"
+            reason = _SINGLE
         else:
-            spread = math.sqrt(max(float(np.median(total.pair_variance_DN2)), 0.0))
-            top = float(2**bits - 1) if bits else max(_next_full_scale(total.maximum_DN), total.maximum_DN)
-            if float(np.median(total.mean_DN)) + 4 * spread > top:
+            top = _top(total, bits)
+            if _reaches(total, top):
                 saturation[item.name] = top
                 reason = f"within 4 standard deviations of the full scale of {top:g} DN"
         sums.append((item, total, reason))
+    # beams of single frames alone: their noise is looked for in what was repeated at the same beam
+    single = {beam_of(item) for item, _, reason in sums if reason == _SINGLE}
+    single -= {beam_of(item) for item, _, reason in sums if not reason}
+    noise_series = series_of_beams(repeated, sorted(single, key=str), shape)
+    judged = [
+        (item, total) for item, total, reason in sums if not reason or (reason == _SINGLE and beam_of(item) in single)
+    ]
+    if all(reason for *_, reason in sums) and not noise_series:
+        raise _no_usable_flat(acquisition, sums)
+    bad = _bad_pixels(darks, judged if noise_series else [pair for pair in judged if pair[1].pairs > 0])
+    good = bad == 0
+    radius = max(1, min(radius, (min(shape) - 1) // 4))
+    others = find_repeated_frames(
+        acquisition,
+        noise_series,
+        sums_of=lambda item: _sums_of(item, keeper),
+        dark_of=lambda item: _dark_of(darks, item),
+        usable=lambda total, mask: _saturation(total, bits) is None and not _reaches(total, _top(total, bits), mask),
+        good=good,
+        radius=radius,
+    )
+    if others:
+        sums = [(item, total, _reason_beside(item, total, reason, others, darks, good)) for item, total, reason in sums]
+        lit = {beam_of(item) for item, _, reason in sums if not reason}
+        others = tuple(item for item in others if item.beam in lit)
     masked = [(item.name, reason) for item, _, reason in sums if reason]
     if len(masked) == len(sums):
-        raise InputError(
-            f"acquisition {acquisition.path}",
-            received=f"no usable flat ({masked[0][0]}: {masked[0][1]})",
-            expected="at least one unsaturated flat series of two or more frames",
-            remedy="lower the current or the exposure, or take more frames",
-        )
+        raise _no_usable_flat(acquisition, sums)
     if masked:
         warnings.append("left out of the fit: " + "; ".join(f"{name} ({reason})" for name, reason in masked))
-
     good_sums = [(item, total) for item, total, reason in sums if not reason]
-    bad = _bad_pixels(darks, good_sums)
-    good = bad == 0
     if good.mean() < 0.5:
         warnings.append(f"{100 * (1 - good.mean()):.0f} % of the pixels look bad; the maps may not be trusted")
 
     tell("noise covariances")
-    radius = max(1, min(radius, (min(shape) - 1) // 4))
     keys = sorted(
-        {_group_key(item) for item, _ in good_sums}, key=lambda key: (key[0] is None, key[0] or 0.0, str(key[1]))
+        {beam_of(item) for item, _ in good_sums}, key=lambda key: (key[0] is None, key[0] or 0.0, str(key[1]))
     )
     index_of = {key: index for index, key in enumerate(keys)}
     dark_pairs = [(item, total) for item, total in darks.sums if total.pairs > 0]
+    stacks = [(item, total) for item, total in good_sums if total.pairs > 0]
 
     def collect(reach: int) -> tuple[list[NoiseCovariance], list[int]]:
         covariances, groups = [], []
-        for item, total in good_sums:
+        for item, total in stacks:
             signal = total.mean_DN - darks.of(item)
             covariances.append(_covariance(item, total, signal, good, reach, estimator))
-            groups.append(index_of[_group_key(item)])
+            groups.append(index_of[beam_of(item)])
+        for other in others:
+            covariances.append(
+                other.covariance(
+                    lambda item, total, mask: _covariance(
+                        item, total, total.mean_DN - _dark_of(darks, item), mask, reach, estimator
+                    )
+                )
+            )
+            groups.append(index_of[other.beam])
         for item, total in dark_pairs:
             covariances.append(_covariance(item, total, np.zeros(shape), good, reach, estimator))
             groups.append(-1)
@@ -427,7 +483,7 @@ def _photon_transfer(
 
     covariances, groups = collect(radius)
     usable = [c.signal_DN > 0 or g < 0 for c, g in zip(covariances, groups, strict=True)]
-    for (item, _), keep in zip(good_sums, usable, strict=False):
+    for (item, _), keep in zip(stacks, usable, strict=False):
         if not keep:
             warnings.append(f"left out of the fit: {item.name} (no signal above dark)")
     if not any(keep for keep, g in zip(usable, groups, strict=True) if g >= 0):
@@ -447,19 +503,28 @@ def _photon_transfer(
 
     # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
     dropped = set()
+    of_others = range(len(stacks), len(stacks) + len(others))
     while True:
-        worst = _bent(covariances, groups, usable, fit)
+        worst = _bent(covariances, groups, [keep and i not in of_others for i, keep in enumerate(usable)], fit)
         if worst is None:
             break
         usable[worst] = False
         dropped.add(worst)
-        name = good_sums[worst][0].name
+        name = stacks[worst][0].name
         warnings.append(f"left out of the fit: {name} (its variance bends away from the photon-transfer line)")
         fit = _fit(covariances, groups, usable, radius)
 
     tell("maps")
-    quantised = all(total.integer for _, total in [*dark_pairs, *good_sums])
+    # averaged frames are no whole numbers whatever the ADC does
+    counted = [*dark_pairs, *stacks, *((item, total) for other in others for item, total, _ in other.members)]
+    quantised = all(total.integer for _, total in counted)
     rounding = 1.0 / 12.0 if quantised else 0.0
+    flat_groups = [index_of[beam_of(item)] for item, _ in good_sums]
+    flat_usable = [True] * len(good_sums)
+    for (item, _), keep in zip(stacks, usable, strict=False):
+        flat_usable[next(i for i, (flat, _) in enumerate(good_sums) if flat is item)] = keep
+    if others:
+        fit = _with_others(fit, groups, usable, {index_of[item.beam]: item.where for item in others}, darks, good)
     read_variance = fit.read_variance_DN2 - rounding
     if not dark_pairs:
         warnings.append(
@@ -469,15 +534,21 @@ def _photon_transfer(
         warnings.append("read noise not seen above the ADC's rounding; set to 0 with its interval")
     read_sd = fit.read_sd_DN2
     read_noise = _root_estimate(read_variance, read_sd)
-    points = _points(sums, darks, good, covariances, groups, good_sums, usable, dropped)
+    points = _points(sums, darks, good, covariances, stacks, usable, dropped)
+    if others:
+        points = _with_noise_of_others(
+            points, others, covariances[of_others.start : of_others.stop], fit.read_variance_DN2
+        )
     read_map, read_relative_sd = _read_variance_map(darks, good, fit.read_variance_DN2)
-    gain_map, gain_sd = _gain_map(
-        good_sums, usable, darks, good, fit, [groups[i] for i in range(len(good_sums))], read_map, estimator
-    )
-    levels = _levels(acquisition, keys, good_sums, usable, darks, good, fit, groups, points, saturation)
+    gain_map, gain_sd = _gain_map(good_sums, flat_usable, darks, good, fit, flat_groups, read_map, estimator)
+    levels = _levels(acquisition, keys, good_sums, flat_usable, darks, good, fit, flat_groups, points, saturation)
     session = max((item.session for item in [*flats, *dark_series]), default=0)
     dark_estimate, reference_exposure = _dark_estimate(
-        darks, good, session, [item.exposure_ms for item, _ in good_sums if item.session == session]
+        darks,
+        good,
+        session,
+        [item.exposure_ms for item, _ in good_sums if item.session == session],
+        fit.read_variance_DN2,
     )
     evidence = _evidence(points, fit, darks, covariances, groups, good, warnings)
     evidence["estimator"] = estimator
@@ -486,9 +557,12 @@ def _photon_transfer(
         "gain_relative_sd": gain_sd,
         "gain_relative_spread": float(np.std(gain_map[good])),
         "read_variance_relative_sd": read_relative_sd,
-        "dark_sd_DN": _dark_map_sd(darks, good, session, reference_exposure),
+        "dark_sd_DN": _dark_map_sd(darks, good, session, reference_exposure, fit.read_variance_DN2),
     }
-    sessions = _session_evidence(acquisition, sums, usable, good_sums, darks, good, warnings)
+    if others:
+        evidence["repeated_frames"] = evidence_of(others, good)
+        warnings.append(warning_of(evidence["repeated_frames"]))
+    sessions = _session_evidence(acquisition, sums, flat_usable, good_sums, darks, good, warnings)
     if sessions is not None:
         evidence["sessions"] = sessions
     for point in points:
@@ -523,13 +597,98 @@ def _photon_transfer(
     )
 
 
+def _no_usable_flat(acquisition: AcquisitionFile, sums: Sequence[tuple[Series, KeptSums, str]]) -> InputError:
+    return InputError(
+        f"acquisition {acquisition.path}",
+        received=f"no usable flat ({sums[0][0].name}: {sums[0][2]})",
+        expected="at least one unsaturated flat series of two or more frames",
+        remedy="lower the current or the exposure, or take more frames",
+    )
+
+
+def _top(total: KeptSums, bits: int | None) -> float:
+    """Full scale that a series may reach, DN."""
+    return float(2**bits - 1) if bits else max(_next_full_scale(total.maximum_DN), total.maximum_DN)
+
+
+def _reaches(total: KeptSums, top_DN: float, mask: NDArray[np.bool_] | None = None) -> bool:
+    """Whether the noise of a series reaches a full scale."""
+    chosen = slice(None) if mask is None else mask
+    spread = math.sqrt(max(float(np.median(total.pair_variance_DN2[chosen])), 0.0))
+    return float(np.median(total.mean_DN[chosen])) + 4 * spread > top_DN
+
+
+def _dark_of(darks: _Darks, item: Series) -> NDArray[np.float64]:
+    return np.zeros(item.shape) if "offset" in item.corrected else darks.of(item)
+
+
+def _reason_beside(
+    item: Series,
+    total: KeptSums,
+    reason: str,
+    others: Sequence[RepeatedFrames],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+) -> str:
+    """Why a flat is left out once the noise of single frames is known from other series; empty: it is not."""
+    if reason != _SINGLE or all(other.beam != beam_of(item) for other in others):
+        return reason
+    return "" if float(np.median((total.mean_DN - darks.of(item))[good])) > 0 else "no signal above dark"
+
+
+def _with_others(
+    fit: SpreadFit,
+    groups: Sequence[int],
+    usable: Sequence[bool],
+    wheres: Mapping[int, str],
+    darks: _Darks,
+    good: NDArray[np.bool_],
+) -> SpreadFit:
+    """The fit with what the noise of other series leaves open; a read variance without darks' noise is kept between 0 and
+    what the darks' difference leaves."""
+    present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
+    fit = widened(fit, {present.index(group): where for group, where in wheres.items() if group in present})
+    if darks.effective > 0:
+        return fit
+    most = most_read_variance([(total.mean_DN, total.frames * item.averaged) for item, total in darks.sums], good)
+    if most is None:
+        return fit
+    value, sd = bounded_read_variance(fit.read_variance_DN2, fit.read_sd_DN2, most)
+    return replace(fit, read_variance_DN2=value, read_sd_DN2=sd)
+
+
+def _with_noise_of_others(
+    points: Sequence[SeriesPoint],
+    others: Sequence[RepeatedFrames],
+    covariances: Sequence[NoiseCovariance],
+    read_DN2: float,
+) -> tuple[SeriesPoint, ...]:
+    """Single-frame flats with the variance of one exposure, and the rms output noise, that other series of their beam show."""
+    result = []
+    for point in points:
+        beam = (point.kV, tuple(sorted(str(layer) for layer in point.filters)))
+        mine = [item for other, item in zip(others, covariances, strict=True) if other.beam == beam]
+        if point.used and point.frames < 2 and mine:
+            weights = [item.samples for item in mine]
+            slopes = [(item.covariance_DN2[item.radius, item.radius] - read_DN2) / item.signal_DN for item in mine]
+            variance = float(np.average(slopes, weights=weights)) * point.mean_signal_DN + read_DN2
+            common = float(np.average([item.common_mode for item in mine], weights=weights))
+            result.append(
+                replace(
+                    point,
+                    pair_variance_DN2=variance,
+                    stack_variance_DN2=variance,
+                    common_mode_percent=100.0 * math.sqrt(common),
+                )
+            )
+        else:
+            result.append(point)
+    return tuple(result)
+
+
 def _next_full_scale(value: float) -> float:
     """The smallest usual full scale at or above a value, DN."""
     return next((scale for scale in _FULL_SCALES if scale >= value), math.inf)
-
-
-def _group_key(item: Series) -> tuple[float | None, tuple[str, ...]]:
-    return (item.kV, tuple(sorted(str(layer) for layer in item.filters)))
 
 
 def _fit(covariances: list[NoiseCovariance], groups: list[int], usable: list[bool], radius: int) -> SpreadFit:
@@ -599,7 +758,11 @@ def _median_of_means(values: NDArray[np.float64], frames: int, integer: bool) ->
 
 
 def _dark_estimate(
-    darks: _Darks, good: NDArray[np.bool_], session: int, exposures: Sequence[float | None]
+    darks: _Darks,
+    good: NDArray[np.bool_],
+    session: int,
+    exposures: Sequence[float | None],
+    read_DN2: float,
 ) -> tuple[Estimate, float | None]:
     """Median dark (DN) of a session at the shortest exposure of its flats that was measured dark; spread of repeats
     included."""
@@ -614,7 +777,10 @@ def _dark_estimate(
     repeats = [_median_of_means(total.mean_DN[good], total.frames, total.integer) for _, total in there]
     frames = sum(total.frames for _, total in there)
     pixels = int(good.sum())
-    noise = float(np.nanmedian(darks.variance[good])) / max(frames, 1) if darks.effective > 0 else 0.0
+    if darks.effective > 0:
+        noise = float(np.nanmedian(darks.variance[good])) / max(frames, 1)
+    else:
+        noise = max(read_DN2, 0.0) / max(sum(total.frames * item.averaged for item, total in there), 1)
     # frame noise carries pixels over the median of the map: sd^2 = E|noise| / (pixels x density at the median)
     low, high = np.quantile(mean[good], [0.4, 0.6])
     sd = math.sqrt(math.sqrt(2.0 * noise / math.pi) * max(float(high - low), 0.5 * math.sqrt(noise)) / 0.2 / pixels)
@@ -623,16 +789,20 @@ def _dark_estimate(
     return estimate_from_sd(level, max(sd, 1e-9)), exposure
 
 
-def _dark_map_sd(darks: _Darks, good: NDArray[np.bool_], session: int, exposure_ms: float | None) -> float | None:
-    """Standard deviation of one pixel of the dark frame (DN), from the frames it is the mean of."""
+def _dark_map_sd(
+    darks: _Darks, good: NDArray[np.bool_], session: int, exposure_ms: float | None, read_DN2: float
+) -> float | None:
+    """Standard deviation of one pixel of the dark frame (DN), from the frames it is the mean of; `read_DN2` where these
+    show no noise."""
     frames = sum(
         total.frames * item.averaged
         for item, total in darks.sums
         if (item.session, item.exposure_ms) == (session, exposure_ms)
     )
-    if frames == 0 or darks.effective < 1:
+    if frames == 0:
         return None
-    return math.sqrt(max(float(np.mean(darks.variance[good])), 0.0) / frames)
+    variance = float(np.mean(darks.variance[good])) if darks.effective >= 1 else read_DN2
+    return math.sqrt(max(variance, 0.0) / frames)
 
 
 def _read_variance_map(
@@ -709,12 +879,11 @@ def _points(
     darks: _Darks,
     good: NDArray[np.bool_],
     covariances: Sequence[NoiseCovariance],
-    groups: Sequence[int],
-    good_sums: Sequence[tuple[Series, KeptSums]],
+    stacks: Sequence[tuple[Series, KeptSums]],
     usable: Sequence[bool],
     dropped: set[int],
 ) -> tuple[SeriesPoint, ...]:
-    order = {item.name: index for index, (item, _) in enumerate(good_sums)}
+    order = {item.name: index for index, (item, _) in enumerate(stacks)}
     points = []
     for item, total, reason in sums:
         signal = total.mean_DN - darks.of(item)
@@ -793,7 +962,7 @@ def _levels(
         saturated = [
             value
             for name, value in saturation.items()
-            if _group_key(next(s for s in acquisition.series if s.name == name)) == keys[group]
+            if beam_of(next(s for s in acquisition.series if s.name == name)) == keys[group]
         ]
         levels.append(
             Level(
@@ -838,7 +1007,7 @@ def _rate(
     load = np.array([point.load_mAs for point in known], dtype=np.float64)
     signal = np.array([point.signal_DN for point in known])
     noise = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
-    frames = np.array([point.frames for point in known], dtype=np.float64)
+    frames = np.array([point.frames * point.averaged for point in known], dtype=np.float64)
     of_a_pixel = (noise + np.array([p.pair_variance_DN2 for p in known])) / frames
     # robust: a few pixels far off do not move a median
     spread = 1.4826 * float(np.median(np.abs(flat_shape[good] - np.median(flat_shape[good]))))
@@ -973,7 +1142,7 @@ def _session_evidence(
             load = _load(item)
             if keep and load is not None and item.session == number:
                 signal = float(np.median((total.mean_DN - darks.of(item))[good]))
-                loads.setdefault((*_group_key(item), item.source_detector_mm), []).append((signal, load))
+                loads.setdefault((*beam_of(item), item.source_detector_mm), []).append((signal, load))
         level_change: dict[str, float] = {}
         for beam, pairs in loads.items():
             rate = sum(signal for signal, _ in pairs) / sum(load for _, load in pairs)
@@ -1023,7 +1192,7 @@ def _repeats(
         sampling = []
         for point in members:
             quanta_DN2 = max(point.pair_variance_DN2 - read_DN2, 0.0) / max(share, 1e-3)
-            noise_DN2 = ((quanta_DN2 + read_DN2) / point.frames + read_DN2 / dark_frames) / pixels
+            noise_DN2 = ((quanta_DN2 + read_DN2) / (point.frames * point.averaged) + read_DN2 / dark_frames) / pixels
             of_pixels = 100.0 * math.sqrt(noise_DN2) / max(point.mean_signal_DN, 1e-9)
             sampling.append(math.hypot(point.common_mode_percent / math.sqrt(point.frames), of_pixels))
         rows.append(

@@ -1202,9 +1202,9 @@ def _local_nuisances(
     if series.kind in ("dark", "afterglow"):
         images[f"dark of {series.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
         return result | projected(images)
-    # without a voltage the noise of a beam is known only from its own series
+    # without a voltage, or a calibrating flat of two frames, the noise of a beam is known only from its own series
     voltage = f"unknown kV ({series.current_mA}, {series.power_W})" if series.kV is None else f"{series.kV:g} kV"
-    gain_sd = _UNKNOWN_GAIN_SD if series.kV is None else scales.GAIN_OF_BEAM_SD
+    gain_sd = _UNKNOWN_GAIN_SD if series.kV is None or item.own_noise else scales.GAIN_OF_BEAM_SD
     beam = f"{voltage} " + "+".join(str(layer) for layer in series.filters)
     images[f"level of {beam}"] = scales.LEVEL_OF_BEAM_SD * signal
     images[f"level of {series.name}"] = scales.LEVEL_OF_SERIES_SD * signal

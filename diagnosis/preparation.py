@@ -37,10 +37,11 @@ class PreparedSession:
 def calibrated_twin(
     acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
 ) -> Twin:
-    """The twin from the series that calibrate (see diagnosis.session)."""
+    """The twin from the series that calibrate (see diagnosis.session); single-frame flats have their noise from the rest."""
     names = calibrating_names(acquisition.series)
     part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
-    return calibrate_twin(part, rng=rng, progress=progress)
+    rest = tuple(item for item in acquisition.series if item.name not in names)
+    return calibrate_twin(part, rng=rng, progress=progress, repeated=rest)
 
 
 def prepare_session(

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..calibration.repeated_frames import Beam, beam_of
 from ..errors import InputError
 from ..generator.series import SeriesRequest
 
@@ -17,12 +18,16 @@ _ONE_RATE = 1.25  # largest over smallest level a unit of exposure that one unkn
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSeries:
-    """One series and its part: `calibrates` (dark and gain maps come from it), `after` (later than the calibration)."""
+    """One series and its part: `calibrates` (dark and gain maps come from it), `after` (later than the calibration).
+
+    own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
+    """
 
     series: Series
     request: SeriesRequest
     calibrates: bool
     after: bool
+    own_noise: bool = False
 
     @property
     def name(self) -> str:
@@ -68,6 +73,12 @@ def calibrating_names(series: Sequence[Series]) -> frozenset[str]:
             seen_flats.add(key)
             chosen.add(item.name)
     return frozenset(chosen)
+
+
+def _noiseless_beams(series: Sequence[Series], calibrating: frozenset[str]) -> frozenset[Beam]:
+    """Beams whose calibrating flats are all single frames."""
+    flats = [item for item in series if item.kind == "flat" and item.name in calibrating]
+    return frozenset(map(beam_of, flats)) - {beam_of(item) for item in flats if item.n_frames > 1}
 
 
 def _mean_DN(item: Series) -> float:
@@ -149,6 +160,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
         raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
     stated = any(item.role == "calibration" for item in ordered)
     calibrating = frozenset() if calibrated_elsewhere and not stated else calibrating_names(ordered)
+    noiseless = frozenset() if calibrated_elsewhere else _noiseless_beams(ordered, calibrating)
     instrument = acquisition.instrument
     levels = measured_levels(ordered)
     clock = 0.0
@@ -205,5 +217,13 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             previous=tuple(replace(before, previous=()) for before in requests[-_REMEMBERED:]),
         )
         requests.append(request)
-        result.append(SessionSeries(series=item, request=request, calibrates=calibrates, after=after))
+        result.append(
+            SessionSeries(
+                series=item,
+                request=request,
+                calibrates=calibrates,
+                after=after,
+                own_noise=item.kind != "dark" and beam_of(item) in noiseless,
+            )
+        )
     return tuple(result)

@@ -28,10 +28,13 @@ LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
+_REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
 UNKNOWN_DOUBT = 0.05  # share of what an effect of the catalogue explains that an unknown one must explain beyond it
+UNKNOWN_CHANCE = 3.0  # log evidence that sessions without any effect show by chance (up to 3.5 in 46 sealed ones)
 PAIR_DOUBT = 3e-3  # share of the stronger effect's log evidence that a second effect must bring
 PAIR_DOUBT_ROOT = 0.6  # and so often its square root: what a slightly wrong law leaves by chance
+PAIR_DOUBT_ELSEWHERE = 0.25  # share of both that is left of them where the two effects move no probe in common
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
@@ -231,7 +234,7 @@ class CurveFit:
 
 def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
     """Nodes with a finer set about `best`, 6 relative widths to each side."""
-    span = np.linspace(-6.0, 6.0, 49) * min(max(width, 1e-4), 0.5)
+    span = np.linspace(-6.0, 6.0, 49) * min(max(width, 1e-6), 0.5)
     near = best * np.exp(span)
     return np.unique(np.concatenate([strengths, near[(near >= strengths[0]) & (near <= strengths[-1])]]))
 
@@ -299,8 +302,8 @@ def fit_curve(
     strengths = coarse
     value, quadratic = likelihood(strengths, sharp)
     at = int(np.argmax(value))
-    for _ in range(3):
-        width = 1.0 / math.sqrt(max(float(quadratic[at]), 1e-6))
+    for reach in _REACHES:  # a peak sharper than the nodes lie apart is closed in on
+        width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
         strengths = _refined(coarse, float(strengths[at]), width)
         value, quadratic = likelihood(strengths, sharp)
         at = int(np.argmax(value))
@@ -535,12 +538,16 @@ def weigh_hypotheses(
                 continue
             done.add(key)
             start = _start_pair(leading, second_fits, states=states, table=table)
-            # the first's own variants were averaged above; its best stands for them. What a law that is slightly off
-            # leaves of a strong effect, any second effect can take up a little of
-            more = evidence_of[first] - leading.log_evidence
-            stronger = max(evidence_of[first], evidence_of[second], 0.0)
-            more -= PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
-            starts.append((more, first, second, start))
+            # the first's own variants were averaged above; its best stands for them
+            starts.append((evidence_of[first] - leading.log_evidence, first, second, start))
+    overlaps = _overlaps([start for *_, start in starts], nuisances, table)
+    for number, (more, first, second, start) in enumerate(starts):
+        # what a law that is slightly off leaves of a strong effect, a second one that acts on the same probes takes up a
+        # little of
+        stronger = max(evidence_of[first], evidence_of[second], 0.0)
+        doubt = PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
+        share = PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
+        starts[number] = (more - share * doubt, first, second, start)
     starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
     for number, (more, first, second, start) in enumerate(starts):
         errors = law_errors if number < _PAIRS_IN_FULL else ()
@@ -551,7 +558,9 @@ def weigh_hypotheses(
     names = group_names if unknown_names is None else unknown_names
     unknown, place = unknown_evidence(residual, nuisances, parts, names)
     # no law is exact: a strong effect leaves a part of what it does to be explained by anything
-    unknown -= UNKNOWN_DOUBT * max(0.0, min(unknown, max((evidence for _, evidence, *_ in raw), default=0.0)))
+    unknown -= UNKNOWN_CHANCE + UNKNOWN_DOUBT * max(
+        0.0, min(unknown, max((evidence for _, evidence, *_ in raw), default=0.0))
+    )
     raw.append(((UNKNOWN,), unknown, math.log(priors.unknown), {}, {}, place))
     scores = np.array([power * evidence + prior for _, evidence, prior, *_ in raw])
     probability = np.exp(scores - scores.max())
@@ -657,6 +666,19 @@ def _start_pair(
     weights_b = b.weights(np.array([grid.best[1]]))[0]
     moves = math.sqrt(max(float(weights_b @ states[0].gram[np.ix_(rows, rows)] @ weights_b), 0.0))
     return _PairStart(first=a, second=b, grid=grid, log_evidence=mean, moves=moves)
+
+
+def _overlaps(starts: Sequence[_PairStart], nuisances: Nuisances, table: _NodeTable) -> NDArray[np.float64]:
+    """How far the two effects of each pair move the same probes: cosine of what the nuisances leave of them, signs aside."""
+    solved = nuisances.solve_all(table.nodes)
+    result = np.ones(len(starts))
+    for number, start in enumerate(starts):
+        first, second = (
+            np.abs(curve.weights(np.array([strength]))[0] @ solved[table.rows(curve)])
+            for curve, strength in zip((start.first, start.second), start.grid.best, strict=True)
+        )
+        result[number] = float(first @ second) / max(math.sqrt(float(first @ first) * float(second @ second)), 1e-12)
+    return result
 
 
 def _finish_pair(

@@ -324,3 +324,53 @@ def test_an_interval_covers_the_variants_that_are_as_likely():
     assert one[1] < 4.0 < one[2] < 5.0
     assert both[1] < 4.0
     assert both[2] > 7.5
+
+
+@pytest.mark.parametrize("sharpness", [0.3, 3.0, 30.0, 200.0])
+def test_a_peak_far_sharper_than_the_nodes_lie_apart_is_found(sharpness):
+    rng = np.random.default_rng(6)
+    response = sharpness * rng.standard_normal(PROBES)
+    residual = 4.0 * response + rng.standard_normal(PROBES)
+    curve = Curve(
+        effect="a",
+        variant="",
+        parameters={},
+        low=0.05,
+        high=50.0,
+        strengths=np.array([1.0]),
+        responses=response[None, :],
+    )
+    fit = fit_curve(residual, curve, Nuisances(np.zeros((PROBES, 1))), GROUPS, law_errors=())
+    exact = float(response @ residual / (response @ response))
+    sd = 1.0 / float(np.linalg.norm(response))
+    assert abs(fit.best - exact) < 0.26 * sd
+    # Laplace's integral of the Gaussian in the logarithm of the strength over the log-uniform prior
+    peak = 0.5 * exact**2 / sd**2
+    wanted = peak + np.log(np.sqrt(2.0 * np.pi) * sd / exact / np.log(50.0 / 0.05))
+    assert fit.log_evidence == pytest.approx(wanted, abs=0.05 + 2.0 * (sd / exact) ** 2)
+    value, low, high = interval_of([fit])
+    assert (low, value, high) == pytest.approx((exact - 1.96 * sd, exact, exact + 1.96 * sd), abs=0.1 * sd)
+
+
+def test_a_second_effect_elsewhere_is_named_beside_a_strong_one():
+    rng = np.random.default_rng(8)
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[:200] = rng.standard_normal(200)
+    weak[400:420] = rng.standard_normal(20)
+    made = [
+        Curve(
+            effect=name,
+            variant="",
+            parameters={},
+            low=0.5,
+            high=500.0,
+            strengths=np.array([1.0]),
+            responses=direction[None, :],
+        )
+        for name, direction in (("strong", strong), ("weak", weak))
+    ]
+    residual = 10.0 * strong + 3.0 * weak + rng.standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), made)
+    assert found[0].effects == ("strong", "weak")
+    alone = weigh(10.0 * strong + rng.standard_normal(PROBES), np.zeros((PROBES, 1)), made)
+    assert alone[0].effects == ("strong",)

@@ -42,7 +42,7 @@ from .probes import (
 )
 from .registration import LARGEST_PX, Placement, gradient, register, render_variance
 from .session import SessionSeries, read_session
-from .summaries import BLOCK_PX, LAGS, SeriesSummary, summarise_series
+from .summaries import BLOCK_PX, LAGS, FirstLook, SeriesSummary, look_at_series, summarise_series
 
 Map = NDArray[np.float32]
 _CACHE_BYTES = 200_000_000
@@ -302,20 +302,16 @@ def build_problem(
             expected="darks and flats whose kV, exposure and tube load are stated",
         )
 
-    def summarise(item: SessionSeries, usable: NDArray[np.bool_]) -> SeriesSummary:
+    saturation_DN = None if acquisition.instrument.bits is None else 2.0**acquisition.instrument.bits - 1
+
+    def pattern_of(item: SessionSeries, usable: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+        """How one unit of a frame's common factor looks."""
         signal = np.broadcast_to(np.asarray(expected[item.name].signal_DN, dtype=np.float64), shape)
         mean = float(signal[usable].mean())
-        return summarise_series(
-            item.series.iter_frames(),
-            good=usable,
-            labels=labels[item.name],
-            pattern=signal / mean if item.series.kind in ("flat", "object") and mean > 0 else None,
-            name=f"series {item.name}",
-            saturation_DN=None if acquisition.instrument.bits is None else 2.0**acquisition.instrument.bits - 1,
-        )
+        return signal / mean if item.series.kind in ("flat", "object") and mean > 0 else None
 
     tell("frames")
-    summaries: dict[str, SeriesSummary] = {}
+    looks: dict[str, FirstLook] = {}
     label_names: dict[str, tuple[str, ...]] = {}
     labels: dict[str, NDArray[np.int64]] = {}
     for item in kept:
@@ -325,8 +321,14 @@ def build_problem(
         kind = item.series.kind
         labels[item.name], label_names[item.name] = _labels(signal, open_DN, kind, good)
         tell(f"frames of {item.name}")
-        summaries[item.name] = summarise(item, good)
-        full = summaries[item.name].saturated_share
+        looks[item.name] = look_at_series(
+            item.series.iter_frames(),
+            good=good,
+            pattern=pattern_of(item, good),
+            name=f"series {item.name}",
+            saturation_DN=saturation_DN,
+        )
+        full = looks[item.name].saturated_share
         if full > 1e-3 and kind != "dark":
             skipped.append(f"{item.name}: saturated in {100 * full:.2g} % of the pixels")
     kept = [item for item in kept if not any(text.startswith(f"{item.name}: saturated") for text in skipped)]
@@ -349,7 +351,7 @@ def build_problem(
             return np.asarray(twin.maps.dark_at(item.series.exposure_ms), dtype=np.float64)
         result = np.zeros(shape)
         for name, weight in weights.items():
-            result += weight * summaries[name].mean_DN
+            result += weight * looks[name].mean_DN
         return result
 
     def dark_noise_of(item: SessionSeries) -> float:
@@ -359,7 +361,7 @@ def build_problem(
         total = 0.0
         for name, weight in dark_weights(item).items():
             variance = float(np.mean(np.broadcast_to(expected[name].white_variance_DN2, shape)[good]))
-            total += weight**2 * variance / summaries[name].frames
+            total += weight**2 * variance / looks[name].frames
         return total
 
     # gain map: what the calibrating flats show over what the smooth model expects
@@ -383,23 +385,30 @@ def build_problem(
             gain_quantum += weight * float(np.mean(np.broadcast_to(model.quantum_variance_DN2, shape)[good]))
             gain_white += weight * float(np.mean(np.broadcast_to(model.white_variance_DN2, shape)[good]))
             signal_map = np.maximum(np.broadcast_to(expected[item.name].signal_DN, shape), 1e-9)
-            gain += shares[item.name] * (summaries[item.name].mean_DN - dark_map(item)) / signal_map
+            gain += shares[item.name] * (looks[item.name].mean_DN - dark_map(item)) / signal_map
     else:
         gain = _gain_of_twin(twin)
     good = good & (gain > 0.05)
-    outlying = _new_outliers(kept, expected, summaries, dark_map, gain, good, shape)
+    outlying = _new_outliers(kept, expected, looks, dark_map, gain, good, shape)
     clean = good & ~outlying
-    memory = {item.name: _memory(summaries[item.name], outlying) for item in kept if item.series.kind == "dark"}
-    if outlying.any():
-        # they count as outliers; what else is said of noise is said without them
-        for item in kept:
-            tell(f"frames of {item.name} without outliers")
-            summaries[item.name] = summarise(item, clean)
+    memory = {item.name: _memory(looks[item.name], outlying) for item in kept if item.series.kind == "dark"}
+    # they count as outliers; what else is said of noise is said without them
+    summaries: dict[str, SeriesSummary] = {}
+    for item in kept:
+        tell(f"frames of {item.name} without outliers")
+        summaries[item.name] = summarise_series(
+            item.series.iter_frames(),
+            good=clean,
+            labels=labels[item.name],
+            pattern=pattern_of(item, clean),
+            name=f"series {item.name}",
+            saturation_DN=saturation_DN,
+        )
 
     tell("registration")
     corrected: dict[str, NDArray[np.float64]] = {}
     for item in kept:
-        measured = summaries[item.name].mean_DN - dark_map(item)
+        measured = looks[item.name].mean_DN - dark_map(item)
         if item.series.kind in ("flat", "object") and "gain" not in item.series.corrected:
             measured = measured / np.where(good, gain, 1.0)
         corrected[item.name] = measured
@@ -569,8 +578,7 @@ def build_problem(
         if item.name in placements and _only_displaces(change):
             moved = nowhere
         if kind in ("flat", "object") and bool(np.any(taken.gain)):
-            signal = np.broadcast_to(np.asarray(model.signal_DN, dtype=np.float32), shape)
-            moved = moved - signal * taken.gain
+            moved = moved - np.asarray(model.signal_DN, dtype=np.float32) * taken.gain
         if item.name in first_of_place and item.name in placements:
             values = (
                 values | {"displacement along rows": 0.0, "displacement along columns": 0.0} | _displacement_of(change)
@@ -723,7 +731,7 @@ def build_problem(
                 for item, block in zip(kept, blocks, strict=True):
                     found = move(item, change, taken, {})
                     if found is not None:
-                        parts.append(_standardised(block, base_scalars[item.name], [found[0]], [found[1]], shape)[0])
+                        parts.append(_standardised(block, base_scalars[item.name], [found[0]], [found[1]])[0])
                 if not change.failed:
                     rows.append(np.concatenate(parts))
             if len(rows) == len(variant.strengths):
@@ -984,7 +992,7 @@ def _pattern_statistics(
 def _new_outliers(
     kept: Sequence[SessionSeries],
     expected: dict[str, ExpectedSeries],
-    summaries: dict[str, SeriesSummary],
+    looks: Mapping[str, FirstLook],
     dark_map: Callable[[SessionSeries], NDArray[np.float64]],
     gain: NDArray[np.float64],
     good: NDArray[np.bool_],
@@ -995,7 +1003,7 @@ def _new_outliers(
     for item in kept:
         if item.series.kind not in ("dark", "flat"):
             continue
-        summary = summaries[item.name]
+        summary = looks[item.name]
         residual = summary.mean_DN - dark_map(item)
         if item.series.kind == "flat":
             signal = np.broadcast_to(expected[item.name].signal_DN, shape)
@@ -1015,7 +1023,7 @@ def _new_outliers(
     return outlying if outlying.sum() < 0.1 * good.sum() else np.zeros(shape, dtype=bool)
 
 
-def _memory(summary: SeriesSummary, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
+def _memory(summary: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
     """Median share of outlying pixels' variance that lasts from frame to frame, and their number; None: none is noisy."""
     stack, pair = summary.stack_variance_DN2[outlying], summary.pair_variance_DN2[outlying]
     seen = stack > 0
@@ -1090,18 +1098,24 @@ def _block(
         if image is not None and values is not None
     ]
     if known:
-        found = _standardised(block, base_scalars, [one[1] for one in known], [one[2] for one in known], shape)
+        found = _standardised(block, base_scalars, [one[1] for one in known], [one[2] for one in known])
         responses[[one[0] for one in known]] = found
     block["responses"] = responses
-    block["offset"] = _offset(item, projection, scalar_probes, previous_DN, shape) * shrink
+    block["offset"] = _offset(item, projection, scalar_probes, previous_DN) * shrink
     block["pattern"], block["pattern_jitter"] = _pattern_of_gain(item, projection, signal, len(scalar_probes), shrink)
     # a panel seldom warms evenly, and no anode's heel is a straight line
     rows, columns = shape
     ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
     some = [(index, image) for index, image in enumerate(maps) if index in uneven and image is not None]
-    both = np.stack([np.broadcast_to(image * ramp, shape) for _, image in some for ramp in ramps]) if some else None
-    found = np.zeros((0, len(names))) if both is None else projection.apply(both)
-    found = np.pad(found, ((0, 0), (0, len(names) - found.shape[1]))) * shrink
+    found = np.zeros((2 * len(some), len(names)))
+    if some:
+        alike = projection.apply(np.stack([np.broadcast_to(ramp, shape) for ramp in ramps]))
+        for place, (_, image) in enumerate(some):
+            moved = float(image.flat[0]) * alike if image.size == 1 else None
+            if moved is None:
+                moved = projection.apply(np.stack([image * ramp for ramp in ramps]))
+            found[2 * place : 2 * place + 2, : len(projection)] = moved
+    found *= shrink
     block["uneven"] = {index: found[2 * place : 2 * place + 2] for place, (index, _) in enumerate(some)}
     return block
 
@@ -1111,7 +1125,6 @@ def _offset(
     projection: MapProjection,
     scalar_probes: Sequence[Scalar],
     previous_DN: float | None,
-    shape: tuple[int, int],
 ) -> NDArray[np.float64]:
     """What one DN more in every pixel of a later series does (probe,)."""
     if item.calibrates:
@@ -1120,7 +1133,7 @@ def _offset(
         1.0 / previous_DN / probe.sd if previous_DN and probe.name.startswith("afterglow") else 0.0
         for probe in scalar_probes
     ]
-    return np.concatenate([projection.apply(np.ones(shape)), scalars])
+    return np.concatenate([projection.of_level, scalars])
 
 
 def _pattern_of_gain(
@@ -1131,19 +1144,26 @@ def _pattern_of_gain(
     shrink: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest."""
-    waves = _waves(signal.shape, scales.PATTERN_WAVES + 1)
+    waves = _pattern_waves(signal.shape)
     smooth = np.zeros((len(projection) + n_scalars, len(waves)))
     rest = np.zeros(len(projection) + n_scalars)
     if item.calibrates or item.series.kind not in ("flat", "object"):
         return smooth, rest
-    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
-    amounts = []
-    for numbers, wave in waves.items():
-        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
-        amounts.append(0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave)
-    smooth[: len(projection)] = projection.apply(np.stack(amounts) * signal).T
+    smooth[: len(projection)] = projection.apply(waves * signal.astype(np.float32)).T
     rest[: len(projection)] = projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
     return smooth * shrink[:, None], rest * shrink**2
+
+
+@lru_cache(maxsize=1)
+def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The smooth part of 1 % of a changed gain map: waves (wave, row, column) that it holds by chance."""
+    waves = _waves(shape, scales.PATTERN_WAVES + 1)
+    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
+    result = np.empty((len(waves), *shape), np.float32)
+    for image, (numbers, wave) in zip(result, waves.items(), strict=True):
+        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
+        image[...] = 0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave
+    return result
 
 
 @lru_cache(maxsize=8)
@@ -1158,14 +1178,10 @@ def _standardised(
     base_scalars: Mapping[str, float],
     images: Sequence[Map],
     values: Sequence[Mapping[str, float]],
-    shape: tuple[int, int],
 ) -> NDArray[np.float64]:
     """Responses (change, probe) of one series' probes to changes of its mean frame and scalars."""
     projection: MapProjection = block["projection"]
-    moved = np.zeros((len(images), len(projection)))
-    seen = [number for number, image in enumerate(images) if image.shape == shape or float(image.flat[0]) != 0.0]
-    if seen:
-        moved[seen] = projection.apply(np.stack([np.broadcast_to(images[number], shape) for number in seen]))
+    moved = projection.apply_each(images)
     scalar = np.array(
         [
             [(own.get(probe.name, base_scalars[probe.name]) - base_scalars[probe.name]) / probe.sd for own in values]

@@ -112,11 +112,13 @@ def _lag_loss(expected: ExpectedSeries) -> float:
 class Areas:
     """The good pixels of a frame, those of one label together.
 
-    Fields: order (pixel,): flat indices, those without label first; parts: where each label's lie in it.
+    Fields: order (pixel,): flat indices, those without label first; parts: where each label's lie in it; known: the last
+    map of which means were taken, and these.
     """
 
     order: NDArray[np.intp]
     parts: tuple[slice, ...]
+    known: list[tuple[NDArray[np.floating], tuple[float, NDArray[np.float64]]]] = field(default_factory=list)
 
     @staticmethod
     def of(good: NDArray[np.bool_], labels: NDArray[np.int64], count: int) -> "Areas":
@@ -132,8 +134,16 @@ class Areas:
         """Means of a map, (row, column) or (1, 1), over all good pixels and over each label's (label,)."""
         if image.size == 1:
             return float(image.flat[0]), np.full(len(self.parts), float(image.flat[0]))
+        for one, means in self.known:
+            if one is image:
+                return means
         values = image.ravel()[self.order]
-        return float(values.mean()), np.array([values[part].mean() for part in self.parts])
+        sums = np.array([np.add.reduce(values[part]) for part in self.parts])
+        counts = np.array([part.stop - part.start for part in self.parts])
+        found = float(np.add.reduce(values)) / values.size, sums / counts
+        # what acts after the quanta leaves their map as it is
+        self.known[:] = [(image, found), *self.known[:1]]
+        return found
 
     def mean(self, image: NDArray[np.floating] | float) -> float:
         """Mean of a map over all good pixels."""
@@ -586,21 +596,21 @@ class MapProjection:
         tolerance: float = 1e-3,
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
-        self._inside = np.flatnonzero(mask)
+        inside = np.flatnonzero(mask)
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
         sharper, root = np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0))
-        correlated = _Correlation(mask.shape, np.asarray(autocovariance_table, dtype=np.float64))
+        correlated = _Correlation(np.asarray(autocovariance_table, dtype=np.float64))
         used: list[Template] = []
-        rows, spread = (np.empty((len(templates), self._inside.size)) for _ in range(2))
+        rows, spread = (np.empty((len(templates), inside.size)) for _ in range(2))
         for template in templates:
             image = template.image * sharper
             norm = math.sqrt(float(np.vdot(image, image)))
             if not (norm > _LEAST_NORM and math.isfinite(norm)):
                 continue
             image *= sharper / norm
-            rows[len(used)] = image.ravel()[self._inside]
+            rows[len(used)] = image.ravel()[inside]
             covered = root * correlated(image * root) + image * white_DN2
-            spread[len(used)] = covered.ravel()[self._inside]
+            spread[len(used)] = covered.ravel()[inside]
             used.append(template)
         left = rows[: len(used)] @ spread[: len(used)].T
         own = np.diag(left).copy()
@@ -617,24 +627,37 @@ class MapProjection:
             ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
             for item in (used[number] for number in chosen)
         )
-        self._rows = np.zeros((0, self._inside.size), np.float32)
+        # (probe, pixel), 0 outside the mask: so maps are taken as they are
+        self._rows = np.zeros((len(chosen), mask.size), np.float32)
         if chosen:
             from scipy.linalg import solve_triangular
 
             lower = np.tril(np.stack(columns, axis=1)[chosen])
-            self._rows = solve_triangular(lower, rows[chosen], lower=True).astype(np.float32)
+            self._rows[:, inside] = solve_triangular(lower, rows[chosen], lower=True)
+        self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
 
     def __len__(self) -> int:
         return len(self._names)
 
     def apply(self, images: NDArray[np.floating]) -> NDArray[np.float64]:
         """Standardised projections (..., probe) of maps (..., row, column), DN."""
-        pixels = images.reshape(*images.shape[:-2], -1)[..., self._inside].astype(np.float32, copy=False)
+        pixels = images.reshape(*images.shape[:-2], -1).astype(np.float32, copy=False)
         return np.asarray(pixels @ self._rows.T, dtype=np.float64)
+
+    def apply_each(self, images: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+        """Standardised projections (image, probe) of maps, (row, column) or (1, 1) where all pixels are alike, DN."""
+        result = np.empty((len(images), len(self)))
+        wide = [number for number, image in enumerate(images) if image.size > 1]
+        for number, image in enumerate(images):
+            if image.size == 1:
+                result[number] = float(image.flat[0]) * self.of_level
+        if wide:
+            result[wide] = self.apply(np.stack([images[number] for number in wide]))
+        return result
 
     def pixel_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
         """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
-        variance = np.asarray(sd_DN, dtype=np.float32).ravel()[self._inside] ** 2
+        variance = np.asarray(sd_DN, dtype=np.float32).ravel() ** 2
         return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
 
     def names(self) -> list[ProbeName]:
@@ -645,23 +668,23 @@ class MapProjection:
 class _Correlation:
     """Convolution of maps (row, column) with the autocovariance of which a table (lag, lag) is a quarter; 0 outside.
 
-    As a sum of products of a matrix for rows and one for columns: a spread that no effect has changed is one such product.
+    As a sum of products of a kernel for rows and one for columns: a spread that no effect has changed is one such product.
     """
 
-    def __init__(self, shape: tuple[int, ...], table: NDArray[np.float64]) -> None:
-        from scipy.linalg import toeplitz
-
+    def __init__(self, table: NDArray[np.float64]) -> None:
         across, sizes, along = np.linalg.svd(table)
         self._parts = [
-            (
-                toeplitz(np.pad(across[:, number] * sizes[number], (0, shape[0]))[: shape[0]]),
-                toeplitz(np.pad(along[number], (0, shape[1]))[: shape[1]]),
-            )
+            tuple(np.concatenate([half[:0:-1], half]) for half in (across[:, number] * sizes[number], along[number]))
             for number in np.flatnonzero(sizes > 1e-12 * sizes[0])
         ]
 
-    def __call__(self, image: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.asarray(sum(rows @ image @ columns for rows, columns in self._parts), dtype=np.float64)
+    def __call__(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+        from scipy.ndimage import correlate1d
+
+        result = np.zeros(image.shape)
+        for rows, columns in self._parts:
+            result += correlate1d(correlate1d(image, rows, axis=0, mode="constant"), columns, axis=1, mode="constant")
+        return result
 
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:

@@ -17,6 +17,7 @@ _CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
 LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
 _STRAY_PX = 2.0  # radius over which light that strays is taken as even
 _WEAK = 0.05
+_BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((9, 0.01), (25, 0.003))  # (pixels, share)
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
@@ -67,13 +68,33 @@ def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.flo
     return rough
 
 
+def _splines(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of the cubic splines through a picture that goes on beyond its borders as it ends there."""
+    from scipy.ndimage import spline_filter
+
+    return np.asarray(spline_filter(np.pad(image, _BEYOND_PX, mode="edge"), order=3, mode="nearest"), dtype=np.float64)
+
+
 def resample(image: NDArray[np.floating], placement: Placement) -> NDArray[np.float64]:
     """The measured picture brought to where the thickness maps are (cubic splines)."""
-    from scipy.ndimage import shift
+    return _resampled(_splines(np.asarray(image, dtype=np.float64)), placement)
 
-    return np.asarray(
-        shift(image, (-placement.row_px, -placement.column_px), order=3, mode="nearest"), dtype=np.float64
-    )
+
+def _resampled(splines: NDArray[np.float64], placement: Placement) -> NDArray[np.float64]:
+    """The measured picture (row, column) brought to where the thickness maps are, from its splines' coefficients."""
+    for along in (placement.row_px, placement.column_px):
+        whole = math.floor(along)
+        t = along - whole
+        weights = (
+            (1.0 - t) ** 3,
+            3.0 * t**3 - 6.0 * t**2 + 4.0,
+            3.0 * (1.0 - t) ** 3 - 6.0 * (1.0 - t) ** 2 + 4.0,
+            t**3,
+        )
+        first, length = _BEYOND_PX + whole - 1, len(splines) - 2 * _BEYOND_PX
+        # the other axis comes first in turn, and first again after both
+        splines = sum(weight / 6.0 * splines[first + k : first + k + length] for k, weight in enumerate(weights)).T
+    return splines
 
 
 def register(
@@ -98,7 +119,7 @@ def register(
     current = np.zeros(2)
     precision = np.eye(2) / prior_px**2
     covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
-    filled = [fill(image, mask) for image in measured]
+    splines = [_splines(fill(image, mask)) for image in measured]
     models = [np.asarray(model, dtype=np.float64) for model in expected]
     slopes = [np.stack(gradient(model))[:, inner] for model in models]
     doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
@@ -107,8 +128,8 @@ def register(
     for caution in _CAUTION:
         placement = _placement(current, covariance)
         normal, right = precision.copy(), precision @ current
-        for image, model, noise, design, doubtful in zip(filled, models, variance, slopes, doubts, strict=True):
-            apart = resample(image, placement) - model
+        for image, model, noise, design, doubtful in zip(splines, models, variance, slopes, doubts, strict=True):
+            apart = _resampled(image, placement) - model
             doubt = doubtful * caution**2
             weight = share / (noise + doubt)[inner]
             level = model[inner]

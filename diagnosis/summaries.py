@@ -54,10 +54,109 @@ class SeriesSummary:
     saturated_share: float
 
 
-def _pieces(pieces: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstLook:
+    """What says which pixels and series can be used; fields as those of `SeriesSummary`."""
+
+    frames: int
+    mean_DN: NDArray[np.float64]
+    pair_variance_DN2: NDArray[np.float64]
+    stack_variance_DN2: NDArray[np.float64]
+    saturated_share: float
+
+
+_Piece = tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
+def _pieces(
+    pieces: Iterable[NDArray[Any]], good: NDArray[np.bool_], pattern: NDArray[np.floating[Any]] | None, name: str
+) -> Iterator[_Piece]:
+    """Frames as they are, in single precision, less the first one and their common factor, and steps between these."""
+    use = good.astype(np.float32)
+    n_good = int(good.sum())
+    if n_good < 16:
+        raise InputError(name, received=f"{n_good} usable pixels", expected="at least 16")
+    shape_of_one = np.ones(good.shape, np.float32) if pattern is None else np.asarray(pattern, dtype=np.float32)
+    reference: NDArray[np.float32] | None = None
+    last: NDArray[np.float32] | None = None
     for piece in pieces:
         for start in range(0, len(piece), _PIECE_FRAMES):
-            yield piece[start : start + _PIECE_FRAMES]
+            raw = piece[start : start + _PIECE_FRAMES]
+            if raw.ndim != 3 or raw.shape[1:] != good.shape:
+                raise InputError(name, received=f"frames of {raw.shape[1:]}", expected=f"frames of {good.shape}")
+            if raw.dtype.kind == "f" and not np.all(np.isfinite(raw)):
+                raise InputError(name, received="NaN or infinite detector numbers", expected="finite values")
+            x = raw.astype(np.float32)
+            if reference is None:
+                reference = x[0].copy()
+            cleaned = x - reference
+            own = np.tensordot(cleaned, use, axes=2) / n_good
+            cleaned -= own[:, None, None].astype(np.float32) * shape_of_one
+            cleaned *= use
+            steps = np.diff(cleaned if last is None else np.concatenate([last, cleaned]), axis=0)
+            last = cleaned[-1:].copy()
+            yield raw, x, cleaned, steps
+    if reference is None:
+        raise InputError(name, received="no frames", expected="at least one frame")
+
+
+class _Variances:
+    """Mean frame, and variances of pixels from steps and from whole stacks, piece by piece."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.frames = self.n_steps = 0
+        self._total, self._sum, self._square, self._steps = (np.zeros(shape) for _ in range(4))
+
+    def add(
+        self, x: NDArray[np.float32], cleaned: NDArray[np.float32], steps: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Sums of a piece taken in; returns that of the squares of its steps."""
+        self.frames += len(x)
+        self.n_steps += len(steps)
+        self._total += x.sum(axis=0, dtype=np.float64)
+        self._sum += cleaned.sum(axis=0, dtype=np.float64)
+        self._square += np.einsum("nrc,nrc->rc", cleaned, cleaned)
+        squares = np.einsum("nrc,nrc->rc", steps, steps)
+        self._steps += squares
+        return squares
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        return np.asarray(self._total / self.frames)
+
+    @property
+    def of_pairs(self) -> NDArray[np.float64]:
+        return self._steps / (2 * self.n_steps) if self.n_steps else np.full(self._steps.shape, np.nan)
+
+    @property
+    def of_stack(self) -> NDArray[np.float64]:
+        if self.frames < 2:
+            return np.full(self._sum.shape, np.nan)
+        return np.clip(self._square - self._sum**2 / self.frames, 0.0, None) / (self.frames - 1)
+
+
+def look_at_series(
+    pieces: Iterable[NDArray[Any]],
+    *,
+    good: NDArray[np.bool_],
+    pattern: NDArray[np.floating[Any]] | None = None,
+    name: str = "frames",
+    saturation_DN: float | None = None,
+) -> FirstLook:
+    """Mean, variances and saturation of a series; arguments and errors as those of `summarise_series`."""
+    found = _Variances(good.shape)
+    saturated = 0
+    for raw, x, cleaned, steps in _pieces(pieces, good, pattern, name):
+        found.add(x, cleaned, steps)
+        if saturation_DN is not None and float(raw.max()) >= saturation_DN:
+            saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
+    return FirstLook(
+        frames=found.frames,
+        mean_DN=found.mean,
+        pair_variance_DN2=found.of_pairs,
+        stack_variance_DN2=found.of_stack,
+        saturated_share=saturated / (found.frames * int(good.sum())),
+    )
 
 
 def _tiles(frames: NDArray[np.float32], good: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
@@ -101,9 +200,6 @@ def summarise_series(
     shape = good.shape
     use = good.astype(np.float32)
     n_good = int(good.sum())
-    if n_good < 16:
-        raise InputError(name, received=f"{n_good} usable pixels", expected="at least 16")
-    shape_of_one = np.ones(shape, np.float32) if pattern is None else np.asarray(pattern, dtype=np.float32)
     n_labels = max(int(labels.max()) + 1, 1)
     flat_labels = np.where(good, labels, -1)
     masks = [flat_labels == label for label in range(n_labels)]
@@ -112,14 +208,9 @@ def summarise_series(
         first, second = _shifted(shape, dr, dc)
         pairs_of_lag.append((first, second, [mask[first] & (mask[second]) for mask in masks]))
 
-    frames = 0
-    reference: NDArray[np.float32] | None = None
-    total = np.zeros(shape)
-    cleaned_total, cleaned_square = np.zeros(shape), np.zeros(shape)
-    pair_square = np.zeros(shape)
+    variances = _Variances(shape)
     pair_fourth = 0.0
     pair_second = 0.0
-    n_pairs = 0
     label_covariance = np.zeros((n_labels, len(LAGS)))
     row_sum = column_sum = block_sum = 0.0
     temporal = np.zeros(2)
@@ -127,17 +218,12 @@ def summarise_series(
     frame_means, tiles = [], []
     codes: NDArray[np.int64] | None = np.zeros(0, dtype=np.int64)
     highest, saturated = -np.inf, 0
-    tail: NDArray[np.float32] | None = None
     blocks = _block_weights(good)
     row_count = np.maximum(use.sum(axis=1), 1.0)
     column_count = np.maximum(use.sum(axis=0), 1.0)
     code_parts: list[NDArray[Any]] = []
     coded = 0
-    for raw in _pieces(pieces):
-        if raw.ndim != 3 or raw.shape[1:] != shape:
-            raise InputError(name, received=f"frames of {raw.shape[1:]}", expected=f"frames of {shape}")
-        if raw.dtype.kind == "f" and not np.all(np.isfinite(raw)):
-            raise InputError(name, received="NaN or infinite detector numbers", expected="finite values")
+    for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
         if codes is not None:
             if raw.dtype.kind in "ui":
                 if coded < _CODES_FRAMES:
@@ -148,31 +234,13 @@ def summarise_series(
         highest = max(highest, float(raw[:, good].max()))
         if saturation_DN is not None:
             saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
-        x = raw.astype(np.float32)
-        if reference is None:
-            reference = x[0].copy()
         means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
         frame_means.append(means)
         tiles.append(_tiles(x, good, TIME_TILES))
-        total += x.sum(axis=0, dtype=np.float64)
-        # deviations from the first frame with the common factor taken out
-        x -= reference
-        own = np.tensordot(x, use, axes=2) / n_good
-        x -= own[:, None, None].astype(np.float32) * shape_of_one
-        x *= use
-        cleaned_total += x.sum(axis=0, dtype=np.float64)
-        cleaned_square += np.einsum("nrc,nrc->rc", x, x)
-        chain = x if tail is None else np.concatenate([tail, x])
-        if len(chain) > 1:
-            start = 0 if tail is None else len(tail) - 1
-            d = np.diff(chain[start:], axis=0)
-            n_pairs += len(d)
-            d2 = np.einsum("nrc,nrc->rc", d, d)
-            pair_square += d2
-            square = d * d
-            sd2 = np.maximum(d2 / len(d), 1e-12)
+        d2 = variances.add(x, cleaned, d)
+        if len(d):
             if len(d) > 3:
-                inside = square[:, good] / sd2[good]
+                inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
                 pair_fourth += float(np.sum(inside * inside))
                 pair_second += inside.size * (1.0 + 0.0)
             for index, (first, second, selected) in enumerate(pairs_of_lag):
@@ -183,23 +251,17 @@ def summarise_series(
             column_sum += float(np.mean((d.sum(axis=1) / column_count) ** 2)) / 2.0 * len(d)
             block = _block_means(d, good, blocks)
             block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
-        frames += len(x)
-        tail = chain[-2:].copy()
         if len(x) > 3:
-            centred = x - x.mean(axis=0)
+            centred = cleaned - cleaned.mean(axis=0)
             for step in (1, 2):
                 temporal[step - 1] += float(np.sum(centred[:-step] * centred[step:])) / n_good
                 temporal_pairs[step - 1] += len(x) - step
                 # a stack's own mean takes a share of the variance out of each product
                 share = float(np.sum(centred * centred)) / n_good / max(len(x) - 1, 1)
                 temporal[step - 1] += share * (len(x) - step) / len(x)
-    if frames == 0 or reference is None:
-        raise InputError(name, received="no frames", expected="at least one frame")
-    nan = np.full(shape, np.nan)
-    pair_variance = pair_square / (2 * n_pairs) if n_pairs else nan
-    stack = np.clip(cleaned_square - cleaned_total**2 / frames, 0.0, None) / (frames - 1) if frames > 1 else nan.copy()
+    frames, n_pairs, pair_variance = variances.frames, variances.n_steps, variances.of_pairs
     counts = np.array([mask.sum() for mask in masks])
-    variances = np.array([pair_variance[mask].mean() if mask.any() else np.nan for mask in masks])
+    of_labels = np.array([pair_variance[mask].mean() if mask.any() else np.nan for mask in masks])
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = (
             label_covariance
@@ -212,10 +274,10 @@ def summarise_series(
     one = max(n_pairs, 1)
     return SeriesSummary(
         frames=frames,
-        mean_DN=total / frames,
+        mean_DN=variances.mean,
         pair_variance_DN2=pair_variance,
-        stack_variance_DN2=stack,
-        label_variance_DN2=variances,
+        stack_variance_DN2=variances.of_stack,
+        label_variance_DN2=of_labels,
         label_autocovariance_DN2=covariance,
         label_pixels=counts,
         row_variance_DN2=row_sum / one,

@@ -131,13 +131,15 @@ def cell_coverage(normal_row: FloatArray, normal_column: FloatArray, covered: Fl
 
 def _least_slope(picture: FloatArray, axis: int) -> FloatArray:
     """Slope of each pixel along an axis: the lesser of those to either side, 0 where they differ in sign."""
-    step = np.diff(picture, axis=axis)
-    ends = [(0, 0), (0, 0)]
-    ends[axis] = (1, 0)
-    before = np.pad(step, ends)
-    ends[axis] = (0, 1)
-    after = np.pad(step, ends)
-    return np.asarray(np.where(before * after > 0, np.sign(before) * np.minimum(np.abs(before), np.abs(after)), 0.0))
+    steps = np.zeros([length + (along == axis) for along, length in enumerate(picture.shape)])
+    inside, before, after = (
+        tuple(part if along == axis else slice(None) for along in (0, 1))
+        for part in (slice(1, -1), slice(None, -1), slice(1, None))
+    )
+    np.subtract(picture[after], picture[before], out=steps[inside])
+    one, other = steps[before], steps[after]
+    # both rising or both falling, else 0
+    return np.asarray(np.maximum(np.minimum(one, other), 0.0) + np.minimum(np.maximum(one, other), 0.0))
 
 
 def fine_cells(
@@ -154,11 +156,11 @@ def fine_cells(
     rows, columns = picture.shape
     place = (np.arange(FINE) - 0.5 * (FINE - 1)) / FINE
     down, right = _least_slope(picture, 0), _least_slope(picture, 1)
-    cells = (
-        picture[:, None, :, None]
-        + down[:, None, :, None] * place[None, :, None, None]
-        + right[:, None, :, None] * place[None, None, None, :]
-    )
+    cells = np.empty((rows, FINE, columns, FINE))
+    for i, below in enumerate(place):
+        line = picture + below * down
+        for j, beside in enumerate(place):
+            cells[:, i, :, j] = line + beside * right
     if borders.pixel.size:
         row, column = np.divmod(borders.pixel, columns)
         shared = share * thick[:, None, None] + (1.0 - share) * thin[:, None, None]

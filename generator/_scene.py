@@ -2,7 +2,7 @@
 
 import math
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
+_MOST_PIXEL_MAPS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,8 @@ class BeamProjection:
 class ModelCache:
     """Scenes and projections, kept between calls of the forward model; the oldest go first beyond `budget_bytes`.
 
-    draft: pictures are only compared with each other, and may be drawn with less work (see `_spread.spread_maps`).
+    draft: pictures are only compared with each other, and may be drawn with less work (see `_spread.spread_maps`); maps
+    whose pixels are all alike are (1, 1).
     """
 
     budget_bytes: int = _BUDGET_BYTES
@@ -97,6 +99,20 @@ class ModelCache:
     _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
     _lit_held: int = 0
     _spreads: "OrderedDict[tuple[object, ...], tuple[Twin, dict[object, Any]]]" = field(default_factory=OrderedDict)
+    _pixels: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
+
+    def pixels(self, owner: object, name: object, read: Callable[[], NDArray[np.floating]]) -> FloatArray:
+        """A map (row, column) of the detector's, kept under the name by its owner's identity; a draft's may be (1, 1)."""
+        key = (id(owner), name)
+        found = self._pixels.get(key)
+        if found is None or found[0] is not owner:
+            image = np.asarray(read(), dtype=np.float64)
+            if self.draft and float(np.ptp(image)) == 0.0:
+                image = image[:1, :1].copy()
+            self._pixels[key] = found = (owner, image)
+            while len(self._pixels) > _MOST_PIXEL_MAPS:
+                self._pixels.popitem(last=False)
+        return found[1]
 
     def spread(self, key: tuple[object, ...], twin: Twin) -> dict[object, Any]:
         """What was kept of a spread of light, the same behind all scenes: arrays and patterns, filled by those who ask."""

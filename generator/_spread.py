@@ -166,8 +166,13 @@ def _drawing(
     transfer = base_transfer_1d(psf_model, psf_sigma_px, order / (2.0 * length))
     if points > length:
         transfer = transfer * averaging(points)[:kept]
-    cosines = 2.0 * np.cos(np.pi / points * np.outer(order, np.arange(points) + 0.5))
-    return np.asarray((cosines_at_pixels(length, points, kept, shift_px) * transfer) @ cosines)
+    return np.asarray((cosines_at_pixels(length, points, kept, shift_px) * transfer) @ _cosines(points, kept))
+
+
+@lru_cache(maxsize=8)
+def _cosines(points: int, kept: int) -> NDArray[np.float64]:
+    """The first cosines (kept, points) of a cosine transform over `points`."""
+    return np.asarray(2.0 * np.cos(np.pi / points * np.outer(np.arange(kept), np.arange(points) + 0.5)))
 
 
 def _object_transfer(state: LineState, f_row: FloatArray, f_column: FloatArray) -> FloatArray | None:

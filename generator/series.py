@@ -54,6 +54,7 @@ _OF_THE_SPREAD = (
 _OF_THE_LIGHT = (*_OF_THE_SPREAD, "open_signal_DN", "product_material", "scene_kind", "displacement_px")
 _TIMED = frozenset(("object_blur",))  # stages whose effects may depend on how long an exposure takes
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
+_ROUNDED_SD = 0.7  # of noise, in steps of the ADC: from there on the staircase's first harmonic is below 1e-4 of a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
 
 
@@ -162,7 +163,9 @@ def with_conditions(effect: AppliedEffect, conditions: Mapping[str, float]) -> A
 
 @dataclass(slots=True, kw_only=True)
 class ExpectedSeries:
-    """What the stored frames of a series are expected to hold; maps (row, column), variances of one stored frame.
+    """What the stored frames of a series are expected to hold; variances of one stored frame.
+
+    Maps are (row, column); with a draft's cache (1, 1) where all pixels are alike.
 
     Fields:
         mean_DN: raw, dark included, mean over the frames.
@@ -228,16 +231,15 @@ class _Choice:
     use_measured_level: bool
 
     def line(self, twin: Twin, request: SeriesRequest, cache: ModelCache) -> tuple[LineState, "_Charge"]:
-        """The final state of the line for a request, and what one exposure of it brings."""
-        found = _lit(twin, request, self, cache)
-        return _read_out(twin, request, found), found[0].charge
+        """The final state of the line for a request, but for its light, and what one exposure brings."""
+        lit, late = _lit(twin, request, self, cache)
+        return _read_out(twin, request, lit, late), lit.charge
 
 
 @dataclass(frozen=True, slots=True)
 class _Charge:
     """What one exposure of a series brings to the pixels, before lag: mean and variances in DN, gain and shape applied."""
 
-    state: LineState
     mean: FloatArray
     correlated: FloatArray
     white: FloatArray
@@ -246,10 +248,10 @@ class _Charge:
     pattern: NoisePattern
 
 
-def _illumination(twin: Twin, request: SeriesRequest) -> tuple[FloatArray, FloatArray]:
+def _illumination(twin: Twin, request: SeriesRequest, cache: ModelCache) -> tuple[FloatArray, FloatArray]:
     """Shape of the flat nearest in kV and filters, and relative gain (row, column)."""
-    relative = np.asarray(twin.maps.gain_relative, dtype=np.float64)
-    relative = np.where(relative > 1e-6, relative, 1.0)
+    gain = twin.maps.gain_relative
+    relative = cache.pixels(twin.maps, "relative gain", lambda: np.where(gain > 1e-6, gain, 1.0))
     shape: FloatArray | None = None
     if twin.levels:
         level = None if request.setting is None else twin.level_at(request.setting)
@@ -263,7 +265,8 @@ def _illumination(twin: Twin, request: SeriesRequest) -> tuple[FloatArray, Float
                     len(wanted ^ {str(layer) for layer in item.filters}),
                 ),
             )
-        shape = np.maximum(np.asarray(level.flat_shape, dtype=np.float64), 0.0)
+        seen = level.flat_shape
+        shape = cache.pixels(level, "shape of the flat", lambda: np.maximum(seen, 0.0))
     return (relative if shape is None else shape), relative
 
 
@@ -299,14 +302,17 @@ def final_state(
 
     Args: as in `expected_series`.
     """
-    return _read_out(twin, request, _lit(twin, request, _Choice(effects, parameters, use_measured_level), cache))
+    cache = ModelCache() if cache is None else cache
+    lit, late = _lit(twin, request, _Choice(effects, parameters, use_measured_level), cache)
+    return _read_out(twin, request, lit.at_load(), late)
 
 
 @dataclass(frozen=True, slots=True)
 class _Lit:
     """A series up to the spread of light: state, projection and the charge that one exposure brings; effects still to act.
 
-    `twin` and `thickness_mm` are held so that their identity stands for them in the cache's keys.
+    `twin` and `thickness_mm` are held so that their identity stands for them in the cache's keys. `charge` is that of a load
+    `load` times as large as the one that state and projection were drawn for.
     """
 
     twin: Twin
@@ -314,10 +320,21 @@ class _Lit:
     state: LineState
     projection: BeamProjection | None
     charge: "_Charge"
+    load: float = 1.0
 
     def times(self, factor: float) -> "_Lit":
         """The same light, more of it."""
-        state, picture, light, charge = self.state, self.state.picture, self.projection, self.charge
+        charge = replace(
+            self.charge,
+            mean=factor * self.charge.mean,
+            correlated=factor * self.charge.correlated,
+            white=factor * self.charge.white,
+        )
+        return replace(self, charge=charge, load=factor * self.load)
+
+    def at_load(self) -> "_Lit":
+        """With state and projection of the charge's load."""
+        factor, state, picture, light = self.load, self.state, self.state.picture, self.projection
         state = replace(
             state,
             signal_DN=factor * state.signal_DN,
@@ -338,17 +355,11 @@ class _Lit:
                 variance_DN2=factor * light.variance_DN2,
                 picture=state.picture,
             ),
-            charge=replace(
-                charge,
-                state=state,
-                mean=factor * charge.mean,
-                correlated=factor * charge.correlated,
-                white=factor * charge.white,
-            ),
+            load=1.0,
         )
 
 
-def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCache | None) -> tuple["_Lit", "_Active"]:
+def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCache) -> tuple["_Lit", "_Active"]:
     """The line up to the spread of light, from the cache where the same was asked before, and the effects that act later.
 
     Light goes as the tube load: of series that differ in nothing else one is drawn.
@@ -357,7 +368,6 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
     active = [item for item in in_order(effects) if item[0].since == "always" or request.after_calibration]
     early = [item for item in active if item[1].stage in _BEFORE_EXPOSURE]
     late = [item for item in active if item[1].stage not in _BEFORE_EXPOSURE]
-    cache = ModelCache() if cache is None else cache
     values: NDArray[np.float64] | None = None
     if twin.spectral is not None:
         given = twin.spectral.best if choice.parameters is None else choice.parameters
@@ -475,13 +485,12 @@ def _drawn(
             ),
             twin,
         )
-    charge = _charge(twin, request, state, spread, draft=cache.draft)
+    charge = _charge(twin, request, state, spread, cache)
     return _Lit(twin, request.thickness_mm, state, projection, charge)
 
 
-def _read_out(twin: Twin, request: SeriesRequest, found: tuple["_Lit", "_Active"]) -> LineState:
+def _read_out(twin: Twin, request: SeriesRequest, lit: "_Lit", late: "_Active") -> LineState:
     """All stages from the exposure on."""
-    lit, late = found
     state = lit.state
     for applied, effect, numbers in late:
         state = effect.change(state, numbers, _context(twin, request, applied, lit.projection))
@@ -495,16 +504,16 @@ def _quanta(state: LineState) -> LineState:
 
 
 def _charge(
-    twin: Twin, request: SeriesRequest, state: LineState, spread: dict[object, Any], *, draft: bool = False
+    twin: Twin, request: SeriesRequest, state: LineState, spread: dict[object, Any], cache: ModelCache
 ) -> _Charge:
     """Light spread over the pixels; `spread` holds what earlier series of the same beam and spread have left."""
-    shape, relative = _illumination(twin, request)
+    shape, relative = _illumination(twin, request, cache)
     if "pattern" not in spread:
         spread["pattern"] = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
     pattern: NoisePattern = spread["pattern"]
     if not request.beam_on:
-        nothing = np.zeros(twin.maps.shape)
-        return _Charge(state, nothing, nothing, nothing, shape, relative, pattern)
+        nothing = np.zeros(shape.shape)
+        return _Charge(nothing, nothing, nothing, shape, relative, pattern)
     quanta = _quanta(state)
     picture, power = spread_maps(
         quanta.signal_DN,
@@ -513,13 +522,12 @@ def _charge(
         pattern=pattern,
         psf_model=twin.noise.psf_model,
         psf_sigma_px=twin.noise.psf_sigma_px.value,
-        draft=draft,
+        draft=cache.draft,
         known=spread,
     )
     lit = shape * state.flat_factor
     scale = lit * relative
     return _Charge(
-        state=state,
         mean=lit * picture,
         correlated=scale * power,
         white=scale * state.secondary_DN * np.maximum(picture, 0.0),
@@ -543,7 +551,7 @@ def _trapped_before(
     twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Choice, cache: ModelCache
 ) -> tuple[FloatArray, FloatArray]:
     """Charge in the traps (trap, row, column) at the begin of the series, and what its first exposure finds, DN."""
-    trapped = np.zeros((len(law.trapped), *twin.maps.shape))
+    trapped = np.zeros((len(law.trapped), 1, 1))
     share = np.asarray(law.trapped)[:, None, None]
     clock: float | None = None
     for earlier in request.previous:
@@ -559,7 +567,7 @@ def _trapped_before(
             trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
         clock = earlier.start_s + exposures * interval
     if clock is None:
-        return trapped, np.zeros(twin.maps.shape)
+        return trapped, np.zeros((1, 1))
     return _paused(law, trapped, request.start_s - clock)
 
 
@@ -605,9 +613,9 @@ def _staircase(
     """
     if step_DN <= 0:
         return 0.0, 0.0
-    least = float(np.sqrt(max(float(np.min(variance_DN2)), 0.0)))
-    if least > 0.7 * step_DN:  # the first harmonic is below 1e-4 of a step
+    if float(np.min(variance_DN2)) > _ROUNDED_SD**2 * step_DN**2:
         return 0.0, step_DN**2 / 12.0
+    mean_DN, variance_DN2 = np.broadcast_arrays(mean_DN, variance_DN2)
     shift = np.zeros_like(mean_DN)
     square = np.full_like(mean_DN, step_DN**2 / 12.0)
     cross = np.zeros_like(mean_DN)
@@ -622,10 +630,10 @@ def _staircase(
     return shift, np.maximum(square + 2.0 * cross - shift**2, -variance_DN2)
 
 
-def _read_variance(twin: Twin, state: LineState) -> FloatArray:
+def _read_variance(twin: Twin, state: LineState, cache: ModelCache) -> FloatArray:
     """White electronic variance (row, column) of one exposure without the ADC's rounding, DN^2."""
     rounding = 1.0 / 12.0 if twin.noise.quantised else 0.0
-    calibrated = np.asarray(twin.maps.read_variance_DN2, dtype=np.float64)
+    calibrated = cache.pixels(twin.maps, "read variance", lambda: twin.maps.read_variance_DN2)
     return np.maximum(calibrated - (rounding + state.read_variance_taken_DN2), 0.0)
 
 
@@ -675,7 +683,7 @@ def expected_series(
         if law.pause_share > 0 and request.previous:
             course = _frame_means((number == 0).astype(np.float64), averaged)
             signal = signal + course.mean() * found
-            trend.append((found, course - course.mean()))
+            trend.append((found + np.zeros(charge.mean.shape), course - course.mean()))
     covariance = _temporal_covariance(state.lag, decay, averaged)
     bend = state.bend_per_DN
     slope: FloatArray | float = 1.0
@@ -683,27 +691,30 @@ def expected_series(
         slope = 1.0 - 2.0 * bend * signal
         signal = signal * (1.0 - bend * signal)
         trend = [(slope * amount, course) for amount, course in trend]
-    quantum = covariance[0] * slope**2 * charge.correlated
-    # secondary quanta are drawn before the traps as the others are
-    white = covariance[0] * slope**2 * charge.white
-    dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
+    quantum, white = charge.correlated, charge.white
+    if covariance[0] != 1.0 or bend != 0.0:
+        # secondary quanta are drawn before the traps as the others are
+        quantum, white = (covariance[0] * slope**2 * variance for variance in (quantum, white))
+    dark = cache.pixels(twin.maps, ("dark", request.exposure_ms), lambda: twin.maps.dark_at(request.exposure_ms))
     for height, profile in state.offsets:
         times = request.start_s + interval * np.arange(exposures, dtype=np.float64)
         course = _frame_means(profile(times), averaged)
         dark = dark + height * course.mean()
         if request.frames > 1:
-            trend.append((np.full(twin.maps.shape, height), course - course.mean()))
-    electronic = _read_variance(twin, state)
+            trend.append((np.full(dark.shape, height), course - course.mean()))
+    electronic = _read_variance(twin, state, cache)
     mean = dark + signal
-    single = averaged * (quantum + white) + electronic + state.row_variance_DN2 + state.column_variance_DN2
-    shift, rounding = _staircase(mean, single, state.step_DN)
-    mean = mean + shift
+    least = electronic + state.row_variance_DN2 + state.column_variance_DN2
+    rounding: FloatArray | float = state.step_DN**2 / 12.0
+    if float(np.min(least)) < _ROUNDED_SD**2 * state.step_DN**2:
+        shift, rounding = _staircase(mean, averaged * (quantum + white) + least, state.step_DN)
+        mean = mean + shift
     white = white + (electronic + rounding) / averaged
     saturated = 0.0
     if twin.instrument.bits is not None:
         highest = 2.0**twin.instrument.bits - 1.0
-        saturated = float(np.mean(mean >= highest))
-        if saturated > 0:
+        if float(mean.max()) >= highest:
+            saturated = float(np.mean(mean >= highest))
             mean = np.minimum(mean, highest)
     lags = np.arange(request.frames) * interval * averaged
     correlation = np.exp(-lags / max(state.output_correlation_s, 1e-12))
@@ -765,7 +776,8 @@ def sample_series(
     """
     cache = ModelCache() if cache is None else cache
     choice = _Choice(effects, parameters, use_measured_level)
-    state, charge = choice.line(twin, request, cache)
+    lit, late = _lit(twin, request, choice, cache)
+    state, charge = _read_out(twin, request, lit.at_load(), late), lit.charge
     shape = twin.maps.shape
     interval = request.interval_s(twin.instrument.readout_ms)
     averaged = request.exposures_per_frame
@@ -783,7 +795,7 @@ def sample_series(
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
     bad = new_bad_pixels(state, shape)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
-    electronic = np.sqrt(_read_variance(twin, state))
+    electronic = np.sqrt(_read_variance(twin, state, cache))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
     lowest = 0.0 if twin.noise.quantised else -math.inf
     scale = np.sqrt(charge.shape * charge.relative)

@@ -105,15 +105,24 @@ def _chantler_table(number: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _penelope_total(number: int, energies_keV: FloatArray) -> FloatArray:
-    return np.asarray(_penelope().get_mu_over_rho(number, energies_keV), dtype=float)
+    MeV, total = (column[number - 1] for column in _penelope_table())
+    known = np.log(1000.0 * np.array(MeV, dtype=float))
+    found = np.interp(np.log(energies_keV), known, np.log(np.array(total, dtype=float)), left=np.nan, right=np.nan)
+    return np.asarray(np.exp(found), dtype=float)
 
 
 @lru_cache(maxsize=1)
-def _penelope() -> Any:
-    """SpekPy's reader of PENELOPE's table, which reads three files each time it is made."""
-    from spekpy.SpekTools import load_mu_data
+def _penelope_table() -> tuple[list[list[float]], list[list[float]]]:
+    """Energies (MeV) and mu/rho (cm2/g) of each element, read from SpekPy's file: importing SpekPy takes a second."""
+    import json
+    from importlib.util import find_spec
+    from pathlib import Path
 
-    return load_mu_data("pene")[0]
+    package = find_spec("spekpy")
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("spekpy is not installed")
+    table = json.loads(Path(package.origin).with_name("data").joinpath("tables", "pene_mu.dat").read_text("utf-8"))
+    return table["photon energy"], table["mu_over_rho"]
 
 
 # xraydb's Elam table is xraylib's, so it is no second opinion and is not offered.

@@ -41,7 +41,7 @@ from .probes import (
     transmission_templates,
 )
 from .registration import LARGEST_PX, Placement, gradient, register, render_variance
-from .session import SessionSeries, read_session
+from .session import SessionSeries, only_own_noise, read_session
 from .summaries import BLOCK_PX, LAGS, FirstLook, SeriesSummary, look_at_series, summarise_series
 
 Map = NDArray[np.float32]
@@ -54,6 +54,7 @@ _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _KNOW_WHEN = frozenset(
     ("heel", "bad_pixels", "gain_map_error")
 )  # effects that look otherwise where calibration has seen them
+_OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
     "veiling_glare": "sharpness",
@@ -459,6 +460,8 @@ def build_problem(
     for variant in variants:
         for strength in variant.strengths:
             all_changes.append(effect_change(variant, strength))
+    for change in all_changes if only_own_noise(session) else ():
+        change.failed = _OWN_NOISE if change.label == "excess_noise" else ""
     nuisance_changes: list[TwinChange] = twin_changes(base)
     for step in nuisance_changes:
         all_changes.append(

@@ -75,6 +75,12 @@ def calibrating_names(series: Sequence[Series]) -> frozenset[str]:
     return frozenset(chosen)
 
 
+def only_own_noise(session: Sequence[SessionSeries]) -> bool:
+    """Whether no flat that calibrates has noise, so that the twin has it from series after them."""
+    lit = [item for item in session if item.series.kind == "flat" and item.calibrates]
+    return any(item.own_noise for item in session) and all(item.series.n_frames == 1 for item in lit)
+
+
 def _noiseless_beams(series: Sequence[Series], calibrating: frozenset[str]) -> frozenset[Beam]:
     """Beams whose calibrating flats are all single frames."""
     flats = [item for item in series if item.kind == "flat" and item.name in calibrating]

@@ -1,0 +1,240 @@
+"""Sessions whose flats are single averaged frames: level and maps from these, noise from what was repeated at the beam."""
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import Setting, open_acquisition, write_acquisition
+from raytwin.acquisition.instrument import Instrument
+from raytwin.calibration.photon_transfer import compute_photon_transfer
+from raytwin.calibration.repeated_frames import bounded_read_variance, most_read_variance
+from raytwin.diagnosis.preparation import calibrated_twin
+from raytwin.diagnosis.session import only_own_noise, read_session
+from raytwin.errors import InputError
+from raytwin.generator.noise import sample_frame_noise
+from raytwin.generator.psf import blur_variance_share
+
+SHAPE = (64, 64)
+GAIN, SIGMA, READ_DN, DARK_DN, AVERAGED = 9.0, 0.55, 11.0, 1200.0, 16
+LEVELS = {20.0: 8000.0, 80.0: 32000.0}
+HARDER = 1.1  # gain behind the object over that in the open field
+
+
+def exposures(mean, count, rng, gain=GAIN):
+    """Whole-number frames (count, row, column) of a mean signal (row, column)."""
+    frames = [
+        DARK_DN
+        + mean
+        + sample_frame_noise(
+            mean,
+            gain_DN=gain,
+            white_fraction=0.003,
+            read_variance_DN2=READ_DN**2,
+            psf_model="aperture",
+            psf_sigma_px=SIGMA,
+            rng=rng,
+        )
+        for _ in range(count)
+    ]
+    return np.clip(np.rint(np.array(frames)), 0, 65535).astype(np.uint16)
+
+
+def averaged(mean, rng):
+    return np.mean(exposures(mean, AVERAGED, rng), axis=0, dtype=np.float64)[None].astype(np.float32)
+
+
+def shadow(share):
+    """Thickness map (row, column) in mm with an object over a share of the rows."""
+    plane = np.zeros(SHAPE, np.float32)
+    plane[: round(share * SHAPE[0])] = 10.0
+    return plane
+
+
+def write_session(
+    path, *, share=0.4, frames=3, objects=6, role="evaluation", flat_frames=0, with_maps=True, seed=0, filters=()
+):
+    """Averaged darks and flats at two exposures, and repeated frames of objects, or `flat_frames` of flats, after them."""
+    rng = np.random.default_rng(seed)
+    pattern = 1.0 + 0.03 * rng.standard_normal(SHAPE)
+    instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0)
+    with write_acquisition(path, instrument) as writer:
+        for exposure_ms, level in LEVELS.items():
+            words = {"exposure_ms": exposure_ms, "averaged": AVERAGED, "role": "calibration"}
+            writer.add_series(f"dark_{exposure_ms:g}", kind="dark", frames=averaged(np.zeros(SHAPE), rng), **words)
+            words |= {"kV": 40.0, "power_W": 20.0}
+            writer.add_series(f"flat_{exposure_ms:g}", kind="flat", frames=averaged(level * pattern, rng), **words)
+        thickness = shadow(share)
+        for number in range(objects):
+            scene = f"product{number}"
+            writer.add_scene(
+                scene, kind="product", thickness_mm={"chicken_breast": thickness} if with_maps else None, product=scene
+            )
+            for exposure_ms, level in LEVELS.items():
+                covered = thickness > 0
+                mean = level * pattern * np.where(covered, 0.5, 1.0)
+                found = np.where(
+                    covered, exposures(mean, frames, rng, gain=HARDER * GAIN), exposures(mean, frames, rng)
+                ).astype(np.uint16)
+                setting = Setting(kV=40.0, power_W=20.0, exposure_ms=exposure_ms, filters=filters)
+                writer.add_series(
+                    f"{scene}_{exposure_ms:g}", kind="object", frames=found, setting=setting, scene=scene, role=role
+                )
+        if flat_frames:
+            setting = Setting(kV=40.0, power_W=20.0, exposure_ms=20.0)
+            found = exposures(LEVELS[20.0] * pattern, flat_frames, rng)
+            writer.add_series("flat_again", kind="flat", frames=found, setting=setting, role="evaluation")
+    return path
+
+
+def transfer_of(path, **words):
+    with open_acquisition(path) as acquisition:
+        return compute_photon_transfer(acquisition, **words)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    return write_session(tmp_path_factory.mktemp("single") / "session.h5")
+
+
+@pytest.fixture(scope="module")
+def found(session):
+    return transfer_of(session)
+
+
+def test_the_noise_of_the_field_beside_objects_is_that_of_the_beam(found):
+    (level,) = found.levels
+    assert level.gain_DN.low < GAIN < level.gain_DN.high
+    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    slope = GAIN * (blur_variance_share("aperture", SIGMA) + 0.003) / 1.003
+    assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.02)
+    assert found.noise.psf_sigma_px.value == pytest.approx(SIGMA, rel=0.04)
+    (row,) = found.evidence["repeated_frames"]
+    assert row["where"] == "beside objects"
+    assert len(row["series"]) == 12
+
+
+def test_levels_and_dark_come_from_the_single_frames_alone(found):
+    (level,) = found.levels
+    assert level.series == ("flat_20", "flat_80")
+    assert level.rate_DN_per_mAs.value == pytest.approx(8000.0 / (20.0 / 40.0 * 0.020), rel=2e-3)
+    assert found.dark_DN.low < DARK_DN < found.dark_DN.high
+    assert found.dark_DN.high - found.dark_DN.low < 0.5
+    points = {point.series: point for point in found.points}
+    expected = level.photon_transfer_slope_DN.value * points["flat_20"].mean_signal_DN + READ_DN**2
+    assert points["flat_20"].pair_variance_DN2 == pytest.approx(expected, rel=0.03)
+
+
+def test_whole_numbers_are_looked_for_where_nothing_was_averaged(found):
+    assert found.noise.quantised
+
+
+def test_read_noise_that_a_far_intercept_leaves_open_is_bounded_by_the_darks(found):
+    read = found.noise.read_noise_DN
+    assert read.low < READ_DN < read.high
+    assert read.high < 1.3 * READ_DN
+
+
+def test_it_is_said_where_the_noise_comes_from_and_what_it_cannot_tell(found):
+    (said,) = [line for line in found.warnings if "repeated frames of 12 other series" in line]
+    assert "noise that has changed since the flats cannot be seen" in said
+
+
+def test_behind_objects_the_gain_is_harder_and_its_interval_says_so(tmp_path):
+    covered = transfer_of(write_session(tmp_path / "covered.h5", share=1.0))
+    (row,) = covered.evidence["repeated_frames"]
+    assert row["where"] == "behind objects"
+    (level,) = covered.levels
+    assert level.gain_DN.value == pytest.approx(HARDER * GAIN, rel=0.04)
+    assert level.gain_DN.high - level.gain_DN.low > 2.0 * 1.96 * 0.03 * level.gain_DN.value
+
+
+def test_objects_that_nobody_maps_are_read_away_from_steps(tmp_path):
+    blind = transfer_of(write_session(tmp_path / "blind.h5", with_maps=False))
+    assert [row["where"] for row in blind.evidence["repeated_frames"]] == ["behind objects"]
+    assert blind.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.08)
+
+
+def test_repeated_flats_held_back_for_evaluation_give_the_whole_field(tmp_path):
+    again = transfer_of(write_session(tmp_path / "again.h5", objects=0, flat_frames=12))
+    (row,) = again.evidence["repeated_frames"]
+    assert (row["series"], row["share_percent"]) == (["flat_again"], 100.0)
+    assert again.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+    assert again.levels[0].series == ("flat_20", "flat_80")
+
+
+def test_series_held_back_for_evaluation_stay_so_where_others_repeat_the_beam(tmp_path):
+    free = transfer_of(write_session(tmp_path / "free.h5", role=None, flat_frames=12))
+    (row,) = free.evidence["repeated_frames"]
+    assert "flat_again" not in row["series"]
+
+
+@pytest.mark.parametrize("words", [{"frames": 1}, {"objects": 0}], ids=["single frames", "no objects"])
+def test_without_any_repeated_frame_one_line_says_what_is_missing(tmp_path, words):
+    path = write_session(tmp_path / "single.h5", **words)
+    with pytest.raises(InputError, match="a single frame has no noise") as error:
+        transfer_of(path)
+    assert "\n" not in str(error.value)
+
+
+def test_objects_in_another_beam_say_nothing_of_this_one(tmp_path):
+    from raytwin.acquisition.setting import filters_from_text
+
+    path = write_session(tmp_path / "other.h5", filters=filters_from_text("Cu:0.2"))
+    with pytest.raises(InputError, match="a single frame has no noise"):
+        transfer_of(path)
+
+
+def test_a_beam_with_repeated_flats_takes_nothing_from_objects(tmp_path):
+    with_objects, without = tmp_path / "with.h5", tmp_path / "without.h5"
+    for path, objects in ((with_objects, 2), (without, 0)):
+        rng = np.random.default_rng(3)
+        instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0)
+        with write_acquisition(path, instrument) as writer:
+            setting = Setting(kV=40.0, power_W=20.0, exposure_ms=20.0)
+            writer.add_series("dark", kind="dark", frames=exposures(np.zeros(SHAPE), 8, rng), exposure_ms=20.0)
+            writer.add_series("flat", kind="flat", frames=exposures(np.full(SHAPE, 8e3), 8, rng), setting=setting)
+            for number in range(objects):
+                writer.add_scene(f"p{number}", kind="product", thickness_mm={"chicken_breast": shadow(0.3)})
+                frames = exposures(np.full(SHAPE, 8e3), 3, rng)
+                writer.add_series(f"o{number}", kind="object", frames=frames, setting=setting, scene=f"p{number}")
+    first, second = transfer_of(with_objects), transfer_of(without)
+    assert repr(first.levels[0].gain_DN) == repr(second.levels[0].gain_DN)
+    assert first.evidence == second.evidence
+
+
+def test_a_diagnosis_calibrates_such_a_session_and_knows_whose_noise_it_has(session):
+    with open_acquisition(session) as acquisition:
+        twin = calibrated_twin(acquisition, rng=np.random.default_rng(0))
+        parts = {item.name: item for item in read_session(acquisition)}
+        elsewhere = read_session(acquisition, calibrated_elsewhere=True)
+    assert twin.evidence["repeated_frames"][0]["where"] == "beside objects"
+    assert twin.spectral is not None
+    assert parts["product0_20"].own_noise
+    assert not parts["dark_20"].own_noise
+    assert not any(item.own_noise for item in elsewhere)
+    assert only_own_noise(list(parts.values()))
+    assert not only_own_noise(elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("variance", "expected"), [(-500.0, (0.0, 30.0)), (50.0, (45.0, 55.0)), (500.0, (70.0, 100.0))]
+)
+def test_a_bounded_read_variance_stays_within_its_bounds(variance, expected):
+    value, sd = bounded_read_variance(variance, 100.0 if abs(variance) > 100 else 1.0, 100.0)
+    assert expected[0] < value < expected[1]
+    assert 0 < sd < 100.0
+
+
+def test_a_bounded_read_variance_that_nothing_is_known_of_is_even():
+    value, sd = bounded_read_variance(0.0, 1e6, 120.0)
+    assert value == pytest.approx(60.0, rel=1e-3)
+    assert sd == pytest.approx(120.0 / np.sqrt(12.0), rel=1e-2)
+
+
+def test_two_averaged_darks_bound_the_read_variance_whatever_their_pattern():
+    rng = np.random.default_rng(0)
+    pattern = 40.0 * rng.standard_normal((100, 100))
+    darks = [(pattern + READ_DN / 4.0 * rng.standard_normal((100, 100)), 16) for _ in range(2)]
+    good = np.ones((100, 100), bool)
+    # 9900 differences: their median is known to 2 %
+    assert most_read_variance(darks, good) == pytest.approx(1.2 * READ_DN**2, rel=0.08)
+    assert most_read_variance(darks[:1], good) is None

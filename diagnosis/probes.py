@@ -229,6 +229,7 @@ def expected_scalars(
     moving = _MovingPicture.of(expected, context)
     moved = moving.pixels()
     total = max(mean_q * keep + mean_w + row + column + moved, _LEAST_DN2)
+    profile = frame_profile(expected, areas)
     if context.frames > 2:
         correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
         lines = [(row if dr == 0 else 0.0) + (column if dc == 0 else 0.0) for dr, dc in LAGS]
@@ -277,17 +278,17 @@ def expected_scalars(
             quantum += row / rows + column / columns
             # seen in steps from frame to frame
             steps = 1.0 - float(expected.frame_factor_correlation[1])
-            values["frame_factor"] = math.log(quantum + steps * (expected.frame_factor_rms * signal) ** 2)
+            wandering = steps * (expected.frame_factor_rms * signal) ** 2
+            # what is left in the traps fades in steps as well
+            fading = 0.5 * float(np.mean(np.diff(profile) ** 2))
+            values["frame_factor"] = math.log(quantum + wandering + fading)
     profiles = time_templates(context.frames)
     if profiles and context.kind != "afterglow":
-        profile = frame_profile(expected, areas)
         scale = 1.0 if context.kind == "dark" else 1.0 / context.reference_signal_DN
         for name, template in profiles:
             values[f"trend {name}"] = float(profile @ template) * scale / math.sqrt(context.frames)
     if context.kind == "afterglow" and context.previous_signal_DN:
-        profile = frame_profile(expected, areas) + float(
-            areas.mean(expected.mean_DN) + areas.mean(dark_change_DN) - context.dark_DN
-        )
+        profile = profile + float(areas.mean(expected.mean_DN) + areas.mean(dark_change_DN) - context.dark_DN)
         for start, stop in _afterglow_bins(context.frames):
             values[f"afterglow frames {start}-{stop - 1}"] = (
                 float(profile[start:stop].mean()) / context.previous_signal_DN

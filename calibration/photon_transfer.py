@@ -495,7 +495,7 @@ def _photon_transfer(
         )
     tell("spread and gain")
     fit = _fit(covariances, groups, usable, radius)
-    wider = min(math.ceil(4 * math.sqrt(2) * fit.sigma_px), (min(shape) - 1) // 4)
+    wider = min(math.ceil(4 * math.sqrt(2) * fit.sigma_px), (min(shape) - 1) // 4, *(item.reach for item in others))
     if wider > radius:
         radius = wider
         covariances, groups = collect(radius)

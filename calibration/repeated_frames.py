@@ -5,6 +5,7 @@ beam: other flats over the whole field, objects beside the object or, where too 
 steps. Behind an object the beam is harder and the gain a few percent higher, which the gain's interval then carries.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,6 +48,11 @@ class RepeatedFrames:
     def samples(self) -> float:
         """Independent frames x pixels."""
         return sum(effective_frames(total.frames) * int(mask.sum()) for _, total, mask in self.members)
+
+    @property
+    def reach(self) -> int:
+        """Largest lag, px, whose window the smallest area of pixels holds."""
+        return min((math.isqrt(int(mask.sum())) - 1) // 2 for *_, mask in self.members)
 
     def covariance(
         self, of_series: Callable[[Series, KeptSums, NDArray[np.bool_]], NoiseCovariance]

@@ -1,5 +1,7 @@
 """Sessions whose flats are single averaged frames: level and maps from these, noise from what was repeated at the beam."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -173,6 +175,12 @@ def test_without_any_repeated_frame_one_line_says_what_is_missing(tmp_path, word
     with pytest.raises(InputError, match="a single frame has no noise") as error:
         transfer_of(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_wide_spread_is_fitted_as_far_as_the_open_field_reaches(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "SIGMA", 2.2)
+    wide = transfer_of(write_session(tmp_path / "wide.h5", share=0.75, objects=8))
+    assert wide.noise.psf_sigma_px.value == pytest.approx(2.2, rel=0.1)
 
 
 def test_objects_in_another_beam_say_nothing_of_this_one(tmp_path):

@@ -724,22 +724,26 @@ def build_problem(
 
     def respond(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
         """Responses (strength, probe) of further variants, by their place in `asked`; failed ones are left out."""
-        result = {}
-        for number, variant in enumerate(asked):
-            rows = []
-            for strength in variant.strengths:
-                change = effect_change(variant, strength)
-                taken = absorb(change)
-                parts = []
-                for item, block in zip(kept, blocks, strict=True):
-                    found = move(item, change, taken, {})
-                    if found is not None:
-                        parts.append(_standardised(block, base_scalars[item.name], [found[0]], [found[1]])[0])
-                if not change.failed:
-                    rows.append(np.concatenate(parts))
-            if len(rows) == len(variant.strengths):
-                result[number] = np.stack(rows)
-        return result
+        number_of = [number for number, variant in enumerate(asked) for _ in variant.strengths]
+        changes = [effect_change(variant, strength) for variant in asked for strength in variant.strengths]
+        taken_in = [absorb(change) for change in changes]
+        rows = np.zeros((len(changes), sum(len(block["residual"]) for block in blocks)))
+        start = 0
+        for item, block in zip(kept, blocks, strict=True):
+            found = [move(item, change, taken, {}) for change, taken in zip(changes, taken_in, strict=True)]
+            seen = [(row, one) for row, one in enumerate(found) if one is not None]
+            stop = start + len(block["residual"])
+            if seen:
+                images, values = zip(*(one for _, one in seen), strict=True)
+                part = _standardised(block, base_scalars[item.name], images, values)
+                rows[[row for row, _ in seen], start:stop] = part
+            start = stop
+        failed = {number for number, change in zip(number_of, changes, strict=True) if change.failed}
+        return {
+            number: rows[[row for row, own in enumerate(number_of) if own == number]]
+            for number in range(len(asked))
+            if number not in failed
+        }
 
     return _join(
         blocks,

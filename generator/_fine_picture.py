@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 FINE = 3  # cells a pixel along each axis
+_MATRICES_TO_PX = 256  # a side: up to there two products are faster than cosine transforms, twice at 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +47,12 @@ def find_borders(depth: FloatArray, *, least_depth: float) -> Borders:
         depth: pixel means.
         least_depth: range across 3 x 3 pixels from which a step counts.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     rows, columns = depth.shape
     # borders of the frame go on as they come, so that a slope does not end there in a plateau
     wide = np.pad(depth, 2, mode="reflect", reflect_type="odd")
-    range_3, range_5 = (
-        (maximum_filter(wide, size, mode="nearest") - minimum_filter(wide, size, mode="nearest"))[2:-2, 2:-2]
-        for size in (3, 5)
-    )
+    most_3, least_3 = _of_three(wide, np.maximum), _of_three(wide, np.minimum)
+    range_3 = (most_3 - least_3)[1:-1, 1:-1]
+    range_5 = _of_three(most_3, np.maximum) - _of_three(least_3, np.minimum)
     sharpness = np.clip(2.0 * range_3 / np.maximum(range_5, 1e-12) - 1.0, 0.0, 1.0)
     steps = (range_3 > least_depth) & (sharpness > 1e-6)
     any_steps = bool(np.any(sharpness[steps] > 0.5))
@@ -85,6 +83,12 @@ def find_borders(depth: FloatArray, *, least_depth: float) -> Borders:
         sharpness=sharpness[row, column][inside],
         any_steps=any_steps,
     )
+
+
+def _of_three(picture: FloatArray, which: np.ufunc) -> FloatArray:
+    """Largest or least of 3 x 3 pixels (row - 2, column - 2), by what `which` of two is."""
+    lines = which(which(picture[:-2], picture[1:-1]), picture[2:])
+    return np.asarray(which(which(lines[:, :-2], lines[:, 1:-1]), lines[:, 2:]))
 
 
 def _area_beyond(distance: FloatArray, long: FloatArray, short: FloatArray) -> FloatArray:
@@ -293,6 +297,8 @@ def sampled_picture(
         shape: rows and columns of the pixels.
         shift_px: displacement along rows and columns.
     """
+    if max(shape) <= _MATRICES_TO_PX:
+        return _sampled_by_matrices(transforms, shape, shift_px)
     from scipy.fft import idct, idst
 
     inverse = (idct, idst)
@@ -312,4 +318,20 @@ def sampled_picture(
                 sums[other] = term if before is None else before + term
         lines = sum(inverse[other](term, type=2, axis=1) for other, term in enumerate(sums) if term is not None)
         result += inverse[kind](lines, type=2, axis=0)
+    return result
+
+
+def _sampled_by_matrices(
+    transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
+    shape: tuple[int, int],
+    shift_px: tuple[float, float],
+) -> FloatArray:
+    """`sampled_picture` as one product a side."""
+    result = np.zeros(shape)
+    for transform, filters in transforms:
+        rows, columns = (
+            cosines_at_pixels(length, length if count == length else FINE * length, count, shift)
+            for length, count, shift in zip(shape, transform.shape, shift_px, strict=True)
+        )
+        result += rows @ (transform if filters is None else transform * filters) @ columns.T
     return result

@@ -38,7 +38,7 @@ _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
-_MOST_PIXEL_MAPS = 64
+_MOST_MADE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,20 +99,26 @@ class ModelCache:
     _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
     _lit_held: int = 0
     _spreads: "OrderedDict[tuple[object, ...], tuple[Twin, dict[object, Any]]]" = field(default_factory=OrderedDict)
-    _pixels: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
+    _made: "OrderedDict[tuple[object, ...], tuple[object, Any]]" = field(default_factory=OrderedDict)
+
+    def made_of(self, owner: object, name: object, make: Callable[[], Any]) -> Any:
+        """What is made of a thing once, kept under a name by the thing's identity."""
+        key = (id(owner), name)
+        found = self._made.get(key)
+        if found is None or found[0] is not owner:
+            self._made[key] = found = (owner, make())
+            while len(self._made) > _MOST_MADE:
+                self._made.popitem(last=False)
+        return found[1]
 
     def pixels(self, owner: object, name: object, read: Callable[[], NDArray[np.floating]]) -> FloatArray:
         """A map (row, column) of the detector's, kept under the name by its owner's identity; a draft's may be (1, 1)."""
-        key = (id(owner), name)
-        found = self._pixels.get(key)
-        if found is None or found[0] is not owner:
+
+        def whole() -> FloatArray:
             image = np.asarray(read(), dtype=np.float64)
-            if self.draft and float(np.ptp(image)) == 0.0:
-                image = image[:1, :1].copy()
-            self._pixels[key] = found = (owner, image)
-            while len(self._pixels) > _MOST_PIXEL_MAPS:
-                self._pixels.popitem(last=False)
-        return found[1]
+            return image[:1, :1].copy() if self.draft and float(np.ptp(image)) == 0.0 else image
+
+        return np.asarray(self.made_of(owner, name, whole))
 
     def spread(self, key: tuple[object, ...], twin: Twin) -> dict[object, Any]:
         """What was kept of a spread of light, the same behind all scenes: arrays and patterns, filled by those who ask."""

@@ -406,7 +406,8 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
 
     found = known(request)
     if found is None:
-        once, load_mAs = _at_unit_load(request, timed=any(effect.stage in _TIMED for _, effect, _ in early))
+        timed = any(effect.stage in _TIMED for _, effect, _ in early)
+        once, load_mAs = cache.made_of(request, ("once", timed), lambda: _at_unit_load(request, timed=timed))
         found = known(once) or keep(once, _drawn(twin, once, choice, cache, values, early))
         if load_mAs != 1.0:
             found = keep(request, found.times(load_mAs))

@@ -45,6 +45,7 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
         *({"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)),
     ],
     "output_drift": [{"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)],
+    "focal_spot": [{"aspect": aspect, "flatness": 0.3} for aspect in (0.707, 1.414)],
     "veiling_glare": [{"length_mm": 2.1}, {"length_mm": 9.5}],
     "mtf_tail": [{"reach_px": 0.84}, {"reach_px": 2.4}],
     "k_fluorescence": [{"range_mm": 0.15}, {"range_mm": 0.33}],

@@ -358,6 +358,15 @@ def _law_factors(
     return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
 
 
+def law_terms(
+    curve: Curve, strength: float, groups: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a law that is off as usual adds: factors (probe, factor) and each probe's own variance (probe,)."""
+    response = curve.response(strength)
+    usual = LAW_ERRORS[0][0]
+    return _law_factors(curve, strength, response, groups, usual), _own_variance(curve, strength, response, usual)
+
+
 def _own_variance(
     curve: Curve, strength: float, effective: NDArray[np.float64], law_error: float
 ) -> NDArray[np.float64]:

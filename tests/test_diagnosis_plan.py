@@ -8,7 +8,7 @@ import pytest
 
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import Gap, _leaves_too_much
+from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much
 from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
@@ -150,6 +150,21 @@ def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a
 ):
     gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
     assert _leaves_too_much(gap, plausible) is vetoed
+
+
+def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_much_it_explains():
+    rng = np.random.default_rng(2)
+    places = np.repeat(np.arange(4), 50)
+    seen, nothing = np.full(50, 40.0), rng.standard_normal(50)
+    before = np.concatenate([seen, seen, nothing, nothing])
+    off_by_a_third = np.concatenate([0.3 * seen, -0.3 * seen, nothing, nothing])
+    elsewhere = np.concatenate([0.1 * seen, 0.1 * seen, 30.0 + nothing, nothing])
+    assert _contradicted(before, off_by_a_third, places) == 0.0
+    found = _contradicted(before, elsewhere, places)
+    assert found == pytest.approx(900.0 / 3200.0, rel=0.05)
+    gap = Gap(before=28.0, after=15.0, floor=0.7, shrinks_by=None, left=0.1, contradicted=found)
+    assert _leaves_too_much(gap, True)
+    assert not _leaves_too_much(replace(gap, contradicted=0.0), True)
 
 
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():

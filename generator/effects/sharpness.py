@@ -1,6 +1,7 @@
 """Blur of the picture: focal spot and motion (they leave the noise alone), and tails of the optical spread (they do not).
 
-focal spot   Gaussian of full width a (M - 1) at the detector, M = source-detector over source-object
+focal spot   variance of a Gaussian of full width a (M - 1) at the detector, M = source-detector over source-object; profile
+             from Gaussian to even brightness
 motion       box of length v t M along the belt
 MTF tail     (1 - w) G(f) + w / (1 + H f^2) in place of the calibrated G(f) (`order` 1; other shapes: effect.py)
 """
@@ -18,6 +19,18 @@ _USUAL_ORDER = 1.0  # of the tail: a Lorentzian
 _SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 
+def _transfer_of_spot(f: FloatArray, flatness: float) -> FloatArray:
+    """Transfer of a spot of standard deviation 1: Gaussian (flatness 0), more and more triangle (0.5), trapezoids, box (1)."""
+    if flatness <= 0.5:
+        triangle = 2.0 * flatness  # share of the variance
+        return np.asarray(
+            np.exp(-2.0 * (1.0 - triangle) * (np.pi * f) ** 2) * np.sinc(math.sqrt(6.0 * triangle) * f) ** 2
+        )
+    slope = 2.0 * (1.0 - flatness)  # width of the second box over that of the first
+    width = math.sqrt(12.0 / (1.0 + slope**2))
+    return np.asarray(np.sinc(width * f) * np.sinc(slope * width * f))
+
+
 def _blur_by_focal_spot(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if not context.has_scene or parameters["strength"] == 0:
         return state
@@ -26,11 +39,12 @@ def _blur_by_focal_spot(state: LineState, parameters: Mapping[str, float], conte
     magnification = needed(context.source_detector_mm, "source_detector_mm", name) / needed(
         context.source_object_mm, "source_object_mm", name
     )
+    flatness = parameters.get("flatness", 0.0)
     sigma_px = _SIGMA_OF_FWHM * parameters["strength"] * (magnification - 1.0) / pitch
     along_row, along_column = sigma_px * math.sqrt(parameters["aspect"]), sigma_px / math.sqrt(parameters["aspect"])
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        rows, columns = (np.exp(-2 * (np.pi * s * f) ** 2) for s, f in ((along_row, f_row), (along_column, f_column)))
+        rows, columns = (_transfer_of_spot(s * f, flatness) for s, f in ((along_row, f_row), (along_column, f_column)))
         return np.asarray(rows * columns)
 
     return replace(state, object_transfers=(*state.object_transfers, transfer))
@@ -46,7 +60,8 @@ FOCAL_SPOT = Effect(
             low=0.05,
             high=1.5,
             default=0.4,
-            source="full width at half maximum; industrial tubes, EN 12543",
+            source="full width at half maximum of the Gaussian of equal variance; industrial tubes, EN 12543. A spot of even"
+            " brightness is 1.47 times as wide",
             log=True,
         ),
         Parameter(
@@ -58,9 +73,18 @@ FOCAL_SPOT = Effect(
             source="width along the rows' index over width along the columns' index; EN 12543 states both",
             log=True,
         ),
+        Parameter(
+            name="flatness",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="profile of the spot: 0 Gaussian, 0.5 triangle, 1 even brightness; EN 12543 shows all of them",
+            log=False,
+        ),
     ),
     stage="object_blur",
-    reference="geometric unsharpness, EN 12543; Gaussian focal spot",
+    reference="geometric unsharpness, EN 12543; Gaussian to even brightness",
     after_calibration=False,
     change=_blur_by_focal_spot,
     needs=("scene", "pixel_mm", "source_object_mm", "source_detector_mm"),

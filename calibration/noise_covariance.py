@@ -147,9 +147,12 @@ def sampling_covariance(
 
     Source: Bartlett, An Introduction to Stochastic Processes (1955), in two dimensions.
     """
-    from scipy.signal import fftconvolve
+    from scipy.fft import irfftn, next_fast_len, rfftn
 
-    pair = fftconvolve(covariance_DN2, covariance_DN2[::-1, ::-1])  # sum_k C(k) C(k + s), s up to 2 R
+    # sum_k C(k) C(k + s), s up to 2 R; importing scipy.signal for it would take longer
+    rows, columns = (2 * length - 1 for length in covariance_DN2.shape)
+    size = [next_fast_len(rows, real=True), next_fast_len(columns, real=True)]
+    pair = irfftn(rfftn(covariance_DN2, size) * rfftn(covariance_DN2[::-1, ::-1], size), size)[:rows, :columns]
     centre = pair.shape[0] // 2
     padded = np.pad(pair, max(0, 2 * radius - centre))
     centre = padded.shape[0] // 2

@@ -510,15 +510,19 @@ def _correlation(picture: FloatArray, depth: FloatArray, good: NDArray[np.bool_]
     if min(measured.shape) < 4 * margin:
         return math.nan
     inner = (slice(margin, -margin), slice(margin, -margin))
-    still = measured[inner].ravel()
+    still = measured[inner] - measured[inner].mean()
+    scale = math.sqrt(float(np.vdot(still, still)))
     best = -1.0
+    if scale < 1e-9 * math.sqrt(still.size):
+        return best
     shifts = sorted({round(shift / stride) for shift in _SHIFTS_PX})
     for down in shifts:
         for right in shifts:
-            moved = np.roll(expected, (down, right), axis=(0, 1))[inner].ravel()
-            if np.std(moved) < 1e-9 or np.std(still) < 1e-9:
-                continue
-            best = max(best, float(np.corrcoef(still, moved)[0, 1]))
+            moved = np.roll(expected, (down, right), axis=(0, 1))[inner]
+            moved = moved - moved.mean()
+            own = math.sqrt(float(np.vdot(moved, moved)))
+            if own >= 1e-9 * math.sqrt(still.size):
+                best = max(best, float(np.vdot(still, moved)) / (scale * own))
     return best
 
 

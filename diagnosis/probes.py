@@ -93,7 +93,13 @@ def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
 def correlation_sum(expected: ExpectedSeries, rows: int, columns: int) -> float:
     """Sum of the quantum part's correlations over lags with triangular weights of a rows x columns block."""
     table = expected.noise_autocovariance
-    return float(_triangle(rows, table.shape[0]) @ table @ _triangle(columns, table.shape[1]))
+    return _correlation_sum(table.tobytes(), table.shape, rows, columns)
+
+
+@lru_cache(maxsize=512)
+def _correlation_sum(table: bytes, shape: tuple[int, int], rows: int, columns: int) -> float:
+    lags = np.frombuffer(table).reshape(shape)
+    return float(_triangle(rows, shape[0]) @ lags @ _triangle(columns, shape[1]))
 
 
 @lru_cache(maxsize=64)

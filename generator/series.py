@@ -52,7 +52,7 @@ _OF_THE_SPREAD = (
     "panel_rotation_deg",
 )
 _OF_THE_LIGHT = (*_OF_THE_SPREAD, "open_signal_DN", "product_material", "scene_kind", "displacement_px")
-_TIMED = frozenset(("object_blur",))  # stages whose effects may depend on how long an exposure takes
+_TIMED = frozenset(("motion_blur",))  # of the effects before the exposure, those that depend on how long it takes
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
 _ROUNDED_SD = 0.7  # of noise, in steps of the ADC: from there on the staircase's first harmonic is below 1e-4 of a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
@@ -406,7 +406,7 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
 
     found = known(request)
     if found is None:
-        timed = any(effect.stage in _TIMED for _, effect, _ in early)
+        timed = any(effect.id in _TIMED for _, effect, _ in early)
         once, load_mAs = cache.made_of(request, ("once", timed), lambda: _at_unit_load(request, timed=timed))
         found = known(once) or keep(once, _drawn(twin, once, choice, cache, values, early))
         if load_mAs != 1.0:

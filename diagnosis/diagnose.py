@@ -549,12 +549,12 @@ def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator)
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
-    """Fold 0 or 1 of each series: alternating in time within each kind, scene and beam."""
+    """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage."""
     counts: dict[tuple[Any, ...], int] = {}
     folds = []
     for view in problem.views:
         series = view.session.series
-        key = (series.kind, series.scene.rstrip("0123456789"), series.kV if series.kind != "dark" else None)
+        key = (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
         counts[key] = counts.get(key, -1) + 1
         folds.append(counts[key] % 2)
     return np.array(folds, dtype=np.intp)

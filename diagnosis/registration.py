@@ -92,8 +92,10 @@ def _resampled(splines: NDArray[np.float64], placement: Placement) -> NDArray[np
             t**3,
         )
         first, length = _BEYOND_PX + whole - 1, len(splines) - 2 * _BEYOND_PX
-        # the other axis comes first in turn, and first again after both
-        splines = sum(weight / 6.0 * splines[first + k : first + k + length] for k, weight in enumerate(weights)).T
+        moved = np.zeros((length, splines.shape[1]))
+        for k, weight in enumerate(weights):
+            moved += weight / 6.0 * splines[first + k : first + k + length]
+        splines = moved.T  # the other axis comes first in turn, and first again after both
     return splines
 
 

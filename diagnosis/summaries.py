@@ -116,7 +116,7 @@ class _Variances:
         self._total += x.sum(axis=0, dtype=np.float64)
         self._sum += cleaned.sum(axis=0, dtype=np.float64)
         self._square += np.einsum("nrc,nrc->rc", cleaned, cleaned)
-        squares = np.einsum("nrc,nrc->rc", steps, steps)
+        squares: NDArray[np.float32] = np.einsum("nrc,nrc->rc", steps, steps)
         self._steps += squares
         return squares
 

@@ -38,7 +38,7 @@ _MOST_UNIQUE_PIXELS = 300_000
 _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left out
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
-_MOST_MADE = 256
+_MOST_MADE = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,7 @@ class ModelCache:
             self._made[key] = found = (owner, make())
             while len(self._made) > _MOST_MADE:
                 self._made.popitem(last=False)
+        self._made.move_to_end(key)
         return found[1]
 
     def pixels(self, owner: object, name: object, read: Callable[[], NDArray[np.floating]]) -> FloatArray:

@@ -235,7 +235,13 @@ def test_a_bounded_read_variance_stays_within_its_bounds(variance, expected):
 def test_a_bounded_read_variance_that_nothing_is_known_of_is_even():
     value, sd = bounded_read_variance(0.0, 1e6, 120.0)
     assert value == pytest.approx(60.0, rel=1e-3)
-    assert sd == pytest.approx(120.0 / np.sqrt(12.0), rel=1e-2)
+    assert sd == pytest.approx(120.0 / np.sqrt(12.0), rel=0.02)
+
+
+def test_a_read_variance_at_its_bound_is_not_known_better_than_the_bound():
+    value, sd = bounded_read_variance(1000.0, 20.0, 100.0)
+    assert 90.0 < value <= 100.0
+    assert sd > 9.0
 
 
 def test_two_averaged_darks_bound_the_read_variance_whatever_their_pattern():

@@ -31,7 +31,7 @@ _STEP_PX = 5
 # have; simulated noise beside products had chi-squares of 1.0 to 2.0 a degree of freedom, the larger the wider the spread.
 _WITHIN_EDGES = 0.55
 _WHOLE_FIELD = 0.9  # share of the pixels
-_INTERCEPT_SD = 0.1  # relative, of a read variance that is an intercept: without it, one of 15 lab sessions lay 3.9 sds off
+_INTERCEPT_SD = 0.1  # relative, of a read variance that is an intercept: one of 15 lab sessions lay 3.9 sds off without
 _MARGIN = 1.2  # of a variance that the darks' difference shows: it is itself noisy
 _MOST_SAMPLES = 6e7  # frames x pixels of one beam and exposure: more tells nothing more
 

@@ -526,7 +526,11 @@ def test_a_session_that_lacks_every_feature_is_judged_by_the_rest_of_the_trainin
 def second_day_problem(rng, *, series=24, each=40, factors=3):
     """Flats of equal beams in time order; a factor that all share."""
     views = tuple(
-        SimpleNamespace(session=SimpleNamespace(series=SimpleNamespace(kind="flat", scene="", kV=40.0)))
+        SimpleNamespace(
+            session=SimpleNamespace(
+                series=SimpleNamespace(kind="flat", scene="", kV=40.0), request=SimpleNamespace(scene_kind=None)
+            )
+        )
         for _ in range(series)
     )
     size = series * each
@@ -534,6 +538,7 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
         residual=rng.standard_normal(size),
         factors=0.5 * rng.standard_normal((size, factors)),
         series_of=np.repeat(np.arange(series), each),
+        groups=np.arange(size) % 5,
         views=views,
     )
 

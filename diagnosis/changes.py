@@ -31,12 +31,13 @@ _SHARES_OF = {
             "image_lag",
             "dark_drift",
             "nonlinearity",
+            "heel",
         ),
         _ONE_SHARE,
     ),
-    "focal_spot": (0.2, 0.4, 0.6, 0.8, 1.0),
+    "focal_spot": (0.25, 0.5, 0.75, 1.0),
     "motion_blur": (0.0, 0.25, 0.5, 0.75, 1.0),
-    **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "heel"), _TWO_SHARES),
+    **dict.fromkeys(("composition_error", "kv_error", "filtration_error"), _TWO_SHARES),
 }
 _MOST_VARIANTS = 4
 _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {

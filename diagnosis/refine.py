@@ -175,15 +175,15 @@ def _newton(
     # a share of photons beyond what is plausible asks for another shape, not for more photons
     strength = min(max(here.best, variant.low), variant.high)
     at = np.asarray(here.curve.response(strength))
-    rows, kept = [at], []
+    steps, asked = [], []
     for item in inner:
         value = variant.parameters[item.name]
-        step = _STEP if _moved(item, value, _STEP) != value else -_STEP
-        moved = {**variant.parameters, item.name: _moved(item, value, step)}
-        answer = respond([replace(variant, parameters=moved, strengths=(strength,))])
-        if 0 in answer:
-            rows.append((whitener.apply(answer[0])[0] - at) / step)
-            kept.append(item.name)
+        steps.append(_STEP if _moved(item, value, _STEP) != value else -_STEP)
+        moved = {**variant.parameters, item.name: _moved(item, value, steps[-1])}
+        asked.append(replace(variant, parameters=moved, strengths=(strength,)))
+    answer = respond(asked)
+    rows = [at] + [(whitener.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
+    kept = [inner[number].name for number in sorted(answer)]
     left, slopes, wide = widened_for(residual - at, np.stack(rows), here.curve, strength, nuisances, groups, _LAW_ERROR)
     normal = wide.inner(slopes, slopes)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0

@@ -14,6 +14,7 @@ from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter,
 from raytwin.generator.effects.effect import spread_transfer
 from raytwin.generator.effects.fluorescence import line_energy_keV
 from raytwin.generator.effects.registration import displacement_px
+from raytwin.generator.effects.sharpness import _transfer_of_spot
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
@@ -966,3 +967,29 @@ def test_hot_pixels_are_their_share_of_the_bad_ones(series_line):
     size = float(np.prod(SHAPE))
     # lines of eight come and go together
     assert abs(hot - found.hot_pixel_share) < 4 * math.sqrt(8 * found.hot_pixel_share / size)
+
+
+@pytest.mark.parametrize("flatness", [0.0, 0.2, 0.5, 0.7, 1.0])
+def test_every_profile_of_a_focal_spot_has_the_same_variance_and_flatter_ones_lighter_tails(flatness):
+    f = np.linspace(0.0, 0.02, 41)
+    transfer = _transfer_of_spot(f, flatness)
+    # 1 - 2 pi^2 f^2 + (3 + kurtosis) (2 pi f)^4 / 24
+    bend = np.polyfit(f**2, transfer, 3)[::-1]
+    assert bend[1] == pytest.approx(-2.0 * np.pi**2, rel=1e-4)
+    excess = 24.0 * bend[2] / (2.0 * np.pi) ** 4 - 3.0
+    known = {0.0: 0.0, 0.5: -0.6, 1.0: -1.2}  # Gaussian, triangle, box
+    if flatness in known:
+        assert excess == pytest.approx(known[flatness], abs=0.02)
+    else:
+        assert -1.2 < excess < 0.0
+
+
+def test_a_focal_spot_of_even_brightness_smears_an_edge_over_its_width():
+    magnification, pitch_mm = 2.0, 0.1
+    width_mm = 0.8
+    strength = width_mm / math.sqrt(12.0) * 2.0 * math.sqrt(2.0 * math.log(2.0))
+    sigma_px = strength / (2.0 * math.sqrt(2.0 * math.log(2.0))) * (magnification - 1.0) / pitch_mm
+    f = np.fft.rfftfreq(4096, 1.0 / 16.0)  # sixteen samples a pixel
+    profile = np.fft.irfft(_transfer_of_spot(sigma_px * f, 1.0), 4096)
+    inside = profile > 0.5 * profile.max()
+    assert inside.sum() / 16.0 == pytest.approx(width_mm / pitch_mm, abs=0.15)

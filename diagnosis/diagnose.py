@@ -43,6 +43,9 @@ _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  #
 DOUBT = (
     0.18  # share of an explanation's probability: of 107 sealed cases that were stated as certain 86 were exactly right
 )
+_LOOSE = (
+    "object_scatter",
+)  # photons followed one by one reach shadows that no kernel fills: up to 2e-3 of its log evidence
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
@@ -244,6 +247,7 @@ def judge(
             unknown_names=problem.part_names,
             priors=priors or Priors(),
             power=POWER,
+            loose=_LOOSE,
         )
 
     whitened = whitening.curves(problem.curves)

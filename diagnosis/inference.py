@@ -15,7 +15,7 @@ power below 1 where tests on simulated sessions showed overconfidence.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -492,6 +492,7 @@ def weigh_hypotheses(
     power: float = 1.0,
     pairs_from: int = 6,
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
+    loose: Collection[str] = (),
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -505,6 +506,7 @@ def weigh_hypotheses(
         power: calibration of confidence: evidences are raised to it.
         pairs_from: pairs are formed of the best so many effects with every other.
         law_errors: relative errors of an effect's law in each group, and how probable each is.
+        loose: effects whose law leaves something where it predicts nothing: a second effect beside them is doubted in full.
     """
     priors = priors or Priors()
     fits = [fit_curve(residual, curve, nuisances, groups, law_errors=law_errors) for curve in curves]
@@ -549,13 +551,15 @@ def weigh_hypotheses(
             start = _start_pair(leading, second_fits, states=states, table=table)
             # the first's own variants were averaged above; its best stands for them
             starts.append((evidence_of[first] - leading.log_evidence, first, second, start))
-    overlaps = _overlaps([start for *_, start in starts], nuisances, table)
+    overlaps = _overlaps([start for *_, start in starts], evidence_of, nuisances, table)
     for number, (more, first, second, start) in enumerate(starts):
         # what a law that is slightly off leaves of a strong effect, a second one that acts on the same probes takes up a
         # little of
         stronger = max(evidence_of[first], evidence_of[second], 0.0)
         doubt = PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
         share = PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
+        if max(first, second, key=lambda effect: evidence_of[effect]) in loose:
+            share = 1.0
         starts[number] = (more - share * doubt, first, second, start)
     starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
     for number, (more, first, second, start) in enumerate(starts):
@@ -677,16 +681,21 @@ def _start_pair(
     return _PairStart(first=a, second=b, grid=grid, log_evidence=mean, moves=moves)
 
 
-def _overlaps(starts: Sequence[_PairStart], nuisances: Nuisances, table: _NodeTable) -> NDArray[np.float64]:
-    """How far the two effects of each pair move the same probes: cosine of what the nuisances leave of them, signs aside."""
+def _overlaps(
+    starts: Sequence[_PairStart], evidence_of: Mapping[str, float], nuisances: Nuisances, table: _NodeTable
+) -> NDArray[np.float64]:
+    """Share of what the weaker effect of each pair does, nuisances aside, that lies where the stronger one does as much."""
     solved = nuisances.solve_all(table.nodes)
     result = np.ones(len(starts))
     for number, start in enumerate(starts):
-        first, second = (
-            np.abs(curve.weights(np.array([strength]))[0] @ solved[table.rows(curve)])
+        squares = [
+            (curve.weights(np.array([strength]))[0] @ solved[table.rows(curve)]) ** 2
             for curve, strength in zip((start.first, start.second), start.grid.best, strict=True)
-        )
-        result[number] = float(first @ second) / max(math.sqrt(float(first @ first) * float(second @ second)), 1e-12)
+        ]
+        if evidence_of[start.first.effect] > evidence_of[start.second.effect]:
+            squares.reverse()
+        weaker, stronger = squares
+        result[number] = float(np.sum(np.minimum(weaker, stronger))) / max(float(weaker.sum()), 1e-12)
     return result
 
 

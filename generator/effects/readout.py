@@ -14,7 +14,7 @@ from .effect import Effect, Parameter
 
 def _add_row_noise(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     ratio = parameters["strength"] ** 2
-    variance = ratio * context.twin.noise.read_noise_DN.value ** 2
+    variance = ratio * context.twin.noise.read_noise_DN.value**2
     if context.since == "always":
         variance /= 1.0 + ratio  # calibrated^2 = white^2 (1 + strength^2)
     columns = parameters["column_share"]

@@ -17,7 +17,8 @@ from .assemble import Problem, build_problem
 from .changes import DEFINED_SD, catalogue_variants
 from .coarse import UNSEEN, in_pixels
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, law_terms, weigh_hypotheses
-from .plan import best_repeat, repeat_text
+from .next_series import best_measurement, proposal_text
+from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .refine import refine
@@ -381,7 +382,7 @@ def judge(
         gap=gap,
         held_out=held_out,
         ambiguous_with=tuple(pairs) if verdict == "ambiguous" else (),
-        next_measurement=_next_measurement(problem, tied) if verdict == "ambiguous" else None,
+        next_measurement=_next_measurement(problem, tied, rng) if verdict == "ambiguous" else None,
         twin=improved,
         added=added,
         named=tuple(named),
@@ -443,19 +444,34 @@ def _strained(problem: Problem, leading: Hypothesis, nuisances: Nuisances) -> tu
     return tuple(sorted(far, key=lambda item: -abs(item[1])))
 
 
-def _next_measurement(problem: Problem, tied: Sequence[Hypothesis]) -> Mapping[str, Any] | None:
-    """Which series to take again to tell the two likeliest explanations apart, found from the forward model and its noise."""
+def _next_measurement(
+    problem: Problem, tied: Sequence[Hypothesis], rng: np.random.Generator
+) -> Mapping[str, Any] | None:
+    """What to measure to tell the two likeliest explanations apart, found from the forward model and its noise.
+
+    A series taken again where that settles it, else the measurement that the session lacks which does.
+    """
     if len(tied) < 2:
         return None
     first, second = (
         {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
     )
+    answer: dict[str, Any] = {"separates": sorted({effect for item in tied[:2] for effect in item.effects})}
     found = best_repeat(problem, first, second)
+    if found is None or found.separation_then < WORTH_IT:
+        planned = best_measurement(problem, first, second, rng=rng)
+        if planned is not None and (planned.separation_then >= WORTH_IT or found is None):
+            return answer | {
+                "text": proposal_text(planned, tied[0].effects, tied[1].effects),
+                "measurement": planned.measurement.name,
+                "measure": [item.as_dict() for item in planned.measurement.series],
+                "separation": planned.separation,
+                "separation_then": planned.separation_then,
+            }
     if found is None:
         return None
-    return {
+    return answer | {
         "text": repeat_text(found, tied[0].effects, tied[1].effects),
-        "separates": sorted({effect for item in tied[:2] for effect in item.effects}),
         "series": found.series,
         "separation": found.separation,
         "separation_then": found.separation_then,

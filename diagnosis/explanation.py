@@ -34,9 +34,10 @@ def _percent(value: tuple[float, float, float]) -> str:
 def strength_text(cause: Cause) -> str:
     """Strength with its 95 % interval and unit."""
     value, low, high = cause.strength
-    digits = max(0, 2 - math.floor(math.log10(max(value, 1e-9))))
-    sign = "-" if cause.sign < 0 else ""
-    return f"{sign}{value:.{min(digits, 4)}f} {cause.unit} ({low:.{min(digits, 4)}f} to {high:.{min(digits, 4)}f})"
+    digits = min(max(0, 2 - math.floor(math.log10(max(value, 1e-9)))), 4)
+    if cause.sign < 0:
+        value, low, high = -value, -high, -low
+    return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def _place_text(place: Place) -> str:

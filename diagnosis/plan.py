@@ -18,7 +18,7 @@ _GRID = 41  # strengths of a competitor, evenly in the logarithm
 _CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
-_WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
+WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
 
 # what shows an effect by itself; also what a session has to hold for it to be told from its like
 ISOLATED_BY = {
@@ -109,7 +109,7 @@ class Repeat:
 def repeat_text(repeat: Repeat, first: Sequence[str], second: Sequence[str]) -> str:
     """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them."""
     names = " and ".join(first) + " from " + " and ".join(second)
-    if repeat.separation_then >= _WORTH_IT:
+    if repeat.separation_then >= WORTH_IT:
         return (
             f"take {repeat.series} again with {repeat.times} times as many frames, which would tell {names} by"
             f" {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"

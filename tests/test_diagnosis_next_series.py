@@ -1,0 +1,100 @@
+"""What a session could still measure, and how far each measurement would set two explanations apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition
+from raytwin.cli import main
+from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.next_series import FRAMES, _separation, best_measurement, measurements_lacking, proposal_text
+
+ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")
+
+
+@pytest.fixture(scope="module")
+def diagnosis(tmp_path_factory):
+    path = tmp_path_factory.mktemp("next") / "session.h5"
+    words = [
+        "--protocol",
+        "short",
+        "--geometry",
+        "fine",
+        "--seed",
+        "2502",
+        "--products",
+        "3",
+        "--effect",
+        "focal_spot=0.6",
+    ]
+    assert main(["lab", "-o", str(path), *words, "--size", "48", "--frames", "10"]) == 0
+    with open_acquisition(path) as acquisition:
+        return diagnose(acquisition, rng=np.random.default_rng(0))
+
+
+def explanation(diagnosis, *effects):
+    found = next(item for item in diagnosis.hypotheses if set(item.effects) == set(effects))
+    return {effect: (found.variants[effect], found.strengths[effect][0]) for effect in effects}
+
+
+def test_a_session_of_flats_and_products_lacks_all_that_isolates_effects(diagnosis):
+    planned = measurements_lacking(diagnosis.problem)
+    assert tuple(item.name for item in planned) == ALL
+    edges = next(item for item in planned if item.name == "edges")
+    # two directions, two distances, two voltages
+    assert len(edges.series) == 8
+    assert len({one.source_object_mm for one in edges.series}) == 2
+    equal = next(item for item in planned if item.name == "timed edges").series
+    assert len({round(one.setting.tube_load_mAs, 9) for one in equal}) == 1
+    assert len({one.exposure_ms for one in equal}) == 3
+    told = edges.series[0].as_dict()
+    assert told["kind"] == "object"
+    assert told["frames"] == FRAMES
+    assert {"kV", "filter", "exposure_ms", "scene", "source_object_mm"} <= set(told)
+
+
+def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of_the_panel(diagnosis):
+    first, second = explanation(diagnosis, "focal_spot"), explanation(diagnosis, "mtf_tail")
+    found = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))
+    assert found.measurement.name in ("discs", "edges", "timed edges")
+    assert found.separation_then > found.separation + 3.0
+    text = proposal_text(found, tuple(first), tuple(second))
+    assert text.startswith(f"measure {found.measurement.text}, which would tell focal_spot from mtf_tail by")
+    # the answer's frames are drawn from the generator alone, and hardly matter
+    again = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))
+    other = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(4))
+    assert again == found
+    assert other.separation_then == pytest.approx(found.separation_then, rel=0.1)
+
+
+def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(diagnosis):
+    curves = {}
+    for effect, strength in (("image_lag", 0.3), ("dark_drift", 3.0)):
+        curve = next(item for item in diagnosis.problem.curves if item.effect == effect)
+        curves[effect] = {effect: (curve, strength)}
+    found = best_measurement(diagnosis.problem, curves["image_lag"], curves["dark_drift"], rng=np.random.default_rng(3))
+    assert found.measurement.name == "afterglow"
+    assert found.separation_then > 5.0
+
+
+def test_an_explanation_lies_nowhere_from_itself_at_another_strength(diagnosis):
+    first = explanation(diagnosis, "focal_spot")
+    same = {effect: (curve, 1.0000001 * strength) for effect, (curve, strength) in first.items()}
+    assert _separation(diagnosis.problem, None, np.zeros(0, dtype=np.intp), first, same) < 1e-3
+
+
+def test_nothing_is_planned_for_a_session_that_states_no_tube_load(diagnosis):
+    problem = diagnosis.problem
+
+    def silent(view):
+        request = view.session.request
+        if request.setting is None:
+            return view
+        setting = replace(request.setting, power_W=None, current_mA=None)
+        return replace(view, session=replace(view.session, request=replace(request, setting=setting)))
+
+    unknown = replace(problem, views=tuple(silent(view) for view in problem.views))
+    assert measurements_lacking(unknown) == ()
+    first, second = explanation(diagnosis, "focal_spot"), explanation(diagnosis, "mtf_tail")
+    assert best_measurement(unknown, first, second, rng=np.random.default_rng(0)) is None

@@ -23,7 +23,7 @@ from ..generator.series import (
 from ..generator.twin import Twin
 from . import changes as scales
 from .changes import TwinChange, Variant, smooth_twin, twin_changes
-from .inference import Curve
+from .inference import LEAST_RESPONSE, Curve
 from .output_course import OutputCourse
 from .probes import (
     OUTLIER_SD,
@@ -1377,10 +1377,12 @@ def _join(
             missing.setdefault(variant.effect, failed)
             continue
         block_responses = responses[list(rows)]
-        if not float(np.max(np.abs(block_responses))) > 1e-3:
+        spread = _spread(variant, blocks, starts, len(residual), rows[0], base.instrument.readout_ms)
+        # a wandering output shifts levels by chance even where too few frames show its noise
+        by_chance = variant.effect == "output_drift" and spread is not None and bool(np.any(spread))
+        if not (by_chance or float(np.max(np.abs(block_responses))) > LEAST_RESPONSE):
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
-        spread = _spread(variant, blocks, starts, len(residual), rows[0], base.instrument.readout_ms)
         jitter = None
         if variant.effect == "gain_map_error":
             jitter = np.concatenate([block["pattern_jitter"] for block in blocks])

@@ -207,7 +207,9 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], nuisances: Nuisance
     farthest: dict[str, tuple[float, float]] = {}
     for curve in curves:
         response = curve.response(curve.high)[None, :]
-        length = math.sqrt(max(float(nuisances.inner(response, response)[0, 0]), 0.0))
+        if curve.by_chance_alone and curve.spread is not None:
+            response = curve.high * curve.spread.T
+        length = math.sqrt(max(float(np.trace(nuisances.inner(response, response))), 0.0))
         if length >= farthest.get(curve.effect, (-1.0, 0.0))[0]:
             farthest[curve.effect] = (length, curve.high)
     found = dict(problem.missing_effects)
@@ -709,6 +711,8 @@ def _strengths_on(
     for _ in range(3 if len(effects) > 1 else 1):
         for effect in effects:
             curve = leading.variants[effect]
+            if curve.by_chance_alone:
+                continue  # the strength is that of all probes
             others = sum(
                 (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
                 np.zeros(len(problem.residual)),

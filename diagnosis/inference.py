@@ -28,6 +28,8 @@ LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 STRENGTH_NODES = 25
 _PAIR_NODES = 13
+_CHANCE_NODES = 121
+LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
 _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
 _UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
 UNKNOWN_DOUBT = 0.05  # share of what an effect of the catalogue explains that an unknown one must explain beyond it
@@ -87,6 +89,11 @@ class Curve:
     spread: NDArray[np.float64] | None = None
     jitter: NDArray[np.float64] | None = None
     exact: NDArray[np.bool_] | None = None
+
+    @property
+    def by_chance_alone(self) -> bool:
+        """Whether the effect moves no probe by a known amount, but some by chance."""
+        return self.spread is not None and not bool(np.any(np.abs(self.responses) > LEAST_RESPONSE))
 
     def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
         """Weights (strength, node) with which the nodes' responses add up at given strengths."""
@@ -282,6 +289,8 @@ def fit_curve(
     The law's inaccuracy is a random factor a group and a part of each probe's own, both in proportion to what the
     nuisances leave of the response at the best strength (found in rounds).
     """
+    if curve.by_chance_alone:
+        return _fit_chance(residual, curve, nuisances)
     nodes = curve.responses
     solved = nuisances.solve_all(nodes)
 
@@ -341,6 +350,32 @@ def fit_curve(
         strengths=strengths,
         log_likelihood=value,
         separation=separation,
+    )
+
+
+def _fit_chance(residual: NDArray[np.float64], curve: Curve, nuisances: Nuisances) -> CurveFit:
+    """Evidence over none of a curve that moves probes by chance alone: r ~ N(0, C + s^2 S S^T), S its spread.
+
+    With S^T C^-1 S = V D V^T and c = V^T S^T C^-1 r the log likelihood ratio is
+    1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
+    """
+    if curve.spread is None:
+        raise ValueError(f"curve {curve.effect} {curve.variant} moves nothing")
+    spread = curve.spread.T
+    values, vectors = np.linalg.eigh(nuisances.inner(spread, spread))
+    along = vectors.T @ nuisances.inner(spread, residual[None, :])[:, 0]
+    strengths = np.unique(
+        np.concatenate([log_strength_nodes(curve.low, curve.high, _CHANCE_NODES), [curve.low, curve.high]])
+    )
+    grown = np.multiply.outer(strengths**2, np.maximum(values, 0.0))
+    quadratic = np.sum(along**2 * strengths[:, None] ** 2 / (1.0 + grown), axis=1)
+    likelihood = 0.5 * (quadratic - np.sum(np.log1p(grown), axis=1))
+    return CurveFit(
+        curve=curve,
+        log_evidence=_log_integral(strengths, likelihood, curve.low, curve.high),
+        strengths=strengths,
+        log_likelihood=likelihood,
+        separation=math.sqrt(2.0 * max(float(likelihood.max()), 0.0)),
     )
 
 

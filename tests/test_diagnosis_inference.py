@@ -374,3 +374,34 @@ def test_a_second_effect_elsewhere_is_named_beside_a_strong_one():
     assert found[0].effects == ("strong", "weak")
     alone = weigh(10.0 * strong + rng.standard_normal(PROBES), np.zeros((PROBES, 1)), made)
     assert alone[0].effects == ("strong",)
+
+
+def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength():
+    rng = np.random.default_rng(12)
+    spread = np.zeros((PROBES, 40))
+    for number in range(40):
+        spread[15 * number : 15 * number + 5, number] = 1.0  # forty levels, each seen by five probes
+    wandering = Curve(
+        effect="wandering",
+        variant="",
+        parameters={},
+        low=0.1,
+        high=10.0,
+        strengths=np.array([1.0]),
+        responses=np.zeros((1, PROBES)),
+        spread=spread,
+    )
+    assert wandering.by_chance_alone
+    steady = curves(rng, effects=4)
+    factors = rng.standard_normal((PROBES, 5))
+    found = weigh(noise(rng, factors) + 2.0 * spread @ rng.standard_normal(40), factors, (wandering, *steady))
+    assert found[0].effects == ("wandering",)
+    assert sum(item.probability for item in found if "wandering" in item.effects) > 0.99
+    value, low, high = found[0].strengths["wandering"]
+    assert low < 2.0 < high
+    # forty levels tell their own spread to a ninth
+    assert 1.5 < high / low < 2.0
+    claims = sum("wandering" in weigh(noise(rng, factors), factors, (wandering, *steady))[0].effects for _ in range(20))
+    assert claims <= 1
+    planted = weigh(noise(rng, factors) + steady[0].response(20.0), factors, (wandering, *steady))
+    assert planted[0].effects == ("effect0",)

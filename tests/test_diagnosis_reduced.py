@@ -112,7 +112,8 @@ def test_single_frames_with_a_twin_cannot_show_noise_from_frame_to_frame(diagnos
     code, answer, _ = diagnosed(single_frames, "--twin", str(line / "twin.h5"))
     assert code == 0
     assert answer["verdict"] != "explained"
-    assert {"row_noise", "output_drift"} <= untested(answer)
+    # an output that wanders shows in levels, if not within them
+    assert {"row_noise"} <= untested(answer)
 
 
 def test_averaged_frames_of_darks_are_as_quiet_as_their_number_says(line, tmp_path):

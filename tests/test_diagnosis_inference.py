@@ -397,7 +397,7 @@ def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength(
     found = weigh(noise(rng, factors) + 2.0 * spread @ rng.standard_normal(40), factors, (wandering, *steady))
     assert found[0].effects == ("wandering",)
     assert sum(item.probability for item in found if "wandering" in item.effects) > 0.99
-    value, low, high = found[0].strengths["wandering"]
+    _, low, high = found[0].strengths["wandering"]
     assert low < 2.0 < high
     # forty levels tell their own spread to a ninth
     assert 1.5 < high / low < 2.0

@@ -41,7 +41,7 @@ _SHARES_OF_EXPOSURE = (1.0, 0.5, 0.25, 0.1)
 _OTHER_VOLTAGE = 0.62  # of the one voltage that a session has, or its inverse
 _LEAST_KV = 30.0
 _FULL = 0.7  # of the ADC's range that planned series may fill
-_PAUSE_S = 5.0
+_LATER_S, _PAUSE_S = 60.0, 5.0  # after the session's last series; between planned ones
 _STRENGTH_FREE = 10.0  # standard deviation of a competitor's strength over itself, before looking
 
 
@@ -226,9 +226,10 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
         ]
 
     def far(kind: str) -> list[float]:
-        """Of the two distances those that the session lacks."""
+        """Distances that make two with those that the session has."""
         known = held(kind)
-        return [one for one in (line.usual_mm, line.other_mm) if round(one, 1) not in known][: 2 - min(len(known), 1)]
+        lacking = [one for one in (line.usual_mm, line.other_mm) if round(one, 1) not in known]
+        return lacking[:1] if known else lacking
 
     every = list(line.settings.values())
     kVs = " and ".join(f"{kV:g}" for kV in voltages) + " kV"
@@ -314,8 +315,8 @@ def best_measurement(
         first, second: the explanations.
         rng: of the frames that stand for the measurements.
     """
-    planned = measurements_lacking(problem)
-    if not planned:
+    line, planned = _line_of(problem), measurements_lacking(problem)
+    if line is None or not planned:
         return None
     wanted = {
         (curve.effect, curve.variant): strength
@@ -326,9 +327,10 @@ def best_measurement(
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "planned.h5"
-            members = _write(path, problem, planned, rng)
+            begin_s = max(view.session.request.start_s for view in problem.views) + _LATER_S
+            members = _write(path, line, planned, begin_s, rng)
             with open_acquisition(path) as acquisition:
-                taken = _problem_of(acquisition, problem, asked)
+                taken = build_problem(acquisition, problem.base, variants=asked, calibrated_elsewhere=True).released()
     except RaytwinError:
         return None  # a line whose twin cannot draw them: said elsewhere
     now = _separation(problem, None, np.zeros(0, dtype=np.intp), first, second)
@@ -352,23 +354,16 @@ def _fixed(problem: Problem, key: tuple[str, str], strength: float) -> Variant:
     return replace(variant, parameters=parameters, strengths=(strength,))
 
 
-def _problem_of(acquisition: AcquisitionFile, problem: Problem, asked: Sequence[Variant]) -> Problem:
-    return build_problem(acquisition, problem.base, variants=asked, calibrated_elsewhere=True).released()
-
-
 def _write(
-    path: Path, problem: Problem, planned: Sequence[Measurement], rng: np.random.Generator
+    path: Path, line: _Line, planned: Sequence[Measurement], begin_s: float, rng: np.random.Generator
 ) -> dict[str, frozenset[str]]:
-    """Measure with the twin; the names of each measurement's series."""
-    line = _line_of(problem)
-    if line is None:
-        raise InputError("session", received="no tube load", expected="series that state it")
+    """Measure with the twin from a time in the session on; the names of each measurement's series."""
     twin = line.twin
     scenes = _scenes(twin.maps.shape, line.material)
     highest = math.inf if twin.instrument.bits is None else _FULL * (2.0**twin.instrument.bits - 1.0)
     cache = ModelCache(draft=True)
     members: dict[str, frozenset[str]] = {}
-    clock = max(view.session.request.start_s for view in problem.views) + 60.0
+    clock = begin_s
     with write_acquisition(path, twin.instrument) as file:
         for name, (kind, maps) in scenes.items():
             file.add_scene(name, kind=kind, thickness_mm=maps)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import AcquisitionFile, open_acquisition, write_acquisition
+from ..acquisition.acquisition_io import open_acquisition, write_acquisition
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError, RaytwinError
 from ..generator.series import ModelCache, SeriesRequest, expected_series, sample_series, with_conditions

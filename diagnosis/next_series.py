@@ -372,15 +372,15 @@ def _write(
             names = []
             previous: tuple[SeriesRequest, ...] = ()
             for item in measurement.series:
-                kind, maps = scenes[item.scene] if item.scene else (None, None)
+                scene = scenes.get(item.scene)
                 request = SeriesRequest(
                     kind=item.kind,
                     setting=item.setting,
                     frames=FRAMES,
                     exposure_ms=item.exposure_ms,
                     start_s=clock,
-                    thickness_mm=maps,
-                    scene_kind=kind,
+                    thickness_mm=None if scene is None else scene[1],
+                    scene_kind=None if scene is None else scene[0],
                     source_object_mm=item.source_object_mm or twin.instrument.source_object_mm,
                     source_detector_mm=twin.instrument.source_detector_mm,
                     panel_rotation_deg=item.panel_rotation_deg,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import open_acquisition, write_acquisition
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError, RaytwinError
-from ..generator.series import ModelCache, SeriesRequest, expected_series, sample_series, with_conditions
+from ..generator.series import SeriesRequest, expected_series, sample_series, with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import Variant
@@ -40,7 +40,6 @@ _FILTER = Filter(material="Cu", thickness_mm=0.2)
 _SHARES_OF_EXPOSURE = (1.0, 0.5, 0.25, 0.1)
 _OTHER_VOLTAGE = 0.62  # of the one voltage that a session has, or its inverse
 _LEAST_KV = 30.0
-_FULL = 0.7  # of the ADC's range that planned series may fill
 _LATER_S, _PAUSE_S = 60.0, 5.0  # after the session's last series; between planned ones
 _STRENGTH_FREE = 10.0  # standard deviation of a competitor's strength over itself, before looking
 
@@ -360,8 +359,6 @@ def _write(
     """Measure with the twin from a time in the session on; the names of each measurement's series."""
     twin = line.twin
     scenes = _scenes(twin.maps.shape, line.material)
-    highest = math.inf if twin.instrument.bits is None else _FULL * (2.0**twin.instrument.bits - 1.0)
-    cache = ModelCache(draft=True)
     members: dict[str, frozenset[str]] = {}
     clock = begin_s
     with write_acquisition(path, twin.instrument) as file:
@@ -386,10 +383,6 @@ def _write(
                     panel_rotation_deg=item.panel_rotation_deg,
                     previous=previous,
                 )
-                expected = expected_series(twin, request, effects=(), cache=cache, use_measured_level=False)
-                top = float(np.max(expected.mean_DN))
-                if top > highest and request.setting is not None:
-                    request = replace(request, setting=_scaled(request.setting, highest / top))
                 step_s = request.interval_s(twin.instrument.readout_ms) * request.exposures_per_frame
                 number += 1
                 name = f"{number} {measurement.name}"

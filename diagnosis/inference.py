@@ -528,6 +528,7 @@ def weigh_hypotheses(
     pairs_from: int = 6,
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
     loose: Collection[str] = (),
+    chance: Mapping[str, float] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -541,9 +542,10 @@ def weigh_hypotheses(
         power: calibration of confidence: evidences are raised to it.
         pairs_from: pairs are formed of the best so many effects with every other.
         law_errors: relative errors of an effect's law in each group, and how probable each is.
+        chance: effect -> log evidence that sessions without it show, beyond what the nuisances allow; taken off.
         loose: effects whose law leaves something where it predicts nothing: a second effect beside them is doubted in full.
     """
-    priors = priors or Priors()
+    priors, chance = priors or Priors(), chance or {}
     fits = [fit_curve(residual, curve, nuisances, groups, law_errors=law_errors) for curve in curves]
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
@@ -562,7 +564,7 @@ def weigh_hypotheses(
         raw.append(
             (
                 (effect,),
-                evidence,
+                evidence - chance.get(effect, 0.0),
                 math.log(priors.single / n_effects),
                 {effect: interval_of(group_fits)},
                 {effect: best.curve},
@@ -595,7 +597,8 @@ def weigh_hypotheses(
         share = PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
         if max(first, second, key=lambda effect: evidence_of[effect]) in loose:
             share = 1.0
-        starts[number] = (more - share * doubt, first, second, start)
+        doubt = share * doubt + chance.get(first, 0.0) + chance.get(second, 0.0)
+        starts[number] = (more - doubt, first, second, start)
     starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
     for number, (more, first, second, start) in enumerate(starts):
         errors = law_errors if number < _PAIRS_IN_FULL else ()

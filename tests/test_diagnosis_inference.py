@@ -405,3 +405,14 @@ def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength(
     assert claims <= 1
     planted = weigh(noise(rng, factors) + steady[0].response(20.0), factors, (wandering, *steady))
     assert planted[0].effects == ("effect0",)
+
+
+def test_what_sessions_without_an_effect_show_by_chance_is_taken_off_alone_and_in_pairs(setup):
+    rng, factors, chosen = setup
+    residual = noise(rng, factors) + chosen[0].response(15.0) + chosen[2].response(30.0)
+    plain = {item.effects: item.log_evidence for item in weigh(residual, factors, chosen)}
+    found = {item.effects: item.log_evidence for item in weigh(residual, factors, chosen, chance={"effect0": 4.0})}
+    for effects, evidence in found.items():
+        taken = 4.0 if "effect0" in effects else 0.0
+        # an unknown effect is doubted in proportion to what the best of the others explains
+        assert evidence == pytest.approx(plain[effects] - taken, abs=1e-6 if effects != (UNKNOWN,) else 0.5)

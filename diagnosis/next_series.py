@@ -331,7 +331,7 @@ def best_measurement(
             with open_acquisition(path) as acquisition:
                 taken = build_problem(acquisition, problem.base, variants=asked, calibrated_elsewhere=True).released()
     except RaytwinError:
-        return None  # a line whose twin cannot draw them: said elsewhere
+        return None  # the twin cannot draw them: a repeat or the table of what isolates effects is named instead
     now = _separation(problem, None, np.zeros(0, dtype=np.intp), first, second)
     proposals = []
     for measurement in planned:

@@ -142,7 +142,7 @@ class ImageEffects:
     ) -> NDArray[np.float32]:
         """Read variance without the rows, columns and lost bits that the darks of the calibration held."""
         state = self._through(self._open_state(), always, None)
-        held = state.row_variance_DN2 + state.column_variance_DN2
+        held = state.read_variance_taken_DN2
         rounding = 1.0 / 12.0 if self.twin.noise.quantised else 0.0
         held += max(state.step_DN**2 / 12.0 - rounding, 0.0)
         if held <= 0:

@@ -218,6 +218,9 @@ def plot_a90(table: Sequence[dict[str, Any]]) -> bytes:
         )
         axis.errorbar(exposure, a90, yerr=[below, above], fmt="o-", color=colour, capsize=3, label=label)
     axis.set_xscale("log")
+    exposures = sorted({float(row["exposure_ms"]) for row in table})
+    axis.set_xticks(exposures, [f"{one:g}" for one in exposures])
+    axis.minorticks_off()
     axis.set(xlabel="exposure, ms", ylabel="contrast at POD 90 %", title="a90 against exposure")
     if axis.get_legend_handles_labels()[0]:
         axis.legend()

@@ -17,7 +17,8 @@ REAL, GENERATED, PUBLISHED = "#1b7f3b", "#c23b22", "#7a7a7a"
 _DPI = 110
 
 
-def _figure(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
+def figure_with_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
+    """A figure of width x height inches and its axes (row, column)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -26,7 +27,8 @@ def _figure(width: float, height: float, rows: int = 1, columns: int = 1) -> tup
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _png(figure: Any) -> bytes:
+def png_of(figure: Any) -> bytes:
+    """The figure as PNG, the same bytes whenever it is made."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
@@ -41,7 +43,7 @@ def plot_noise_maps(twin: Twin) -> bytes:
         (twin.maps.read_variance_DN2, "electronic and rounding variance, DN$^2$"),
         (twin.maps.dark_DN, "dark, DN"),
     )
-    figure, axes = _figure(13, 6.2, 2, 3)
+    figure, axes = figure_with_axes(13, 6.2, 2, 3)
     for column, (values, title) in enumerate(maps):
         low, high = np.percentile(values[good], [1, 99])
         shown = axes[0, column].imshow(values, vmin=low, vmax=high, cmap="viridis", interpolation="nearest")
@@ -51,12 +53,12 @@ def plot_noise_maps(twin: Twin) -> bytes:
         axes[0, column].set(title=title, xlabel="column, px", ylabel="row, px")
         axes[1, column].hist(values[good], bins=60, color="#446688")
         axes[1, column].set(xlabel=title, ylabel="pixels")
-    return _png(figure)
+    return png_of(figure)
 
 
 def plot_photon_transfer(twin: Twin) -> bytes:
     """Variance of one pixel against signal for every flat, with the fitted lines, and the residuals. PNG."""
-    figure, axes = _figure(12, 4.2, 1, 2)
+    figure, axes = figure_with_axes(12, 4.2, 1, 2)
     read = twin.noise.read_variance_DN2
     points = [point for point in twin.evidence["photon_transfer"] if point["signal_DN"] > 0]
     for index, level in enumerate(twin.levels):
@@ -79,12 +81,12 @@ def plot_photon_transfer(twin: Twin) -> bytes:
     axes[0, 0].legend()
     axes[0, 1].axhline(0, color="grey", linewidth=0.8)
     axes[0, 1].set(xlabel="signal above dark, DN", ylabel="measured over fitted variance - 1, %", title="residuals")
-    return _png(figure)
+    return png_of(figure)
 
 
 def plot_validation(rows: Sequence[dict[str, Any]]) -> bytes:
     """Predicted over measured mean and noise of flats that calibration did not see, with 95 % intervals. PNG."""
-    figure, axes = _figure(12, 0.45 * len(rows) + 1.6, 1, 2)
+    figure, axes = figure_with_axes(12, 0.45 * len(rows) + 1.6, 1, 2)
     height = np.arange(len(rows))[::-1]
     for column, (key, title) in enumerate((("mean_DN", "mean"), ("sd_DN", "noise (sd)"))):
         axis = axes[0, column]
@@ -101,7 +103,7 @@ def plot_validation(rows: Sequence[dict[str, Any]]) -> bytes:
         axis.axvline(0, color="grey", linewidth=0.8)
         axis.set(xlabel="predicted over measured - 1, %", title=title, yticks=height)
         axis.set_yticklabels([row["setting"].replace(",", ", ") for row in rows] if column == 0 else [], fontsize=8)
-    return _png(figure)
+    return png_of(figure)
 
 
 def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
@@ -116,7 +118,7 @@ def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
         contrast = float(contrasts[index])
         size = reference.rows[index].size_mm
     low, high = float(np.percentile(image, 2)) - 0.1, float(np.percentile(image, 99)) + 0.25
-    figure, axes = _figure(3.3 * len(exposures) + 3.3, 8.2, 3, len(exposures) + 1)
+    figure, axes = figure_with_axes(3.3 * len(exposures) + 3.3, 8.2, 3, len(exposures) + 1)
     axes[0, 0].imshow(image, vmin=low, vmax=high, cmap="gray")
     axes[0, 0].contour(mask, [0.5], colors="red", linewidths=0.8)
     axes[0, 0].set_title(f"reference, 1 s; bone of {size:.2g} mm,\ncontrast {contrast:.3f} (outlined)", fontsize=9)
@@ -133,13 +135,13 @@ def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
             axis.set_title(f"{title}, {exposure:g} ms", fontsize=9)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
-    return _png(figure)
+    return png_of(figure)
 
 
 def plot_training(training: dict[str, Any]) -> bytes:
     """Training and validation loss of the shared network and of the networks of every exposure. PNG."""
     names = list(training)
-    figure, axes = _figure(3.2 * len(names), 3.2, 1, len(names))
+    figure, axes = figure_with_axes(3.2 * len(names), 3.2, 1, len(names))
     for column, name in enumerate(names):
         axis = axes[0, column]
         for index, network in enumerate(training[name]["networks"]):
@@ -147,12 +149,12 @@ def plot_training(training: dict[str, Any]) -> bytes:
             axis.plot(np.arange(1, len(losses) + 1), losses, color=f"C{index}", linewidth=1)
             axis.plot(network["validation_epochs"], network["validation_losses"], ".--", color=f"C{index}", linewidth=1)
         axis.set(title=f"{name}", xlabel="epoch", ylabel="loss (dashed: validation)" if column == 0 else "")
-    return _png(figure)
+    return png_of(figure)
 
 
 def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exposures: Sequence[float]) -> bytes:
     """POD against contrast: a thin curve a network, a thick one for all; hits and misses as ticks; a90 intervals. PNG."""
-    figure, axes = _figure(4.1 * len(exposures), 4.0, 1, len(exposures))
+    figure, axes = figure_with_axes(4.1 * len(exposures), 4.0, 1, len(exposures))
     for column, exposure in enumerate(exposures):
         axis = axes[0, column]
         for kind, colour, label, offset in (("real", REAL, "measured", 0.0), ("test", GENERATED, "generated", 0.025)):
@@ -185,7 +187,7 @@ def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exp
         if axis.get_legend_handles_labels()[0]:
             axis.legend(loc="lower right", fontsize=8)
     axes[0, 0].set_ylabel("probability of detection")
-    return _png(figure)
+    return png_of(figure)
 
 
 def _curve(axis: Any, grid: Any, contrast: Any, hit: Any, **style: Any) -> None:
@@ -202,7 +204,7 @@ def _curve(axis: Any, grid: Any, contrast: Any, hit: Any, **style: Any) -> None:
 
 def plot_a90(table: Sequence[dict[str, Any]]) -> bytes:
     """Contrast at POD 90 % against exposure, measured and generated, with two-sided 95 % intervals. PNG."""
-    figure, axes = _figure(6.4, 4.2)
+    figure, axes = figure_with_axes(6.4, 4.2)
     axis = axes[0, 0]
     for kind, colour, label, shift in (("real", REAL, "measured", 0.97), ("generated", GENERATED, "generated", 1.03)):
         rows = [(row["exposure_ms"], row[kind]) for row in table if row[kind] and row[kind]["a90"] is not None]
@@ -224,4 +226,4 @@ def plot_a90(table: Sequence[dict[str, Any]]) -> bytes:
     axis.set(xlabel="exposure, ms", ylabel="contrast at POD 90 %", title="a90 against exposure")
     if axis.get_legend_handles_labels()[0]:
         axis.legend()
-    return _png(figure)
+    return png_of(figure)

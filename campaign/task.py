@@ -14,14 +14,13 @@ Every file stands in one folder; what is there already is not made again, and tr
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, open_acquisition
 from ..acquisition.contrast import DILATIONS, dilations_for_pixel
@@ -30,7 +29,6 @@ from ..acquisition.dataset_io import (
     DatasetRow,
     concatenate_datasets,
     read_dataset,
-    write_dataset,
     write_selected,
 )
 from ..acquisition.pairs import ObjectPair, dataset_from_acquisition, object_pairs, split_by_product
@@ -38,11 +36,11 @@ from ..acquisition.setting import Setting, setting_from_text
 from ..errors import FileFormatError, FitError, InputError
 from ..files import sha256_of_file, whole_file
 from ._plain import plain
+from .trial import curve_of_table, detect_on_file, scene_of, thresholds_from_images, train_on_file, write_split
 
 if TYPE_CHECKING:
     from ..generator.known_scenes import KnownScene
     from ..generator.twin import Twin
-    from ..segmentation import EpochResult, Recipe
 
 Tell = Callable[[str], None]
 
@@ -57,9 +55,6 @@ TRIALS = (
     ("measured", "measured"),
 )
 _FEWEST_TO_LEARN = 8  # measured images with a foreign object, below which networks of their own are not trained
-_FEWEST_TO_TRY = 5  # objects
-_AT_ONCE = 8  # images through a network
-_NEAR_PX = 3  # a mark this close to an object belongs to it
 _START_AVERAGED = 16  # the common start learns from images of as many frames: noisy ones teach a new network nothing
 
 
@@ -194,11 +189,11 @@ def run_task(
         table = directory / f"hits_{name}.csv"
         tell(f"networks of {networks} on images of {images}")
         learnt_from = measured.path if networks == "measured" else directory / f"{networks}_train.h5"
-        thresholds = _thresholds(
+        thresholds = thresholds_from_images(
             runs[networks], learnt_from, directory / f"thresholds_{networks}.json", plan.marked_share, device=device
         )
-        _detect(runs[networks], dataset, table, sizes, thresholds, device=device)
-        answers[name] = _curve(table, plan.size)
+        detect_on_file(runs[networks], dataset, table, sizes, thresholds, device=device)
+        answers[name] = curve_of_table(table, plan.size)
     if same:
         for images in ("after", "measured"):
             told = "before" if images == "after" else images
@@ -405,11 +400,6 @@ def _write_some(dataset: Dataset, numbers: Sequence[int], out: Path, *, draws: i
     write_selected(dataset, out, selection=chosen)
 
 
-def scene_of(image: str) -> str:
-    """The scene of an image: `product1#2` is the second image of `product1`."""
-    return image.partition("#")[0]
-
-
 def _with_objects(path: Path, splits: Sequence[str]) -> int:
     with read_dataset(path) as dataset:
         return sum(bool(row.foreign_object) and row.split in splits for row in dataset.rows)
@@ -560,7 +550,7 @@ class _DescribedSource:
             seed=3 * self.plan.seed + place,
             with_counts=False,
         )
-        _write_part(whole, path, part)
+        write_split(whole, path, part)
         return summary.warnings
 
 
@@ -615,7 +605,7 @@ class _ReferenceSource:
                 with_counts=False,
             )
         chosen.unlink()
-        _write_part(whole, path, part)
+        write_split(whole, path, part)
         return summary.warnings
 
 
@@ -640,23 +630,6 @@ def _source(brought: TaskInput, measured: _Measured, twin: "Twin", plan: TaskPla
             remedy="give a description, an acquisition with thickness maps or reference images with --task-products",
         )
     return _ReferenceSource(place, measured, plan)
-
-
-def _write_part(whole: Path, path: Path, part: str) -> None:
-    """All images of a file as split test, or as train and val."""
-    with (
-        read_dataset(whole) as dataset,
-        write_dataset(path, shape=dataset.shape, provenance=dict(dataset.attributes)) as writer,
-    ):
-        for number, row in enumerate(dataset.rows):
-            split = part if part == "test" else ("val" if row.split == "val" else "train")
-            writer.append(
-                image=dataset.images(number),
-                foreign_object_mask=dataset.foreign_object_masks(number),
-                product_mask=dataset.product_masks(number),
-                row=replace(row, split=split),
-            )
-    whole.unlink()
 
 
 def _largest_material(scenes: "Sequence[KnownScene]") -> str:
@@ -695,187 +668,32 @@ def _train(
     first = replace(RECIPES["raytwin"], steps=plan.start_steps, batch=plan.batch, crop_px=crop)
     later = replace(recipe_for_fine_tuning(RECIPES["raytwin"]), steps=plan.steps, batch=plan.batch, crop_px=crop)
     start = directory / "networks_start"
-    _train_on(directory / "start.h5", start, first, 1, None, plan, device=device, tell=tell, name="common start")
+    train_on_file(
+        directory / "start.h5",
+        start,
+        recipe=first,
+        networks=1,
+        seed=plan.seed,
+        device=device,
+        tell=tell,
+        name="common start",
+    )
     folders = {}
     for arm in arms:
         dataset = measured if arm == "measured" else directory / f"{arm}_train.h5"
         folders[arm] = directory / f"networks_{arm}"
-        _train_on(
+        train_on_file(
             dataset,
             folders[arm],
-            later,
-            plan.networks,
-            start,
-            plan,
+            recipe=later,
+            networks=plan.networks,
+            seed=plan.seed,
+            start_from=start,
             device=device,
             tell=tell,
             name=f"networks of {arm}",
         )
     return folders
-
-
-def _train_on(
-    path: Path,
-    folder: Path,
-    recipe: "Recipe",
-    networks: int,
-    start: Path | None,
-    plan: TaskPlan,
-    *,
-    device: str,
-    tell: Tell,
-    name: str,
-) -> None:
-    from ..segmentation import train_networks
-
-    def progress(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
-        tell(f"{name}: network {network + 1}, epoch {done} of {wanted}")
-
-    with read_dataset(path) as dataset:
-        train_networks(
-            dataset,
-            folder,
-            recipe=recipe,
-            networks=networks,
-            seed=plan.seed,
-            device=device,
-            start_from=start,
-            progress=progress,
-        )
-
-
-def _thresholds(runs_path: Path, learnt_from: Path, out: Path, share: float, *, device: str) -> dict[int, float]:
-    """Probability above which each network's pixels are marked, by network.
-
-    Networks that learnt little differ in how readily they mark. Each gets the threshold at which `share` of the images that
-    it learnt from show a mark away from objects: something its owner knows, whatever images it is tried on later.
-    """
-    from scipy.ndimage import binary_dilation
-
-    from ..segmentation import build_network, finished_networks, open_runs, predict_probabilities, read_weights
-
-    if out.exists():
-        return {int(number): float(value) for number, value in json.loads(out.read_text(encoding="utf-8")).items()}
-    runs = open_runs(runs_path)
-    found: dict[int, float] = {}
-    with read_dataset(learnt_from) as dataset:
-        numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
-        for network_number in finished_networks(runs):
-            _, weights = read_weights(runs.path / f"network_{network_number:03d}" / "weights.pt")
-            network = build_network(runs.recipe, seed=0, pretrained=False)
-            network.load_state_dict(weights)
-            network = network.to(device)
-            highest = []
-            for first in range(0, len(numbers), _AT_ONCE):
-                part = numbers[first : first + _AT_ONCE]
-                maps = predict_probabilities(network, dataset.images(part), recipe=runs.recipe, device=device)
-                for values, mask in zip(maps, dataset.foreign_object_masks(part), strict=True):
-                    away = (
-                        ~binary_dilation(mask, iterations=_NEAR_PX) if mask.any() else np.ones(mask.shape, dtype=bool)
-                    )
-                    highest.append(float(values[away].max()) if away.any() else 0.0)
-            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 1.0 - 1e-6))
-    with whole_file(out) as temporary:
-        temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
-    return found
-
-
-def _detect(
-    runs_path: Path,
-    dataset_path: Path,
-    out: Path,
-    contrast: Mapping[str, float],
-    thresholds: Mapping[int, float],
-    *,
-    device: str,
-) -> None:
-    """Hit table of all networks on the images of split test; images of one scene share its name."""
-    from ..segmentation import Detection, detect_with_networks, open_runs, write_detections
-
-    if out.exists():
-        return
-
-    def rows(dataset: Dataset, numbers: NDArray[np.intp]) -> Iterator[Detection]:
-        runs = open_runs(runs_path)
-        for network, threshold in thresholds.items():
-            for found in detect_with_networks(
-                runs, dataset, numbers, networks=[network], threshold=threshold, device=device
-            ):
-                scene = scene_of(found.image)
-                value = contrast.get(scene, found.contrast)
-                known = value is not None and math.isfinite(value) and found.recall is not None
-                yield replace(found, image=scene, contrast=value if known else None)
-
-    with read_dataset(dataset_path) as dataset:
-        write_detections(out, rows(dataset, dataset.indices(split="test")))
-
-
-def _curve(table_path: Path, size: str) -> dict[str, Any]:
-    """What an answer says of a hit table: counts, a90 with its interval, the curve; null where the data support none."""
-    from ..pod import curve_rows, false_alarm_rate, fit_pod, read_pod_table
-
-    table = read_pod_table(table_path, size=size)
-    objects = len(set(table.image or ()))
-    alarms = None
-    if len(table.false_alarm):
-        alarms = asdict(
-            false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
-        )
-    told: dict[str, Any] = {
-        "n": len(table.size),
-        "n_hits": 0 if table.hits is None else int(table.hits.sum()),
-        "objects": objects,
-        "a50": None,
-        "a90": None,
-        "a90_95_interval": {"low": None, "high": None},
-        "false_alarms": alarms,
-        "points": _hits_by_size(table.size, table.hits),
-        "line": None,
-        "table": table_path.name,
-        "warnings": [],
-    }
-    if objects < _FEWEST_TO_TRY or table.hits is None:
-        told["warnings"] = [f"{objects} foreign objects of known {size}: too few for a curve"]
-        return told
-    try:
-        fit = fit_pod(table.size, table.hits, repeats="crossed", network=table.network, image=table.image)
-    except FitError as error:
-        told["warnings"] = [str(error)]
-        return told
-    low, high = (
-        bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
-        for bounds in (fit.a90_low_two_sided, fit.a90_95_two_sided)
-    )
-    told |= {
-        "a50": fit.a50,
-        "a90": fit.a90,
-        "a90_95_interval": {"low": low, "high": high},
-        "line": None
-        if fit.curve is None
-        else {key: value.tolist() for key, value in curve_rows(fit, points=41).items()},
-        "link": fit.link,
-        "repeats": fit.repeats,
-        "warnings": list(fit.warnings),
-    }
-    return told
-
-
-def _hits_by_size(size: NDArray[np.float64], hits: NDArray[np.float64] | None) -> list[dict[str, float]]:
-    """Share of hits in up to eight groups of like size."""
-    if hits is None or not len(size):
-        return []
-    groups = np.unique(size)
-    edges = groups if len(groups) <= 8 else np.unique(np.quantile(size, np.linspace(0.0, 1.0, 9)[:-1]))
-    place = np.searchsorted(edges, size, side="right") - 1
-    return [
-        {
-            "size": float(size[place == number].mean()),
-            "hits": int(hits[place == number].sum()),
-            "n": int((place == number).sum()),
-        }
-        for number in range(len(edges))
-        if (place == number).any()
-    ]
 
 
 def _comparisons(directory: Path, real: str, plan: TaskPlan, *, same: bool) -> dict[str, Any]:

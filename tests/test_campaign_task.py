@@ -151,8 +151,8 @@ def stand_in(monkeypatch):
                     writer.writerow([*size, int(hit), network, scene, row.foreign_object, alarm])
 
     monkeypatch.setattr(task_module, "_train", train)
-    monkeypatch.setattr(task_module, "_detect", detect)
-    monkeypatch.setattr(task_module, "_thresholds", lambda *words, **options: {0: 0.5, 1: 0.5})
+    monkeypatch.setattr(task_module, "detect_on_file", detect)
+    monkeypatch.setattr(task_module, "thresholds_from_images", lambda *words, **options: {0: 0.5, 1: 0.5})
     monkeypatch.setattr(task_module, "_FEWEST_TO_LEARN", 3)
     monkeypatch.setattr(task_module, "_START_AVERAGED", 1)
     return limits, trained
@@ -209,7 +209,7 @@ def test_sizes_that_all_are_detected_at_give_null_with_a_warning(line, twin, tmp
                 if row.split == "test" and row.foreign_object:
                     writer.writerow([row.size_mm, 1, 0, scene_of(row.image)])
 
-    monkeypatch.setattr(task_module, "_detect", always)
+    monkeypatch.setattr(task_module, "detect_on_file", always)
     plan = TaskPlan(size="size_mm", test_share=0.7)
     found = run_task(twin, twin, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=plan)
     assert found["a90_real"] is None
@@ -265,7 +265,7 @@ def test_a_dataset_needs_something_to_generate_from(line, twin, tmp_path, stand_
         encoding="utf-8",
     )
     brought = TaskInput(measured=dataset, products=description)
-    monkeypatch.setattr(task_module, "_detect", _by_row)
+    monkeypatch.setattr(task_module, "detect_on_file", _by_row)
     found = run_task(twin, twin, brought, tmp_path / "described", plan=TaskPlan(images=10, size="size_mm"))
     assert found["products"] == "the description fillets.toml"
     assert found["curves"]["before_on_before"]["objects"] >= 1

@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "pod": ("pod", "probability-of-detection curve with a90 and its bounds"),
     "compare": ("compare", "are two POD curves the same?"),
     "plan": ("plan", "how many images and networks a POD study needs"),
+    "sweep": ("sweep", "the chain over many settings, so that one is chosen by its a90"),
     "diagnose": ("diagnose", "where the sim-to-real gap lies, which effect causes it, how far it shrinks"),
     "blind-check": ("blind_check", "the diagnosis on sealed cases of the virtual lab"),
     "lab": ("lab", "a session measured in the virtual lab"),

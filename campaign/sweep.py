@@ -1,0 +1,504 @@
+"""A sweep: many settings of one line, each judged by the a90 of networks trained and tried on images generated for it.
+
+Order of events. (1) Every setting is looked at (sweep_settings): what the line, the limits or the references rule out is a row
+with its reason and costs no training. (2) References are dealt out and one network learns from them, from which all others start.
+(3) Each setting is a task (sweep_trial) that a runner (sweep_runners) does: images, networks, hits, POD. (4) The rows are put
+together, compared with the best on the same images, and one is recommended (sweep_choice).
+
+What is finished is kept under the hash of what decides it: twin, references, setting, training, seed and version. So a sweep that
+was stopped goes on where it was, a setting that is added costs that setting, and a limit that is changed costs nothing.
+"""
+
+import contextlib
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import FitError, InputError, RaytwinError
+from ..files import whole_file
+from ..generator.twin_io import read_twin
+from ._plain import digest, plain
+from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
+from .sweep_file import Campaign, CurveOptions, Pair
+from .sweep_runners import Runner
+from .sweep_settings import Outlook, Scout, keep_best, labels_of
+from .sweep_trial import (
+    Task,
+    basis_of,
+    common_words,
+    is_done,
+    prepare_references,
+    setting_key,
+    setting_task,
+    start_key,
+    start_task,
+)
+
+UNITS = {"contrast": "", "size_mm": "mm"}
+_MARKER = "campaign.json"
+_KEY_LETTERS = 10
+COLUMNS = (
+    "label",
+    "low",
+    "high",
+    "feasible",
+    "trained",
+    "reason",
+    "a50",
+    "a90",
+    "a90_low",
+    "a90_high",
+    "a90_upper",
+    "n",
+    "n_hits",
+    "objects",
+    "false_alarm_rate",
+    "false_alarm_low",
+    "false_alarm_high",
+    "dose_uGy",
+    "dose_uGy_low",
+    "dose_uGy_high",
+    "throughput_per_s",
+    "pair_ms",
+    "belt_speed_mm_s",
+    "motion_px",
+    "photons_low",
+    "photons_high",
+    "delta_R",
+    "cnr_object",
+    "extrapolated",
+    "pareto",
+    "recommended",
+    "alike",
+    "warnings",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """What a sweep tells while it runs: `tell` a line; `begin` settings to train and how many of them are done already; `advance`
+    a row that is complete."""
+
+    tell: Callable[[str], None] = lambda line: None
+    begin: Callable[[int, int], None] = lambda total, done: None
+    advance: Callable[[Mapping[str, Any]], None] = lambda row: None
+
+
+def look_ahead(campaign: Campaign, *, each: Callable[[], None] = lambda: None) -> tuple[Outlook, ...]:
+    """What is known of every setting of a campaign before training, in the file's order.
+
+    Args:
+        campaign: as read.
+        each: called after each setting.
+
+    Raises:
+        InputError: a twin or references that cannot be read.
+    """
+    scout = Scout(campaign, read_twin(campaign.twin))
+    try:
+        found = []
+        for pair in campaign.settings:
+            found.append(scout.look(pair))
+            each()
+    finally:
+        scout.close()
+    if campaign.keep_best is None:
+        return tuple(found)
+    return keep_best(found, keep=campaign.keep_best, of=campaign.keep_best_of)
+
+
+def run_sweep(
+    campaign: Campaign,
+    directory: Path,
+    *,
+    runner: Runner,
+    version: str,
+    device: str = "cpu",
+    threads: int = 1,
+    keep_images: bool = False,
+    outlooks: Sequence[Outlook] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Do what is left of a sweep and write sweep.json and sweep.csv; returns what sweep.json holds.
+
+    Args:
+        campaign: what is asked.
+        directory: of the sweep, new or begun before, with this campaign or another one.
+        runner: where the settings are worked at.
+        version: of raytwin; a part of what decides a result.
+        device, threads: of each network's training.
+        keep_images: generated images stay.
+        outlooks: of `look_ahead`; None: looked at here.
+        progress: what to tell.
+
+    Raises:
+        InputError: the folder is of something else, another run works in it, references that cannot be used.
+        RaytwinError: the network that all start from could not be trained.
+    """
+    progress = progress or Progress()
+    _claim(directory)
+    with _only_one(directory):
+        found = tuple(outlooks) if outlooks is not None else look_ahead(campaign)
+        basis = basis_of(campaign, version=version)
+        data = (directory / "references").resolve()
+        tasks: dict[str, Task] = {}
+        errors: dict[str, str] = {}
+        if any(one.kept for one in found):
+            if not campaign.described:
+                prepare_references(campaign, data, basis)
+            common = common_words(campaign, data, device=device, threads=threads, keep_images=keep_images)
+            start = _start(campaign, directory, basis, common, runner, progress)
+            tasks = _tasks(campaign, directory, found, basis, common, start)
+        labels = labels_of([one.pair for one in found])
+        rows = {one.text: _row(one, label, None, "") for one, label in zip(found, labels, strict=True)}
+        outlook_of = {one.text: (one, label) for one, label in zip(found, labels, strict=True)}
+
+        def complete(text: str, error: str) -> dict[str, Any]:
+            outlook, label = outlook_of[text]
+            row = _row(outlook, label, tasks[text], error)
+            if not error:
+                _write_json(Path(tasks[text]["folder"]) / "row.json", row)
+            rows[text] = row
+            return row
+
+        left = {text: task for text, task in tasks.items() if not is_done(task)}
+        progress.begin(len(tasks), len(tasks) - len(left))
+        for text in tasks:
+            if text not in left:
+                complete(text, "")
+
+        def done(task: Task, error: str) -> None:
+            text = f"{task['low']};{task['high']}"
+            if error:
+                errors[text] = error
+            progress.advance(complete(text, error))
+
+        runner.run(list(left.values()), done)
+        answer = _answer(campaign, directory, list(rows.values()), basis, tasks)
+        _write_json(directory / "sweep.json", answer)
+        write_table(directory / "sweep.csv", answer["rows"])
+    return answer
+
+
+def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Seconds that each trained setting took, by its text; not in sweep.json, whose bytes say nothing of when it was made."""
+    found = {}
+    for row in rows:
+        path = directory / row["folder"] / "seconds.json" if row["folder"] else None
+        if path is not None and path.exists():
+            found[str(row["setting"])] = float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
+    return found
+
+
+def outlook_row(outlook: Outlook, label: str) -> dict[str, Any]:
+    """An outlook as a row, for people and JSON."""
+    return _row(outlook, label, None, "")
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """The rows as CSV: one line a setting, empty where a number is not known."""
+    with whole_file(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for row in rows:
+            flat = dict(row)
+            rate, dose = row["false_alarm_rate"] or {}, row["dose_uGy"] or {}
+            flat |= {
+                "false_alarm_rate": rate.get("value"),
+                "false_alarm_low": rate.get("low"),
+                "false_alarm_high": rate.get("high"),
+                "dose_uGy": dose.get("value"),
+                "dose_uGy_low": dose.get("low"),
+                "dose_uGy_high": dose.get("high"),
+                "photons_low": (row["photons_low"] or {}).get("value"),
+                "photons_high": (row["photons_high"] or {}).get("value"),
+                "warnings": "; ".join(row["warnings"]),
+            }
+            writer.writerow([_cell(flat[name]) for name in COLUMNS])
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(int(value))
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
+
+
+# ---------------------------------------------------------------------------------------------------- tasks
+
+
+def _start(
+    campaign: Campaign,
+    directory: Path,
+    basis: Mapping[str, Any],
+    common: Mapping[str, Any],
+    runner: Runner,
+    progress: Progress,
+) -> Path | None:
+    """Folder of the network that all settings start from, trained where it is not there; None: they start from none."""
+    if not campaign.training.start_steps:
+        return None
+    key = start_key(basis, campaign.training)
+    folder = (directory / "start" / key[:_KEY_LETTERS]).resolve()
+    task = start_task(campaign, folder, key, common)
+    if not is_done(task):
+        progress.tell("training the network that all settings start from")
+        failures: list[str] = []
+
+        def done(_: Task, error: str) -> None:
+            failures.append(error)
+
+        runner.run([task], done)
+        if any(failures):
+            raise RaytwinError(f"the network that all settings start from could not be trained: {failures[0]}")
+    return folder
+
+
+def _tasks(
+    campaign: Campaign,
+    directory: Path,
+    outlooks: Sequence[Outlook],
+    basis: Mapping[str, Any],
+    common: Mapping[str, Any],
+    start: Path | None,
+) -> dict[str, Task]:
+    tasks = {}
+    for one in outlooks:
+        if one.kept:
+            key = setting_key(basis, campaign.training, campaign.trying, one.pair)
+            folder = (directory / "settings" / _folder_name(one.pair, key)).resolve()
+            tasks[one.text] = setting_task(campaign, one.pair, folder, key=key, start=start, common=common)
+    return tasks
+
+
+def _folder_name(pair: Pair, key: str) -> str:
+    low, high = pair
+    return f"{low.kV:g}-{high.kV:g}kV_{low.exposure_ms:g}ms_{key[:_KEY_LETTERS]}"
+
+
+# ---------------------------------------------------------------------------------------------------- rows and answer
+
+
+def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[str, Any]:
+    """All that is known of a setting; `task` is what was done for it, if anything was."""
+    row: dict[str, Any] = {
+        "label": label,
+        "setting": outlook.text,
+        "low": str(outlook.pair[0]),
+        "high": str(outlook.pair[1]),
+        "feasible": outlook.feasible,
+        "trained": False,
+        "reason": outlook.reason or outlook.why_left_out or error,
+        "a50": None,
+        "a90": None,
+        "a90_low": None,
+        "a90_high": None,
+        "a90_upper": None,
+        "n": None,
+        "n_hits": None,
+        "objects": None,
+        "false_alarm_rate": None,
+        "dose_uGy": outlook.dose_uGy,
+        "throughput_per_s": outlook.throughput_per_s,
+        "pair_ms": outlook.pair_ms,
+        "belt_speed_mm_s": outlook.belt_speed_mm_s,
+        "motion_px": outlook.motion_px,
+        "photons_low": outlook.photons[0],
+        "photons_high": outlook.photons[1],
+        "delta_R": outlook.delta_R,
+        "cnr_object": outlook.cnr_object,
+        "extrapolated": outlook.extrapolated,
+        "points": [],
+        "line": None,
+        "folder": "",
+        "warnings": list(outlook.warnings),
+    }
+    if task is None or error:
+        return dict(plain(row))
+    folder = Path(task["folder"])
+    trial = json.loads((folder / "trial.json").read_text(encoding="utf-8"))
+    row["folder"] = f"settings/{folder.name}"
+    row["warnings"] = list(dict.fromkeys([*row["warnings"], *trial["warnings"]]))
+    if trial["refused"]:
+        return dict(plain(row | {"feasible": False, "reason": trial["refused"]}))
+    curve = json.loads((folder / "pod.json").read_text(encoding="utf-8"))
+    alarms = curve["false_alarms"]
+    row |= {
+        "trained": True,
+        "a50": curve["a50"],
+        "a90": curve["a90"],
+        "a90_low": curve["a90_95_interval"]["low"],
+        "a90_high": curve["a90_95_interval"]["high"],
+        "a90_upper": curve["a90_95"],
+        "n": curve["n"],
+        "n_hits": curve["n_hits"],
+        "objects": curve["objects"],
+        "false_alarm_rate": None
+        if alarms is None
+        else {"value": alarms["rate"], "low": alarms["low"], "high": alarms["high"], "n": alarms["n"]},
+        "points": curve["points"],
+        "line": curve["line"],
+        "warnings": [*row["warnings"], *curve["warnings"]],
+    }
+    if curve["a90"] is None:
+        about = [line for line in curve["warnings"] if "a90" in line]
+        row["reason"] = (about or [*curve["warnings"], "no a90"])[0]
+    return dict(plain(row))
+
+
+def _answer(
+    campaign: Campaign,
+    directory: Path,
+    rows: list[dict[str, Any]],
+    basis: Mapping[str, Any],
+    tasks: Mapping[str, Task],
+) -> dict[str, Any]:
+    limits = campaign.limits
+    choice = choose(rows, goal=limits.a90, most_false_alarms=limits.maximum_false_alarm_rate)
+    front = set(pareto_front(rows))
+    for number, row in enumerate(rows):
+        ratio = None
+        alike = False
+        if choice.best is not None and number != choice.best and row["a90"] is not None:
+            ratio = _ratio_to_best(
+                directory, tasks[rows[choice.best]["setting"]], tasks[row["setting"]], campaign.curve
+            )
+            alike = indistinct(ratio)
+        row |= {
+            "pareto": number in front,
+            "recommended": number == choice.recommended,
+            "best": number == choice.best,
+            "ratio_to_best": ratio,
+            "alike": alike,
+        }
+        over = limits.maximum_false_alarm_rate
+        if row["a90"] is not None and not takes_part(row, over):
+            rate = row["false_alarm_rate"]
+            told = "unknown" if rate is None else f"{100 * rate['value']:.3g} %"
+            row["reason"] = f"false alarms {told}, allowed are {100 * (over or 0.0):g} %"
+    unit = UNITS[campaign.curve.size]
+
+    def named(number: int | None) -> str | None:
+        return None if number is None else str(rows[number]["setting"])
+
+    result = {
+        "campaign": campaign.path.name,
+        **basis,
+        "size": campaign.curve.size,
+        "unit": unit,
+        "goal": limits.a90,
+        "maximum_false_alarm_rate": limits.maximum_false_alarm_rate,
+        "networks": campaign.training.networks,
+        "settings": len(rows),
+        "feasible": sum(bool(row["feasible"]) for row in rows),
+        "trained": sum(bool(row["trained"]) for row in rows),
+        "recommended": named(choice.recommended),
+        "best": named(choice.best),
+        "meets_goal": choice.meets,
+        "pareto": [str(rows[number]["setting"]) for number in sorted(front)],
+        "alike": [str(row["setting"]) for row in rows if row["alike"]],
+        "sentence": sentence(
+            rows, choice, goal=limits.a90, unit=unit, most_false_alarms=limits.maximum_false_alarm_rate
+        ),
+        "rows": rows,
+    }
+    return dict(plain(result))
+
+
+def _ratio_to_best(directory: Path, best: Task, other: Task, curve: CurveOptions) -> dict[str, Any]:
+    """a90 of a setting over that of the best, with its 95 % interval; on the same test images it is a paired comparison."""
+    key = digest({"best": best["curve_key"], "other": other["curve_key"]})
+    kept = directory / "compare" / f"{key[:20]}.json"
+    if kept.exists():
+        held: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
+        if held.get("key") == key:
+            return dict(held["ratio"])
+    ratio = compare_tables(Path(best["folder"]) / "hits.csv", Path(other["folder"]) / "hits.csv", curve)
+    _write_json(kept, {"key": key, "ratio": ratio})
+    return ratio
+
+
+def compare_tables(first: Path, second: Path, curve: CurveOptions) -> dict[str, Any]:
+    """Ratio of the a90 of two hit tables, second over first: {value, low, high, paired}; null where there is none."""
+    from ..pod import check_trials, compare_pod, read_pod_table
+
+    tables = [read_pod_table(path, size=curve.size) for path in (first, second)]
+    names = [set(table.image or ()) for table in tables]
+    shared = bool(names[0]) and names[0] == names[1]
+    trials = [
+        check_trials(
+            table.size,
+            [] if table.hits is None else table.hits,
+            network=table.network,
+            image=table.image,
+            log_size=curve.log_size,
+        )
+        for table in tables
+    ]
+    try:
+        found = compare_pod(
+            trials[0],
+            trials[1],
+            link=curve.link,
+            log_size=curve.log_size,
+            method=curve.method,
+            repeats="crossed",
+            shared_images=shared,
+        )
+    except (FitError, InputError) as error:
+        return {"value": None, "low": None, "high": None, "paired": "nothing", "why": str(error)}
+    ratio = found.ratio_a90
+    ends = [None if one is None or not math.isfinite(one) else one for one in (ratio.value, ratio.low, ratio.high)]
+    return {"value": ends[0], "low": ends[1], "high": ends[2], "paired": found.paired}
+
+
+# ---------------------------------------------------------------------------------------------------- the folder
+
+
+def _claim(directory: Path) -> None:
+    """Make the folder that of a sweep, or refuse one of something else."""
+    marker = directory / _MARKER
+    if marker.exists():
+        return
+    if directory.exists() and any(directory.iterdir()):
+        raise InputError(
+            "-o",
+            received=f"{directory}, a folder with other files in it",
+            expected="a new or empty folder, or that of a sweep begun before",
+        )
+    directory.mkdir(parents=True, exist_ok=True)
+    _write_json(marker, {"format": "raytwin-sweep", "version": 1})
+
+
+def marker_of(directory: Path) -> Path:
+    """A file that is there once the folder is a sweep's: what workers on other machines must see."""
+    _claim(directory)
+    return (directory / _MARKER).resolve()
+
+
+@contextlib.contextmanager
+def _only_one(folder: Path) -> Iterator[None]:
+    """No second run in the same folder at the same time, where the system can say so."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with open(folder / ".lock", "w", encoding="ascii") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(
+                "-o", received=f"{folder}, where a sweep is running", expected="a folder that no other run works in"
+            ) from None
+        yield
+
+
+def _write_json(path: Path, value: Mapping[str, Any]) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(plain(value), indent=1, allow_nan=False) + "\n", encoding="utf-8")

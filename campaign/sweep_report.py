@@ -1,0 +1,310 @@
+"""A sweep's answer as one self-contained HTML page."""
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files import whole_file
+from .figures import figure_with_axes, png_of
+from .sweep_choice import paces
+from .sweep_file import Campaign
+
+_DASH = "–"
+_TAKEN, _ALIKE, _OTHER, _FRONT = "#1b7f3b", "#335588", "#8a8a8a", "#c23b22"
+_MOST_CURVES = 8
+_MOST_BARS = 60
+
+
+def write_report(
+    answer: Mapping[str, Any], path: Path, *, campaign: Campaign, seconds: Mapping[str, float], version: str
+) -> Path:
+    """Write the report of a sweep's answer (what `run_sweep` returns); returns its path.
+
+    Args:
+        answer: rows, recommendation and what it rests on.
+        path: the page to write.
+        campaign: whose settings of training and limits are told.
+        seconds: what each setting took, by its text.
+        version: of raytwin.
+    """
+    import jinja2
+
+    rows = answer["rows"]
+    shown = [row for row in rows if row["a90"] is not None]
+    figures = {}
+    if shown:
+        figures["a90"] = plot_intervals(shown, size=_size_label(answer), goal=answer["goal"])
+        figures["front"] = plot_front(shown, size=_size_label(answer))
+    if any(row["line"] or row["points"] for row in rows):
+        figures["pod"] = plot_curves(rows, size=_size_label(answer))
+    template = jinja2.Template(
+        (Path(__file__).parent / "sweep_report.html").read_text(encoding="utf-8"), autoescape=True
+    )
+    page = template.render(
+        version=version,
+        answer=answer,
+        sentence=answer["sentence"],
+        size=_size_label(answer),
+        trained=[_trained_row(row, seconds) for row in _in_order(rows) if row["trained"]],
+        left_out=[_left_out_row(row) for row in rows if not row["trained"]],
+        notes=_notes(rows),
+        recommended=next((row for row in rows if row["recommended"]), None),
+        facts=_facts(campaign, answer),
+        limits=_limits(campaign),
+        figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},
+    )
+    with whole_file(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return path
+
+
+def plot_intervals(rows: Sequence[Mapping[str, Any]], *, size: str, goal: float | None) -> bytes:
+    """a90 of each setting with its two-sided 95 % interval and one-sided bound, the smallest bound first. PNG."""
+    ordered = _in_order(rows)[:_MOST_BARS]
+    figure, axes = figure_with_axes(10, 1.4 + 0.32 * len(ordered))
+    axis = axes[0, 0]
+    height = np.arange(len(ordered))[::-1]
+    largest = max(max(row["a90"], row["a90_high"] or 0.0) for row in ordered)
+    for y, row in zip(height, ordered, strict=True):
+        colour = _colour(row)
+        low, high = (row["a90"] if row[name] is None else row[name] for name in ("a90_low", "a90_high"))
+        axis.plot([low, high], [y, y], color=colour, linewidth=2.2 if row["recommended"] else 1.4)
+        axis.plot([row["a90"]], [y], "o", color=colour, markerfacecolor=colour if row["recommended"] else "white")
+        if row["a90_upper"] is not None:
+            axis.plot([row["a90_upper"]], [y], "|", color=colour, markersize=11, markeredgewidth=1.6)
+        if row["a90_high"] is None:
+            axis.annotate(
+                "no upper end", (row["a90"], y), xytext=(8, -3), textcoords="offset points", fontsize=7, color=colour
+            )
+        largest = max(largest, row["a90_upper"] or 0.0)
+    if goal is not None:
+        axis.axvline(goal, color="black", linewidth=0.9, linestyle=":")
+        axis.annotate("goal", (goal, height[0] + 0.55), fontsize=8, ha="center", annotation_clip=False)
+    axis.set_yticks(height, [row["label"] for row in ordered], fontsize=9)
+    axis.set(xlim=(0, 1.06 * max(largest, goal or 0.0)), ylim=(-0.7, len(ordered) - 0.3))
+    axis.set_xlabel(f"{size} at POD 90 %: estimate, two-sided 95 % interval, one-sided 95 % bound (tick)")
+    for colour, label in ((_TAKEN, "recommended"), (_ALIKE, "not shown to be worse than the best"), (_OTHER, "worse")):
+        if any(_colour(row) == colour for row in ordered):
+            axis.plot([], [], "o-", color=colour, label=label)
+    # below the axis: a legend inside would cover intervals
+    axis.legend(fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
+    return png_of(figure)
+
+
+def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
+    """a90 against pace and against dose, with those that no other setting beats in all three. PNG."""
+    pace = paces(rows)
+    belt = not any(row["throughput_per_s"] is not None for row in rows)
+    panels = [
+        (pace, "belt speed, mm/s" if belt else "throughput, products/s"),
+        (
+            [math.nan if row["dose_uGy"] is None else row["dose_uGy"]["value"] for row in rows],
+            "air kerma of a pair, uGy",
+        ),
+    ]
+    figure, axes = figure_with_axes(11, 4.2, 1, 2)
+    for column, (values, title) in enumerate(panels):
+        axis = axes[0, column]
+        for value, row in zip(values, rows, strict=True):
+            if not (math.isfinite(value) and value > 0):
+                continue
+            low, high = (row["a90"] if row[name] is None else row[name] for name in ("a90_low", "a90_high"))
+            colour = _TAKEN if row["recommended"] else _FRONT if row["pareto"] else _OTHER
+            axis.plot([value, value], [low, high], color=colour, linewidth=1, alpha=0.6)
+            axis.plot([value], [row["a90"]], "o", color=colour, markersize=9 if row["recommended"] else 6)
+        axis.set(xscale="log", xlabel=title, ylabel=f"{size} at POD 90 %" if column == 0 else "")
+        axis.set_ylim(bottom=0)
+        _few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
+    kinds = [
+        ("recommended", _TAKEN, "recommended"),
+        ("pareto", _FRONT, "no other beats it in a90, dose and throughput"),
+    ]
+    for name, colour, label in kinds:
+        if any(row[name] for row in rows):
+            axes[0, 0].plot([], [], "o", color=colour, label=label)
+    axes[0, 0].plot([], [], "o", color=_OTHER, label="beaten by another")
+    axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
+    return png_of(figure)
+
+
+def _few_ticks(axis: Any, values: Sequence[float]) -> None:
+    """Ticks of a logarithmic axis at 1, 2 and 5, in plain numbers."""
+    if not values:
+        return
+    lowest, highest = min(values) / 1.25, max(values) * 1.25
+    decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
+    ticks = [step * 10.0**power for power in decades for step in (1, 2, 5)]
+    inside = [tick for tick in ticks if lowest <= tick <= highest]
+    axis.set_xticks(inside, [f"{tick:g}" for tick in inside])
+    axis.minorticks_off()
+    axis.set_xlim(lowest, highest)
+
+
+def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
+    """POD curves with 95 % bands of the recommended setting, of those that no other beats, and of others up to eight. PNG."""
+    fitted = [row for row in rows if row["line"] or row["points"]]
+    ranked = sorted(
+        fitted, key=lambda row: (not row["recommended"], not row["pareto"], row["a90"] is None, row["a90"] or 0.0)
+    )
+    chosen = ranked[:_MOST_CURVES]
+    columns = min(len(chosen), 4)
+    lines = -(-len(chosen) // columns)
+    figure, axes = figure_with_axes(3.1 * columns, 2.9 * lines, lines, columns)
+    for axis, row in zip(axes.flat, chosen, strict=False):
+        colour = _colour(row)
+        line = row["line"]
+        if line:
+            # where a band has no end there is null
+            at, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
+            axis.plot(at, pod, color=colour)
+            axis.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
+        for point in row["points"]:
+            axis.plot([point["size"]], [point["hits"] / point["n"]], "o", color="black", markersize=3)
+        axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
+        if row["a90"] is not None:
+            axis.plot([row["a90"]], [0.9], "o", color=colour, markersize=5)
+        axis.set(ylim=(-0.03, 1.03))
+        axis.set_title(str(row["label"]) + (" *" if row["recommended"] else ""), fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel(size)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("probability of detection")
+    for axis in list(axes.flat)[len(chosen) :]:
+        axis.set_axis_off()
+    return png_of(figure)
+
+
+def _colour(row: Mapping[str, Any]) -> str:
+    return _TAKEN if row["recommended"] else _ALIKE if row["alike"] or row["best"] else _OTHER
+
+
+def _in_order(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Smallest upper bound first; those without a bound, then those without a90, last."""
+    return sorted(
+        rows,
+        key=lambda row: (
+            row["a90"] is None,
+            row["a90_upper"] is None,
+            row["a90_upper"] or row["a90"] or 0.0,
+            str(row["label"]),
+        ),
+    )
+
+
+def _size_label(answer: Mapping[str, Any]) -> str:
+    return "contrast" if answer["size"] == "contrast" else "size, mm"
+
+
+def _number(value: float | None, digits: str = ".3g") -> str:
+    return _DASH if value is None else format(value, digits)
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    return f"{_number(low)} to {_number(high)}"
+
+
+def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[str, Any]:
+    alarms, dose, ratio = row["false_alarm_rate"], row["dose_uGy"], row["ratio_to_best"]
+    marks = []
+    if row["recommended"]:
+        marks.append("recommended")
+    if row["best"] and not row["recommended"]:
+        marks.append("smallest bound")
+    if row["alike"]:
+        marks.append("not shown to be worse")
+    if row["pareto"]:
+        marks.append("front")
+    if row["reason"]:
+        marks.append(str(row["reason"]))
+    spent = seconds.get(row["setting"])
+    return {
+        "label": row["label"],
+        "setting": f"{row['low']}; {row['high']}",
+        "recommended": row["recommended"],
+        "a90": _number(row["a90"]),
+        "interval": _interval(row["a90_low"], row["a90_high"]) if row["a90"] is not None else _DASH,
+        "upper": _number(row["a90_upper"]),
+        "a50": _number(row["a50"]),
+        "ratio": _DASH
+        if not ratio or ratio["value"] is None
+        else f"{ratio['value']:.2f} ({_interval(ratio['low'], ratio['high'])})",
+        "hits": f"{row['n_hits']} of {row['n']}",
+        "alarms": _DASH
+        if alarms is None
+        else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.3g} to {100 * alarms['high']:.3g})",
+        "dose": _DASH if dose is None else f"{dose['value']:.3g} ({_interval(dose['low'], dose['high'])})",
+        "throughput": _number(row["throughput_per_s"]),
+        "motion": _number(row["motion_px"]),
+        "cnr": _number(row["cnr_object"]),
+        "extrapolated": "yes" if row["extrapolated"] else "no",
+        "seconds": _DASH if spent is None else f"{spent:.0f}",
+        "marks": "; ".join(marks),
+    }
+
+
+def _left_out_row(row: Mapping[str, Any]) -> dict[str, str]:
+    dose = row["dose_uGy"]
+    return {
+        "label": row["label"],
+        "setting": f"{row['low']}; {row['high']}",
+        "kind": "cannot be" if not row["feasible"] else "not tried",
+        "throughput": _number(row["throughput_per_s"]),
+        "dose": _number(None if dose is None else dose["value"]),
+        "cnr": _number(row["cnr_object"]),
+        "reason": row["reason"],
+    }
+
+
+def _notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Each warning once, with the settings that it belongs to."""
+    where: dict[str, list[str]] = {}
+    for row in rows:
+        for line in row["warnings"]:
+            where.setdefault(line, []).append(str(row["label"]))
+    everywhere = len(rows)
+    return [
+        (line if len(labels) == everywhere else f"{'; '.join(labels[:4])}{' ...' if len(labels) > 4 else ''}: {line}")
+        for line, labels in where.items()
+    ]
+
+
+def _facts(campaign: Campaign, answer: Mapping[str, Any]) -> list[str]:
+    training, trying = campaign.training, campaign.trying
+    marked = (
+        f"a pixel is marked above a probability of {trying.threshold:g}"
+        if trying.threshold is not None
+        else f"each network's threshold lets {100 * trying.marked_share:g} % of the images it learnt from show a mark away from"
+        " objects"
+    )
+    start = (
+        f"they start from one network that learnt for {training.start_steps} steps from the"
+        f" {'clearest images' if campaign.described else 'references'} and {training.mixed_steps} from noisier ones"
+        if training.start_steps
+        else "they start from random weights"
+    )
+    tests = "other products of it" if campaign.test_references is None else campaign.test_references.name
+    counts = {row["objects"] for row in answer["rows"] if row["trained"]}
+    tried = (
+        f"Tried on {counts.pop()} foreign objects, the same at every setting"
+        if len(counts) == 1
+        else "Tried on held-back images"
+    )
+    return [
+        f"Twin {campaign.twin.name}; images for training come from {campaign.references.name}, those to try networks on from"
+        f" {tests}.",
+        f"Each setting has {training.networks} networks, trained for {training.steps} steps on {training.images} pairs generated"
+        f" at it (recipe {training.recipe}, batch {training.batch}); {start}.",
+        f"{tried}; {marked}.",
+    ]
+
+
+def _limits(campaign: Campaign) -> list[str]:
+    """The limits that the campaign states, in its own words."""
+    return [
+        f"{name} = {value:g}" for name, value in asdict(campaign.limits).items() if value not in (None, True, False)
+    ] + ([] if campaign.limits.extrapolation else ["extrapolation = false"])

@@ -1,0 +1,440 @@
+"""What is known of a setting before anything is trained: can the line do it, what it costs, how well the object stands out.
+
+Time and dose of a product with N frames of t averaged in each image, readout r, and air kerma K of one frame at the product:
+
+    pair = sum or maximum over the two images of N (t + r)        throughput = v / pitch on a belt, else 1 / (pair + pause)
+    dose = sum over the two images of N K                         motion = v M t / pixel
+
+(t + r is the longer of the two where readout overlaps the exposure.) The belt's motion goes into the images as the effect
+`motion_blur`; frames that a belt would move apart are not averaged.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..acquisition.dataset_io import Dataset, read_dataset
+from ..acquisition.instrument import Instrument
+from ..acquisition.setting import Setting, text_from_filters
+from ..errors import InputError
+from ..generator.effects import AppliedEffect
+from ..generator.line_limits import frames_per_s
+from ..generator.predict import Prediction, predict_flatfield
+from ..generator.twin import Twin
+from .sweep_file import Campaign, Limits, Pair, Timing, text_of_pair
+
+if TYPE_CHECKING:
+    from ..generator.describe import Description
+
+_MOTION = "motion_blur"
+_MOTION_MS = 50.0  # the effect's strength is the path in this time
+_STRICTER = ("maximum_kV", "maximum_current_mA", "maximum_power_w")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outlook:
+    """A setting before training.
+
+    Fields: pair; reason (why it cannot be, empty where it can); kept (whether it is trained) with why_left_out where not;
+    dose_uGy, photons (low, high; a pixel and frame of the open beam), each {value, low, high}; pair_ms; throughput_per_s;
+    belt_speed_mm_s; motion_px (longest path in one exposure); extrapolated; delta_R, cnr_object; warnings. None: unknown.
+    """
+
+    pair: Pair
+    reason: str = ""
+    kept: bool = True
+    why_left_out: str = ""
+    dose_uGy: Mapping[str, float] | None = None
+    photons: tuple[Mapping[str, float] | None, Mapping[str, float] | None] = (None, None)
+    pair_ms: float | None = None
+    throughput_per_s: float | None = None
+    belt_speed_mm_s: float | None = None
+    motion_px: float | None = None
+    extrapolated: bool | None = None
+    delta_R: float | None = None
+    cnr_object: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """LOW;HIGH."""
+        return text_of_pair(self.pair)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether line and limits allow it."""
+        return not self.reason
+
+
+class _Refused(Exception):  # noqa: N818  (a finding, no failure)
+    """A setting that a limit of the campaign rules out."""
+
+
+class Scout:
+    """Looks at the settings of a campaign; close it after use.
+
+    Args:
+        campaign: whose limits and references count.
+        twin: the line, as the file has it.
+    """
+
+    def __init__(self, campaign: Campaign, twin: Twin) -> None:
+        self.campaign = campaign
+        self.twin = replace(twin, instrument=limited_instrument(twin.instrument, campaign.limits))
+        self._datasets: list[Dataset] = []
+        self._descriptions: list[Description] = []
+        for word, path in (("references", campaign.references), ("test_references", campaign.test_references)):
+            if path is None:
+                continue
+            if campaign.described:
+                from ..generator.describe import read_description
+
+                self._descriptions.append(read_description(path))
+            else:
+                self._datasets.append(open_references(path, word))
+
+    def close(self) -> None:
+        """Close the reference files."""
+        for dataset in self._datasets:
+            dataset.close()
+
+    def look(self, pair: Pair) -> Outlook:
+        """What is known of one pair of settings; one that cannot be comes back with the reason."""
+        limits = self.campaign.limits
+        known: dict[str, Any] = {"belt_speed_mm_s": pair[0].belt_speed_mm_s}
+        warnings: list[str] = []
+        try:
+            predictions = tuple(predict_flatfield(self.twin, one) for one in pair)
+            for found in predictions:
+                warnings += found.warnings
+            known |= _costs(self.twin, pair, predictions, self.campaign.timing)
+            warnings += known.pop("warnings")
+            known["motion_px"] = _motion_px(self.twin.instrument, pair)
+            _check(self.twin, pair, predictions, known, limits, self.campaign.timing)
+            warnings += self._try_images(pair)
+            known |= self._contrast(pair, warnings)
+        except InputError as error:
+            return Outlook(pair=pair, reason=str(error), kept=False, warnings=_once(warnings), **known)
+        except _Refused as error:
+            return Outlook(pair=pair, reason=str(error), kept=False, warnings=_once(warnings), **known)
+        return Outlook(pair=pair, warnings=_once(warnings), **known)
+
+    def _try_images(self, pair: Pair) -> tuple[str, ...]:
+        """Whether images can be made at all; the noise of one reference of each kind is weighed."""
+        from ..generator.generate import ReferenceImages
+        from ..generator.generate_described import DescribedScenes
+
+        twin, told = twin_at(self.twin, pair)
+        found: list[str] = list(told)
+        for description in self._descriptions:
+            found += DescribedScenes(twin, description, low=pair[0], high=pair[1], seed=0).warnings
+        for dataset in self._datasets:
+            _check_distance(self.twin.instrument, pair, dataset, self.campaign.reference_setting)
+            images = ReferenceImages(
+                twin,
+                dataset,
+                low=pair[0],
+                high=pair[1],
+                product_material=self.campaign.product_material,
+                foreign_material=self.campaign.foreign_material,
+                reference_setting=self.campaign.reference_setting,
+            )
+            found += images.warnings
+            first = {dataset.rows[number].setting: place for place, number in reversed(list(enumerate(images.numbers)))}
+            for place in first.values():
+                found += images.counts(place, np.random.default_rng(0))[1]
+        return tuple(found)
+
+    def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float]:
+        from ..generator.contrast import compute_contrast_map
+
+        slabs = self.campaign.slabs
+        if slabs is None:
+            return {}
+        if self.twin.spectral is None:
+            warnings.append("no contrast-to-noise: the twin has no spectral part")
+            return {}
+        found = compute_contrast_map(
+            replace(self.twin, effects=()),
+            [[pair]],
+            product=slabs.product,
+            foreign_object=slabs.foreign_object,
+            object_pixels=slabs.object_pixels,
+            displaces=slabs.displaces,
+        )[0][0]
+        warnings += [line for line in found.warnings if line not in warnings]
+        return {"delta_R": found.delta_R.value, "cnr_object": found.cnr_object}
+
+
+def open_references(path: Path, word: str) -> Dataset:
+    """The dataset that a word of the campaign file names.
+
+    Raises:
+        InputError: a file of another kind.
+    """
+    try:
+        return read_dataset(path)
+    except InputError as error:
+        raise InputError(
+            f"{word}, {error.argument}",
+            received=error.received,
+            expected="a dataset file with reference images (or a description, .toml)",
+            remedy="`raytwin import reference` makes one of an acquisition or of folders",
+        ) from None
+
+
+def limited_instrument(instrument: Instrument, limits: Limits) -> Instrument:
+    """The instrument with the campaign's limits on the tube where they are stricter, and its readout where it is longer."""
+    changes: dict[str, Any] = {}
+    for field in _STRICTER:
+        wanted, own = getattr(limits, field), getattr(instrument, field)
+        if wanted is not None:
+            changes[field] = wanted if own is None else min(wanted, own)
+    if limits.readout_ms is not None:
+        changes["readout_ms"] = max(limits.readout_ms, instrument.readout_ms or 0.0)
+    return replace(instrument, **changes) if changes else instrument
+
+
+def motion_strength_px(instrument: Instrument, setting: Setting) -> float | None:
+    """Path (px) of the object's image in 50 ms on the belt, as the effect `motion_blur` states it; None where there is none.
+
+    v M 50 ms / pixel; of a TDI detector, whose charge moves along with the object, in one stage's share of that time.
+    """
+    if setting.belt_speed_mm_s is None or instrument.pixel_mm is None:
+        return None
+    magnification = instrument.magnification or 1.0
+    path = setting.belt_speed_mm_s * magnification * _MOTION_MS / 1000.0 / instrument.pixel_mm
+    return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
+
+
+def twin_at(twin: Twin, pair: Pair) -> tuple[Twin, tuple[str, ...]]:
+    """The twin with the motion that the pair's belt speed makes in its images, and warnings.
+
+    A `motion_blur` of the twin itself, measured at the belt speed of its session, gives way to it.
+    """
+    strength = motion_strength_px(twin.instrument, pair[0])
+    if strength is None:
+        if pair[0].belt_speed_mm_s is not None:
+            return twin, ("the belt's motion is not in the images: the twin does not know its pixel pitch",)
+        return twin, ()
+    told = []
+    own = [item for item in twin.effects if item.id == _MOTION]
+    if own:
+        told.append("the twin's own motion blur gives way to that of the setting's belt speed")
+    if twin.instrument.belt_axis is None:
+        told.append("the belt is taken to move along the rows' index: the twin's belt_axis is not declared")
+    motion = AppliedEffect(id=_MOTION, parameters={"strength": strength}, since="calibration")
+    rest = tuple(item for item in twin.effects if item.id != _MOTION)
+    return replace(twin, effects=(*rest, motion)), tuple(told)
+
+
+def _motion_px(instrument: Instrument, pair: Pair) -> float | None:
+    """Longest path (px) of the object's image in one exposure; None where no belt moves."""
+    strengths = [motion_strength_px(instrument, one) for one in pair]
+    paths = [
+        strength * one.exposure_ms / _MOTION_MS
+        for strength, one in zip(strengths, pair, strict=True)
+        if strength is not None
+    ]
+    return max(paths) if paths else None
+
+
+def _costs(twin: Twin, pair: Pair, predictions: Sequence[Prediction], timing: Timing) -> dict[str, Any]:
+    """Dose, photons, time and throughput of a pair."""
+    instrument = twin.instrument
+    warnings: list[str] = []
+    kerma = [found.air_kerma_uGy for found in predictions]
+    dose = None
+    if all(one is not None for one in kerma):
+        parts = [one.times(setting.averaged) for one, setting in zip(kerma, pair, strict=True) if one is not None]
+        # flux is uncertain in both images alike, so the ends add up as the values do
+        dose = {end: sum(getattr(part, end) for part in parts) for end in ("value", "low", "high")}
+    photons = tuple(
+        None if found.photons_absorbed is None else found.photons_absorbed.as_dict() for found in predictions
+    )
+    speed = pair[0].belt_speed_mm_s
+    area = instrument.detector in (None, "area")
+    pair_ms = throughput = None
+    if area:
+        each = [1000.0 / frames_per_s(instrument, one) for one in pair]
+        pair_ms = sum(each) if timing.pair == "in_turn" else max(each)
+        if instrument.readout_ms is None:
+            warnings.append("readout unknown: taken as none (readout_ms under [limits] states it)")
+    if speed is not None:
+        throughput = None if timing.product_pitch_mm is None else speed / timing.product_pitch_mm
+    elif pair_ms is not None:
+        throughput = 1000.0 / (pair_ms + timing.pause_ms)
+    else:
+        warnings.append(
+            "throughput unknown: a line detector's images take as long as the belt does; state belt_speed_mm_s"
+        )
+    return {
+        "dose_uGy": dose,
+        "photons": photons,
+        "pair_ms": pair_ms,
+        "throughput_per_s": throughput,
+        "extrapolated": any(found.extrapolated for found in predictions),
+        "warnings": warnings,
+    }
+
+
+def _check(
+    twin: Twin,
+    pair: Pair,
+    predictions: Sequence[Prediction],
+    known: Mapping[str, Any],
+    limits: Limits,
+    timing: Timing,
+) -> None:
+    """Raise where the campaign's limits or the detector's range rule a setting out."""
+    bits = twin.instrument.bits
+    for setting, found in zip(pair, predictions, strict=True):
+        if bits is not None:
+            room = 2.0**bits - 1.0 - twin.dark_DN.value
+            if found.mean_DN.value > room:
+                raise _Refused(
+                    f"the detector saturates at {setting.kV:g} kV: {found.mean_DN.value:.4g} DN above dark in the open beam,"
+                    f" room for {room:.4g} DN"
+                )
+    if known["extrapolated"] and not limits.extrapolation:
+        raise _Refused("outside the calibrated range, and extrapolation = false")
+    speed, motion = known["belt_speed_mm_s"], known["motion_px"]
+    if speed is not None and max(one.averaged for one in pair) > 1:
+        raise _Refused("frames averaged on a moving belt show the object in several places: averaged = 1")
+    pitch, pair_ms = timing.product_pitch_mm, known["pair_ms"]
+    if speed is not None and pitch is not None and pair_ms is not None and pair_ms > 1000.0 * pitch / speed:
+        raise _Refused(
+            f"a pair takes {pair_ms:.4g} ms, and products come every {1000.0 * pitch / speed:.4g} ms at {speed:g} mm/s"
+        )
+    dose = known["dose_uGy"]
+    if limits.maximum_dose_uGy is not None and dose is None:
+        raise _Refused("the dose is unknown (the twin has no spectral part), and maximum_dose_uGy asks for it")
+    for name, value, limit, unit in (
+        ("belt speed", speed, limits.maximum_belt_speed_mm_s, "mm/s"),
+        ("motion in one exposure", motion, limits.maximum_motion_px, "px"),
+        ("dose", None if dose is None else dose["value"], limits.maximum_dose_uGy, "uGy"),
+    ):
+        if value is not None and limit is not None and value > limit * (1 + 1e-9):
+            raise _Refused(f"{name} {value:.4g} {unit}, allowed are {limit:g} {unit}")
+    least, throughput = limits.minimum_throughput_per_s, known["throughput_per_s"]
+    if least is not None and (throughput is None or throughput < least * (1 - 1e-9)):
+        text = "unknown" if throughput is None else f"{throughput:.4g} products/s"
+        raise _Refused(f"throughput {text}, asked for are {least:g} products/s")
+
+
+def _check_distance(instrument: Instrument, pair: Pair, dataset: Dataset, fallback: Pair | None) -> None:
+    """Refuse a distance that references which state none (the instrument's, then) were not taken at."""
+    from ..generator.generate import reference_settings
+
+    own = instrument.source_detector_mm
+    rows = {row.setting: row for row in dataset.rows}
+    for row in rows.values():
+        for reference, target in zip(reference_settings(row, fallback), pair, strict=True):
+            stated = target.source_detector_mm
+            if reference.source_detector_mm is None and stated is not None and own is not None and stated != own:
+                raise InputError(
+                    "target setting",
+                    received=f"source-detector distance {stated:g} mm",
+                    expected=f"the references' {own:g} mm",
+                    remedy="another distance is another magnification; measure references there",
+                )
+
+
+def keep_best(outlooks: Sequence[Outlook], *, keep: int, of: str) -> tuple[Outlook, ...]:
+    """The outlooks, those feasible ones left out that have less contrast-to-noise than the best `keep`.
+
+    Longer exposures always show more, so settings are compared with others of the same throughput (`of` throughput; belt
+    speed where products a second are unknown), or all with all (`of` all). Which they lost to stands in `why_left_out`.
+    """
+    groups: dict[str, list[int]] = {}
+    for number, one in enumerate(outlooks):
+        if one.feasible and one.cnr_object is not None:
+            groups.setdefault(_pace(one) if of == "throughput" else "any throughput", []).append(number)
+    result = list(outlooks)
+    for name, members in groups.items():
+        ranked = sorted(members, key=lambda number: (-(outlooks[number].cnr_object or 0.0), outlooks[number].text))
+        for place, number in enumerate(ranked[keep:], start=keep + 1):
+            told = (
+                f"not trained: contrast-to-noise {outlooks[number].cnr_object:.3g} is number {place} of {len(ranked)} at"
+                f" {name}; keep_best trains the best {keep}"
+            )
+            result[number] = replace(outlooks[number], kept=False, why_left_out=told)
+    return tuple(result)
+
+
+def _pace(one: Outlook) -> str:
+    if one.throughput_per_s is not None:
+        return f"{one.throughput_per_s:.4g} products/s"
+    return "unknown throughput" if one.belt_speed_mm_s is None else f"{one.belt_speed_mm_s:.4g} mm/s"
+
+
+def labels_of(pairs: Sequence[Pair]) -> list[str]:
+    """A short name for each pair: what differs between them, in words with units."""
+    words = [[_words_of(one) for one in pair] for pair in pairs]
+    names = list(dict.fromkeys(name for pair in words for side in pair for name in side))
+    varied = [name for name in names if len({(pair[0].get(name), pair[1].get(name)) for pair in words}) > 1]
+    shown = varied or [name for name in names if name in ("kV", "filters", "exposure_ms")]
+    labels = []
+    for pair in words:
+        parts = []
+        for name in shown:
+            low, high = pair[0].get(name, ""), pair[1].get(name, "")
+            if not (low or high):
+                parts += ["no belt"] if name == "belt_speed_mm_s" else []
+                continue
+            parts.append((low if low == high else f"{low or '-'}/{high or '-'}") + _UNITS[name])
+        labels.append(", ".join(parts))
+    return labels
+
+
+_UNITS = {
+    "kV": " kV",
+    "filters": "",
+    "power_W": " W",
+    "current_mA": " mA",
+    "exposure_ms": " ms",
+    "averaged": " frames",
+    "belt_speed_mm_s": " mm/s",
+    "source_detector_mm": " mm to the source",
+    "frame_interval_ms": " ms a frame",
+    "binning": " x binned",
+}
+
+
+def _words_of(setting: Setting) -> dict[str, str]:
+    found = {}
+    for name in _UNITS:
+        value = getattr(setting, name)
+        if name == "filters":
+            found[name] = text_from_filters(value) or "no filter"
+        else:
+            found[name] = "" if value is None else f"{value:g}"
+    return found
+
+
+def start_pair(references: Pair, share: float) -> Pair:
+    """The references' own settings with a share of their exposure: fewer frames, and less current where that is not enough."""
+    targets = []
+    for one in references:
+        frames = one.averaged * share
+        averaged = max(1, math.ceil(frames - 1e-9))
+        factor = frames / averaged
+        targets.append(
+            replace(
+                one,
+                averaged=averaged,
+                power_W=None if one.power_W is None else one.power_W * factor,
+                current_mA=None if one.current_mA is None else one.current_mA * factor,
+                belt_speed_mm_s=None,
+                frame_interval_ms=None,
+            )
+        )
+    return targets[0], targets[1]
+
+
+def _once(lines: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(lines))

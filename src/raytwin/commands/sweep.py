@@ -1,0 +1,249 @@
+"""Choose a setting by its a90: images, networks, hits and POD for every setting of a campaign file, and one recommended.
+
+CAMPAIGN.toml names a twin, reference images, the settings (a list, a grid or both), limits of tube, belt, dose and throughput,
+and how networks are trained (docs/campaigns.md has an example and every word). Settings that line, limits or references rule
+out are rows with the reason. Writes sweep.json, sweep.csv and report.html into the folder; a sweep that was stopped goes on
+where it was, and only what a changed campaign changes is done again.
+"""
+
+import argparse
+import signal
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError
+from ._answer import answer, say
+from ._folder import written_folder
+
+if TYPE_CHECKING:
+    from ..campaign.sweep_file import Campaign
+    from ..campaign.sweep_runners import Runner
+    from ..campaign.sweep_settings import Outlook
+
+EXAMPLE = """examples:
+  raytwin sweep campaign.toml --plan
+  raytwin sweep campaign.toml -o sweep --workers 2
+  raytwin sweep campaign.toml -o sweep --scheduler tcp://10.0.0.1:8786
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `raytwin sweep`."""
+    parser.add_argument("campaign", metavar="CAMPAIGN.toml", type=Path, help="what is asked (docs/campaigns.md)")
+    parser.add_argument("-o", "--output", metavar="DIR", type=Path, help="folder of the sweep, new or to go on with")
+    parser.add_argument(
+        "--plan",
+        action="store_true",
+        help="train nothing: print feasibility, dose, throughput and contrast-to-noise of every setting",
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="settings at once, a process each (default 1)"
+    )
+    where.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster that sees the same files: tcp://host:8786 or its file"
+    )
+    parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processor threads of a setting (default 1); may change last digits",
+    )
+    parser.add_argument("--keep-images", action="store_true", help="keep the images generated for each setting")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run `raytwin sweep`."""
+    from ..campaign.sweep_file import read_campaign
+
+    for option, value in (("--workers", arguments.workers), ("--threads", arguments.threads)):
+        if value < 1:
+            raise InputError(option, received=value, expected="a whole number, 1 or more")
+    if arguments.output is None and not arguments.plan:
+        raise InputError("-o", received="none", expected="a folder for the sweep, or --plan to look ahead only")
+    campaign = read_campaign(arguments.campaign)
+    if arguments.plan:
+        return _plan(campaign, arguments)
+    if arguments.scheduler is None:
+        from ..segmentation import choose_device
+
+        choose_device(arguments.device)  # says at once how to install torch where it is missing
+    with written_folder(arguments.output):
+        return _sweep(campaign, arguments)
+
+
+def _plan(campaign: "Campaign", arguments: argparse.Namespace) -> int:
+    from ..campaign.sweep import outlook_row
+    from ..campaign.sweep_settings import labels_of
+
+    outlooks = _looked_at(campaign)
+    rows = [
+        outlook_row(one, label) for one, label in zip(outlooks, labels_of([one.pair for one in outlooks]), strict=True)
+    ]
+    kept = sum(one.kept for one in outlooks)
+    result = {
+        "settings": len(rows),
+        "feasible": sum(one.feasible for one in outlooks),
+        "to_train": kept,
+        "rows": [row | {"kept": one.kept} for row, one in zip(rows, outlooks, strict=True)],
+    }
+    text = "\n".join(
+        [
+            *_plan_lines(rows),
+            f"{len(rows)} settings, {result['feasible']} feasible, {kept} to train",
+        ]
+    )
+    answer(result, as_json=arguments.json, text=text)
+    return 0
+
+
+def _looked_at(campaign: "Campaign") -> "tuple[Outlook, ...]":
+    from tqdm import tqdm
+
+    from ..campaign.sweep import look_ahead
+
+    with tqdm(total=len(campaign.settings), unit="setting", desc="looking ahead", disable=None) as bar:
+        return look_ahead(campaign, each=bar.update)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    """End as a key press does: processes are stopped, nothing half done counts."""
+    raise KeyboardInterrupt
+
+
+def _sweep(campaign: "Campaign", arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from .. import __version__
+    from ..campaign.sweep import Progress, run_sweep, seconds_of
+    from ..campaign.sweep_report import write_report
+
+    bar: Any = None
+    count = 0
+
+    def begin(total: int, done: int) -> None:
+        nonlocal bar, count
+        bar, count = tqdm(total=total, initial=done, unit="setting", desc="settings", disable=None), done
+        if done and bar.disable:
+            say(f"{done} of {total} settings are done already")
+
+    def advance(row: Mapping[str, Any]) -> None:
+        nonlocal count
+        count += 1
+        bar.update()
+        if bar.disable:
+            say(f"[{count}/{bar.total}] {row['label']}: {_told(row)}")
+
+    main_thread = threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGTERM, _interrupt) if main_thread else None
+    runner: Runner | None = None
+    try:
+        runner = _runner(arguments, version=__version__)
+        result = run_sweep(
+            campaign,
+            arguments.output,
+            runner=runner,
+            version=__version__,
+            device=arguments.device,
+            threads=arguments.threads,
+            keep_images=arguments.keep_images,
+            outlooks=_looked_at(campaign),
+            progress=Progress(tell=say, begin=begin, advance=advance),
+        )
+    finally:
+        if bar is not None:
+            bar.close()
+        if runner is not None:
+            runner.close()
+        if previous is not None:
+            signal.signal(signal.SIGTERM, previous)
+    seconds = seconds_of(arguments.output, result["rows"])
+    report = write_report(
+        result, arguments.output / "report.html", campaign=campaign, seconds=seconds, version=__version__
+    )
+    shown = {
+        **result,
+        "rows": [row | {"seconds": seconds.get(row["setting"])} for row in result["rows"]],
+        "paths": {"report": report, "json": arguments.output / "sweep.json", "csv": arguments.output / "sweep.csv"},
+    }
+    text = "\n".join([*_result_lines(result["rows"]), result["sentence"], f"report: {report}"])
+    answer(shown, as_json=arguments.json, text=text)
+    return 0
+
+
+def _runner(arguments: argparse.Namespace, *, version: str) -> "Runner":
+    from ..campaign.sweep import marker_of
+    from ..campaign.sweep_runners import DaskCluster, Processes
+
+    if arguments.scheduler is None:
+        return Processes(arguments.workers)
+    cluster = DaskCluster(arguments.scheduler)
+    try:
+        cluster.check(marker_of(arguments.output), version=version)
+    except BaseException:
+        cluster.close()
+        raise
+    return cluster
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    if row["a90"] is None:
+        return str(row["reason"])
+    return f"a90 {row['a90']:.3g} ({_shown(row['a90_low'])} to {_shown(row['a90_high'])})"
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str]) -> list[str]:
+    """Columns as wide as they must be; the notes stand behind them."""
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
+    shown = []
+    for number, (line, note) in enumerate(zip(lines, ["", *notes], strict=True)):
+        cells = [
+            line[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)),
+        ]
+        shown.append(("  ".join(cells) + (f"  {note}" if note and number else "")).rstrip())
+    return shown
+
+
+def _costs(row: Mapping[str, Any]) -> list[str]:
+    dose = (row["dose_uGy"] or {}).get("value")
+    return [_shown(row["throughput_per_s"]), _shown(row["motion_px"]), _shown(dose), _shown(row["cnr_object"])]
+
+
+def _plan_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    return _table(
+        ("setting", "products/s", "motion px", "dose uGy", "CNR"),
+        [[str(row["label"]), *_costs(row)] for row in rows],
+        [str(row["reason"]) for row in rows],
+    )
+
+
+def _result_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    body, notes = [], []
+    for row in rows:
+        alarms = row["false_alarm_rate"]
+        body.append(
+            [
+                str(row["label"]),
+                _shown(row["a90"]),
+                _shown(row["a90_low"]),
+                _shown(row["a90_high"]),
+                _shown(row["a90_upper"]),
+                "-" if alarms is None else f"{100 * alarms['value']:.3g} %",
+                *_costs(row),
+            ]
+        )
+        marks = [word for word in ("recommended", "pareto", "alike") if row[word]]
+        notes.append(str(row["reason"]) or ", ".join(marks))
+    header = ("setting", "a90", "low", "high", "a90/95", "false al.", "products/s", "motion px", "dose uGy", "CNR")
+    return _table(header, body, notes)

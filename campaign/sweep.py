@@ -178,7 +178,7 @@ def run_sweep(
             progress.advance(complete(text, error))
 
         runner.run(list(left.values()), done)
-        answer = _answer(campaign, directory, list(rows.values()), basis, tasks)
+        answer = _answer(campaign, directory, list(rows.values()), basis, tasks, progress)
         _write_json(directory / "sweep.json", answer)
         write_table(directory / "sweep.csv", answer["rows"])
     return answer
@@ -357,18 +357,21 @@ def _answer(
     rows: list[dict[str, Any]],
     basis: Mapping[str, Any],
     tasks: Mapping[str, Task],
+    progress: Progress,
 ) -> dict[str, Any]:
     limits = campaign.limits
     choice = choose(rows, goal=limits.a90, most_false_alarms=limits.maximum_false_alarm_rate)
     front = set(pareto_front(rows))
     for number, row in enumerate(rows):
-        ratio = None
-        alike = False
+        ratio, alike = None, False
         if choice.best is not None and number != choice.best and row["a90"] is not None:
-            ratio = _ratio_to_best(
-                directory, tasks[rows[choice.best]["setting"]], tasks[row["setting"]], campaign.curve
-            )
-            alike = indistinct(ratio)
+            best = rows[choice.best]
+            if _apart(best, row):
+                ratio = {"value": row["a90"] / best["a90"], "low": None, "high": None, "paired": "nothing"}
+            else:
+                progress.tell(f"comparing {row['label']} with {best['label']}")
+                ratio = _ratio_to_best(directory, tasks[best["setting"]], tasks[row["setting"]], campaign.curve)
+                alike = indistinct(ratio)
         row |= {
             "pareto": number in front,
             "recommended": number == choice.recommended,
@@ -408,6 +411,11 @@ def _answer(
         "rows": rows,
     }
     return dict(plain(result))
+
+
+def _apart(best: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether the 95 % intervals of two a90 do not even touch: nothing is left to compare."""
+    return best["a90_high"] is not None and other["a90_low"] is not None and best["a90_high"] < other["a90_low"]
 
 
 def _ratio_to_best(directory: Path, best: Task, other: Task, curve: CurveOptions) -> dict[str, Any]:

@@ -105,9 +105,10 @@ def sentence(
         if any(row.get("a90") is not None for row in rows):
             return "No setting has both an a90 and as few false alarms as asked for."
         most = max((row for row in rows if row.get("n")), key=lambda row: row["n_hits"] / row["n"])
+        found = f"Most was found at {most['label']}: {most['n_hits']} of {most['n']}."
         return (
             f"None of the {trained} settings that were tried has an a90 that the data support: larger objects, more images or"
-            f" more training are wanted, or less noise. Most was found at {most['label']}: {most['n_hits']} of {most['n']}."
+            f" more training are wanted, or less noise. {found if most['n_hits'] else 'No object was found at any of them.'}"
         )
     row = rows[choice.recommended]
     facts = _facts(row, unit)

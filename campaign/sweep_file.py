@@ -236,6 +236,14 @@ _MATERIALS = {"product_material": "chicken_breast", "foreign_material": "rib_bon
 def _check_together(campaign: Campaign) -> None:
     """Words that fit alone but not together."""
     name = campaign.path.name
+    tests = campaign.test_references
+    if not campaign.described and tests is not None and tests.samefile(campaign.references):
+        raise InputError(
+            f"{name}, test_references",
+            received=f"{tests.name}, the file that networks learn from",
+            expected="images of other products",
+            remedy="leave it out: a share of the products is then held back",
+        )
     if campaign.keep_best is not None and campaign.slabs is None:
         raise InputError(
             f"{name}, keep_best",

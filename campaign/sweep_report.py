@@ -208,6 +208,14 @@ def _interval(low: float | None, high: float | None) -> str:
     return f"{_number(low)} to {_number(high)}"
 
 
+def _ratio(ratio: Mapping[str, Any] | None) -> str:
+    if not ratio or ratio["value"] is None:
+        return _DASH
+    if ratio["low"] is None and ratio["high"] is None:
+        return f"{ratio['value']:.2f}"
+    return f"{ratio['value']:.2f} ({_interval(ratio['low'], ratio['high'])})"
+
+
 def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[str, Any]:
     alarms, dose, ratio = row["false_alarm_rate"], row["dose_uGy"], row["ratio_to_best"]
     marks = []
@@ -230,9 +238,7 @@ def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[s
         "interval": _interval(row["a90_low"], row["a90_high"]) if row["a90"] is not None else _DASH,
         "upper": _number(row["a90_upper"]),
         "a50": _number(row["a50"]),
-        "ratio": _DASH
-        if not ratio or ratio["value"] is None
-        else f"{ratio['value']:.2f} ({_interval(ratio['low'], ratio['high'])})",
+        "ratio": _ratio(ratio),
         "hits": f"{row['n_hits']} of {row['n']}",
         "alarms": _DASH
         if alarms is None

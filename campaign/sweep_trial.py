@@ -200,6 +200,9 @@ def prepare_references(campaign: Campaign, folder: Path, basis: Mapping[str, Any
 def _dealt(campaign: Campaign, references: Dataset, *, held_back: bool) -> list[str]:
     """Split of each reference: the file's own where it has what is needed, else by product."""
     splits = [row.split for row in references.rows]
+    if "train" not in splits:
+        # a file that was not dealt out calls all its images test
+        splits = ["train"] * len(splits)
     missing_test, missing_validation = held_back and "test" not in splits, "val" not in splits
     if not missing_test and not missing_validation:
         return splits
@@ -332,10 +335,9 @@ def _run_start(task: Task, tell: Tell) -> None:
             tell=tell,
             name="start, noisier images",
         )
-        for path in (*parts, mixed):
-            path.unlink(missing_ok=True)
+        _remove(*parts, mixed)
     if described:
-        clear.unlink(missing_ok=True)
+        _remove(clear)
     with whole_file(folder / "start.json") as temporary:
         temporary.write_bytes(canonical({"key": task["key"], "networks": chosen.name}))
 
@@ -349,9 +351,7 @@ def _run_setting(task: Task, tell: Tell) -> None:
         if found["refused"]:
             return
     if not task["keep_images"]:
-        for name in ("train", "test"):
-            (folder / f"{name}.h5").unlink(missing_ok=True)
-            (folder / f"{name}.json").unlink(missing_ok=True)
+        _remove(folder / "train.h5", folder / "test.h5")
     curve = curve_of_table(
         folder / "hits.csv",
         task["curve"]["size"],
@@ -467,6 +467,13 @@ def _generate(
     with whole_file(noted) as temporary:
         temporary.write_text(json.dumps({"warnings": list(summary.warnings)}) + "\n", encoding="utf-8")
     return summary.warnings
+
+
+def _remove(*images: Path) -> None:
+    """Take generated images away, with what was noted beside them."""
+    for path in images:
+        path.unlink(missing_ok=True)
+        path.with_suffix(".json").unlink(missing_ok=True)
 
 
 def _look_of(known: set[str]) -> Callable[[str], str]:

@@ -16,9 +16,9 @@ from raytwin.acquisition import read_dataset
 from raytwin.acquisition.dataset_io import write_selected
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.campaign import sweep_trial
-from raytwin.campaign.sweep import Progress, look_ahead, run_sweep
+from raytwin.campaign.sweep import Progress, compare_tables, look_ahead, run_sweep
 from raytwin.campaign.sweep_choice import Choice, choose, indistinct, paces, pareto_front, sentence
-from raytwin.campaign.sweep_file import read_campaign, text_of_pair
+from raytwin.campaign.sweep_file import CurveOptions, read_campaign, text_of_pair
 from raytwin.campaign.sweep_report import write_report
 from raytwin.campaign.sweep_runners import DaskCluster, Here, Processes
 from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, motion_strength_px, start_pair, twin_at
@@ -522,6 +522,55 @@ def test_labels_say_what_differs_and_nothing_else(line):
     assert labels_of([still, moving]) == ["no belt", "9 mm/s"]
 
 
+def test_further_looks_at_a_reference_bear_its_name():
+    name = sweep_trial._look_of({"a", "b-1"})
+    assert [name(image) for image in ("a", "b-1", "a-00002", "b-1-00003", "a-00004")] == [
+        "a",
+        "b-1",
+        "a#2",
+        "b-1#2",
+        "a#3",
+    ]
+
+
+def test_a_file_that_was_not_dealt_out_is_dealt_out(line, tmp_path):
+    with read_dataset(line / "references.h5") as references:
+        write_selected(references, line / "undealt.h5", selection=slice(None), split="test")
+    campaign = campaign_of(line, words=[("references.h5", "undealt.h5")])
+    sweep_trial.prepare_references(campaign, tmp_path, sweep_trial.basis_of(campaign, version="1"))
+    with read_dataset(tmp_path / "learn.h5") as learn, read_dataset(tmp_path / "test.h5") as test:
+        assert {row.split for row in learn.rows} == {"train", "val"}
+        assert len(learn) + len(test) == 20
+
+
+def hit_table(path, threshold, *, networks=3, images=30):
+    """Hits of networks that see what is larger than a threshold that networks and images vary."""
+    rng = np.random.default_rng(7)
+    sizes, eyes = np.linspace(0.02, 0.3, images), 0.02 * rng.standard_normal(networks)
+    hard = 0.02 * rng.standard_normal(images)
+    noise = np.random.default_rng(round(1e4 * threshold))
+    lines = ["contrast,hit,network,image,foreign_object,false_alarm"]
+    for network in range(networks):
+        for image in range(images):
+            seen = sizes[image] + eyes[network] + hard[image] + 0.02 * noise.standard_normal() > threshold
+            lines.append(f"{sizes[image]:.5f},{int(seen)},{network},p{image},bone,")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_settings_are_compared_on_the_same_images(tmp_path):
+    first, second = hit_table(tmp_path / "1.csv", 0.12), hit_table(tmp_path / "2.csv", 0.13)
+    found = compare_tables(first, second, CurveOptions())
+    assert found["paired"] == "image"
+    assert found["low"] < found["value"] < found["high"]
+    # other names are other images
+    third = tmp_path / "3.csv"
+    third.write_text(second.read_text().replace(",p", ",q"))
+    apart = compare_tables(first, third, CurveOptions())
+    assert apart["paired"] == "nothing"
+    assert apart["high"] / apart["low"] >= found["high"] / found["low"]
+
+
 @given(share=st.floats(0.01, 0.9), averaged=st.integers(1, 40))
 def test_a_share_of_the_references_is_a_share_of_their_tube_load(share, averaged):
     own = tuple(dataclasses.replace(one, averaged=averaged) for one in LONG)
@@ -634,6 +683,7 @@ BAD = [
     ('references = "references.h5"', 'references = "absent.h5"', "references.*not there.*relative to the campaign file"),
     ('references = "references.h5"', 'references = "twin.h5"', "references.*expected a dataset file"),
     ('references = "references.h5"', 'references = "products.toml"', "start_low and start_high"),
+    ("test_share = 0.4", 'test_references = "references.h5"', "test_references.*the file that networks learn from"),
     ("test_share = 0.4", "test_share = 0.95", "test_share.*at most 0.9"),
     ("test_share = 0.4", "test_share = 0.8\nvalidation_share = 0.4", "less than 1 together"),
     ("seed = 3", "seed = -1", "seed.*0 or more"),

@@ -54,6 +54,10 @@ _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _KNOW_WHEN = frozenset(
     ("heel", "bad_pixels", "gain_map_error")
 )  # effects that look otherwise where calibration has seen them
+_ON_OBJECTS_ALONE = frozenset(
+    {item.id for item in EFFECTS.values() if item.stage == "object_blur"}
+    | {"misregistration", "object_scatter", "composition_error"}
+)
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
@@ -807,16 +811,18 @@ def _touches(change: _Change, request: SeriesRequest) -> bool:
     for effect in change.effects:
         if effect.since == "calibration" and not request.after_calibration:
             continue
-        stage = EFFECTS[effect.id].stage
-        if effect.id in ("misregistration", "object_scatter", "composition_error") or stage == "object_blur":
-            touched = request.kind == "object" and not _only_displaces(change)
-        elif stage in ("beam", "arrivals", "quanta", "optics", "exposure"):
-            touched = request.beam_on
-        else:
-            touched = True
-        if touched:
+        if can_show(effect.id, request) and not (effect.id in _ON_OBJECTS_ALONE and _only_displaces(change)):
             return True
     return False
+
+
+def can_show(effect: str, request: SeriesRequest) -> bool:
+    """Whether an effect of the catalogue can move a series at all, whatever its law."""
+    if effect in _ON_OBJECTS_ALONE:
+        return request.kind == "object"
+    if EFFECTS[effect].stage in ("beam", "arrivals", "quanta", "optics", "exposure"):
+        return request.beam_on
+    return True
 
 
 def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[SessionSeries]]:

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
-from .assemble import Problem, build_problem
+from .assemble import Problem, build_problem, can_show
 from .changes import DEFINED_SD, catalogue_variants
 from .coarse import UNSEEN, in_pixels
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, law_terms, weigh_hypotheses
@@ -239,6 +239,13 @@ def judge(
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
 
+    elsewhere = {
+        effect: np.array([not can_show(effect, view.session.request) for view in problem.views], dtype=bool)[
+            problem.series_of
+        ]
+        for effect in {variant.effect for variant in problem.variants}
+    }
+
     def weigh(curves: Sequence[Curve]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
             residual,
@@ -252,6 +259,7 @@ def judge(
             power=POWER,
             loose=_LOOSE,
             chance=_CHANCE,
+            elsewhere=elsewhere,
         )
 
     whitened = whitening.curves(problem.curves)

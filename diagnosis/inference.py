@@ -16,7 +16,7 @@ power below 1 where tests on simulated sessions showed overconfidence.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -37,8 +37,13 @@ UNKNOWN_CHANCE = 3.0  # log evidence that sessions without any effect show by ch
 PAIR_DOUBT = 3e-3  # share of the stronger effect's log evidence that a second effect must bring
 PAIR_DOUBT_ROOT = 0.6  # and so often its square root: what a slightly wrong law leaves by chance
 PAIR_DOUBT_ELSEWHERE = 0.36  # share of both that is left of them where the two effects move no probe in common
+APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
+_TIMES_SEEN = (
+    3.0  # what a law predicts in a group over what is seen there, up to which it may be off by a share of itself
+)
+_MOVES = 0.3  # standard deviations of a probe by which an effect is said to move it
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
 UNKNOWN_SHARE = 0.1  # of the groups of probes in which an effect outside the catalogue shows
 _SWEEPS = 4
@@ -293,6 +298,7 @@ def fit_curve(
         return _fit_chance(residual, curve, nuisances)
     nodes = curve.responses
     solved = nuisances.solve_all(nodes)
+    seen = nuisances.solve(residual)
 
     def terms(
         model: Nuisances, rows: NDArray[np.float64], vector: NDArray[np.float64]
@@ -321,7 +327,7 @@ def fit_curve(
     for law_error, share in law_errors:
         best = start
         for _ in range(3):
-            effective = curve.weights(np.array([best]))[0] @ solved
+            effective = _credible(curve.weights(np.array([best]))[0] @ solved, seen, groups)
             extra = _law_factors(curve, best, effective, groups, law_error)
             own = _own_variance(curve, best, effective, law_error)
             if extra.shape[1] == 0 and float(own.max()) < _LEAST_FACTOR:
@@ -379,6 +385,19 @@ def _fit_chance(residual: NDArray[np.float64], curve: Curve, nuisances: Nuisance
     )
 
 
+def _credible(
+    response: NDArray[np.float64], seen: NDArray[np.float64], groups: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """The part of a response (probe,) that its law's inaccuracy is a share of: in each group no more than `_TIMES_SEEN` what is seen.
+
+    A law that predicts thousands of standard deviations where nothing is seen is wrong by all of them, not off by a share.
+    """
+    predicted = np.bincount(groups, weights=response**2)
+    found = np.bincount(groups, weights=np.maximum(seen**2, 1.0))
+    share = np.sqrt(np.minimum(1.0, _TIMES_SEEN**2 * found / np.maximum(predicted, 1e-12)))
+    return np.asarray(response * share[groups])
+
+
 def _law_factors(
     curve: Curve, strength: float, response: NDArray[np.float64], groups: NDArray[np.intp], law_error: float
 ) -> NDArray[np.float64]:
@@ -413,21 +432,36 @@ def _own_variance(
     return np.asarray(own if curve.jitter is None else own + strength**2 * curve.jitter)
 
 
+@dataclass(frozen=True, slots=True)
+class Widened:
+    """Nuisances once an effect's law may be off, and the probes' standard deviations (probe,) that they are in units of."""
+
+    nuisances: Nuisances
+    root: NDArray[np.float64]
+
+
 def widened_for(
     residual: NDArray[np.float64],
-    rows: NDArray[np.float64],
     curve: Curve,
     strength: float,
     nuisances: Nuisances,
     groups: NDArray[np.intp],
     law_error: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], Nuisances]:
-    """Residual (probe,), responses (row, probe) and nuisances where a curve's law at a strength may be off by law_error."""
+) -> Widened:
+    """What may vary beside a curve at a strength whose law may be off by law_error; residual (probe,) is what is seen."""
     effective = curve.weights(np.array([strength]))[0] @ nuisances.solve_all(curve.responses)
-    extra = _law_factors(curve, strength, effective, groups, law_error)
-    own = _own_variance(curve, strength, effective, law_error)
-    moved, moved_rows, wide, _ = _with_law(residual, rows, nuisances, extra, own)
-    return moved, moved_rows, wide
+    effective = _credible(effective, nuisances.solve(residual), groups)
+    return _widened(
+        nuisances,
+        _law_factors(curve, strength, effective, groups, law_error),
+        _own_variance(curve, strength, effective, law_error),
+    )
+
+
+def _widened(base: Nuisances, factors: NDArray[np.float64], inexact: NDArray[np.float64]) -> Widened:
+    """With more factors (probe, factor) and more variance of each probe's own (probe,)."""
+    root = np.sqrt(1.0 + inexact)
+    return Widened(Nuisances(np.concatenate([base.factors, factors], axis=1) / root[:, None]), root)
 
 
 def _with_law(
@@ -444,15 +478,14 @@ def _with_law(
         factors: what is random in groups (probe, factor).
         inexact: variance of each probe's own (probe,).
     """
-    scale = 1.0 + inexact
-    root = np.sqrt(scale)
+    found = _widened(base, factors, inexact)
+    wide, root = found.nuisances, found.root
     moved, moved_nodes = residual / root, nodes / root
-    wide = Nuisances(np.concatenate([base.factors, factors], axis=1) / root[:, None])
     before, after = residual[None, :], moved[None, :]
     quadratic = float(moved @ moved - np.sum(wide.project(after) ** 2)) - float(
         residual @ residual - np.sum(base.project(before) ** 2)
     )
-    determinant = float(np.sum(np.log(scale))) + wide.log_determinant - base.log_determinant
+    determinant = 2.0 * float(np.sum(np.log(root))) + wide.log_determinant - base.log_determinant
     return moved, moved_nodes, wide, -0.5 * (determinant + quadratic)
 
 
@@ -529,6 +562,7 @@ def weigh_hypotheses(
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
     loose: Collection[str] = (),
     chance: Mapping[str, float] | None = None,
+    elsewhere: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -544,8 +578,10 @@ def weigh_hypotheses(
         law_errors: relative errors of an effect's law in each group, and how probable each is.
         chance: effect -> log evidence that sessions without it show, beyond what the nuisances allow; taken off.
         loose: effects whose law leaves something where it predicts nothing: a second effect beside them is doubted in full.
+        elsewhere: effect -> probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is
+            not doubted.
     """
-    priors, chance = priors or Priors(), chance or {}
+    priors, chance, elsewhere = priors or Priors(), chance or {}, elsewhere or {}
     fits = [fit_curve(residual, curve, nuisances, groups, law_errors=law_errors) for curve in curves]
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
@@ -589,22 +625,29 @@ def weigh_hypotheses(
             # the first's own variants were averaged above; its best stands for them
             starts.append((evidence_of[first] - leading.log_evidence, first, second, start))
     overlaps = _overlaps([start for *_, start in starts], evidence_of, nuisances, table)
-    for number, (more, first, second, start) in enumerate(starts):
-        # what a law that is slightly off leaves of a strong effect, a second one that acts on the same probes takes up a
-        # little of
-        stronger = max(evidence_of[first], evidence_of[second], 0.0)
+    apart = _Apart(residual, nuisances, groups, law_errors)
+
+    def doubted(number: int, evidence: float) -> float:
+        """Evidence of a pair less what the first's law may have left of it for the second to take up."""
+        _, first, second, _ = starts[number]
+        strong, weak = sorted((first, second), key=lambda effect: -evidence_of[effect])
+        stronger = max(evidence_of[strong], 0.0)
         doubt = PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
-        share = PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
-        if max(first, second, key=lambda effect: evidence_of[effect]) in loose:
-            share = 1.0
-        doubt = share * doubt + chance.get(first, 0.0) + chance.get(second, 0.0)
-        starts[number] = (more - doubt, first, second, start)
-    starts.sort(key=lambda item: -item[0] - item[3].log_evidence)
-    for number, (more, first, second, start) in enumerate(starts):
-        errors = law_errors if number < _PAIRS_IN_FULL else ()
+        if strong not in loose:
+            doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
+        gain = evidence - evidence_of[strong]
+        if strong in elsewhere and gain > 0.0:
+            clean = elsewhere[strong] & ~np.any(np.abs(singles[strong].curve.responses) > _MOVES, axis=0)
+            doubt = min(doubt, max(gain - apart.evidence(clean, by_effect[weak]), 0.0) + APART_DOUBT)
+        return evidence - doubt - chance.get(first, 0.0) - chance.get(second, 0.0)
+
+    ahead = [doubted(number, more + start.log_evidence) for number, (more, _, _, start) in enumerate(starts)]
+    for rank, number in enumerate(sorted(range(len(starts)), key=lambda number: -ahead[number])):
+        more, first, second, start = starts[number]
+        errors = law_errors if rank < _PAIRS_IN_FULL else ()
         evidence, strengths, chosen = _finish_pair(residual, start, nuisances, groups, errors, table=table)
         key = (min(first, second), max(first, second))
-        raw.append((key, evidence + more, math.log(priors.pair / n_pairs), strengths, chosen, ""))
+        raw.append((key, doubted(number, evidence + more), math.log(priors.pair / n_pairs), strengths, chosen, ""))
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names
     unknown, place = unknown_evidence(residual, nuisances, parts, names)
@@ -631,6 +674,58 @@ def weigh_hypotheses(
             ),
             key=lambda item: (-item.probability, -item.log_evidence),
         )
+    )
+
+
+class _Apart:
+    """Evidence of effects in a part of the probes alone."""
+
+    def __init__(
+        self,
+        residual: NDArray[np.float64],
+        nuisances: Nuisances,
+        groups: NDArray[np.intp],
+        law_errors: Sequence[tuple[float, float]],
+    ) -> None:
+        self._residual = residual
+        self._nuisances = nuisances
+        self._groups = groups
+        self._law_errors = law_errors
+        self._within: dict[bytes, Nuisances] = {}
+        self._found: dict[tuple[bytes, str], float] = {}
+
+    def evidence(self, part: NDArray[np.bool_], fits: Sequence[CurveFit]) -> float:
+        """Log evidence over none of an effect, its variants averaged, in the probes of `part` (probe,)."""
+        if not np.any(part):
+            return 0.0
+        key, effect = np.packbits(part).tobytes(), fits[0].curve.effect
+        if (key, effect) not in self._found:
+            if key not in self._within:
+                self._within[key] = Nuisances(self._nuisances.factors[part])
+            self._found[key, effect] = self._of(part, fits, self._within[key])
+        return self._found[key, effect]
+
+    def _of(self, part: NDArray[np.bool_], fits: Sequence[CurveFit], nuisances: Nuisances) -> float:
+        found = [
+            fit_curve(
+                self._residual[part],
+                _of_probes(fit.curve, part),
+                nuisances,
+                self._groups[part],
+                law_errors=self._law_errors,
+            ).log_evidence
+            for fit in fits
+        ]
+        return float(_log_mean_exp(np.array(found)))
+
+
+def _of_probes(curve: Curve, part: NDArray[np.bool_]) -> Curve:
+    return replace(
+        curve,
+        responses=curve.responses[:, part],
+        spread=None if curve.spread is None else curve.spread[part],
+        jitter=None if curve.jitter is None else curve.jitter[part],
+        exact=None if curve.exact is None else curve.exact[part],
     )
 
 
@@ -676,6 +771,7 @@ def _states_of(
     result = [state(nuisances, table.nodes, residual, 0.0)]
     curve = leading.curve
     effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
+    effective = _credible(effective, nuisances.solve(residual), groups)
     for law_error, probability in law_errors:
         extra = _law_factors(curve, leading.best, effective, groups, law_error)
         own = _own_variance(curve, leading.best, effective, law_error)
@@ -756,12 +852,12 @@ def _finish_pair(
     nodes = table.nodes[table.rows(a, b)]
     best: tuple[float, _PairGrid] = (value, grid)
     if law_errors and pair.moves * law_errors[0][0] > _LAW_MATTERS:
-        solved = nuisances.solve_all(nodes)
+        solved, seen = nuisances.solve_all(nodes), nuisances.solve(residual)
         for law_error, probability in law_errors:
             start = grid.best
             for _ in range(2):
-                effective_a = a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)]
-                effective_b = b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :]
+                effective_a = _credible(a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)], seen, groups)
+                effective_b = _credible(b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :], seen, groups)
                 extra = np.concatenate(
                     [
                         _law_factors(a, start[0], effective_a, groups, law_error),

@@ -6,7 +6,7 @@ standard deviations would be refused for that coarseness alone; so what leads is
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +21,7 @@ REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which t
 _MOST_EFFECTS = 4
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _STARTS = 2
+_OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 _ROUNDS = 5
 _ENOUGH = 1.0  # gain of log evidence below which the search ends
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
@@ -70,32 +71,84 @@ def refine(
         for effect in hypothesis.effects:
             if effect in done or len(done) >= _MOST_EFFECTS:
                 continue
-            rest = residual.copy()
+            done.add(effect)
+            seen = _Seen(residual=residual, nuisances=nuisances, groups=groups, whitener=whitener)
             for other in hypothesis.effects:
                 if other != effect:
-                    rest -= hypothesis.variants[other].response(hypothesis.strengths[other][0])
-            done.add(effect)
-            fits = [fit_curve(rest, curve, nuisances, groups) for curve in curves if curve.effect == effect]
-            # the best start on the grid is not always the one that leads furthest
-            for fit in sorted(fits, key=lambda item: -item.log_evidence)[:_STARTS]:
+                    seen = seen.beside(hypothesis.variants[other], hypothesis.strengths[other][0])
+            fits = [seen.fit(curve) for curve in curves if curve.effect == effect]
+            for fit in _starts_of(fits):
                 response = fit.curve.response(fit.best)
-                if float(response @ nuisances.solve(response)) < REFINED_FROM**2:
+                if float(response @ seen.nuisances.solve(response)) < REFINED_FROM**2:
                     continue
                 variant = variants[effect, fit.curve.variant]
-                found = _refined(variant, fit, rest, nuisances, groups, respond, whitener)
+                found = _refined(variant, fit, seen, respond)
                 if found is not None:
                     result.append(found)
     return result
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Seen:
+    """What one effect is fitted to: the residual less what others explain, in units of what their laws leave uncertain.
+
+    Fields: residual (probe,), nuisances and groups as weighed; whitener of responses; root (probe,): standard deviations of
+    the probes, in whitened ones (None: 1).
+    """
+
+    residual: NDArray[np.float64]
+    nuisances: Nuisances
+    groups: NDArray[np.intp]
+    whitener: Whitener
+    root: NDArray[np.float64] | None = None
+
+    def beside(self, curve: Curve, strength: float) -> "_Seen":
+        """The same once another effect stands at a strength, its law off by _LAW_ERROR."""
+        found = widened_for(self.residual, curve, strength, self.nuisances, self.groups, _LAW_ERROR)
+        root = found.root if self.root is None else self.root * found.root
+        rest = (self.residual - curve.response(strength)) / found.root
+        return replace(self, residual=rest, nuisances=found.nuisances, root=root)
+
+    def scaled(self, curve: Curve) -> Curve:
+        """A whitened curve in these units."""
+        root = self.root
+        if root is None:
+            return curve
+        return replace(
+            curve,
+            responses=curve.responses / root,
+            spread=None if curve.spread is None else curve.spread / root[:, None],
+            jitter=None if curve.jitter is None else curve.jitter / root**2,
+        )
+
+    def apply(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses as asked of the forward model, whitened and in these units."""
+        whitened = self.whitener.apply(responses)
+        return whitened if self.root is None else whitened / self.root
+
+    def fit(self, curve: Curve) -> CurveFit:
+        """A whitened curve, fitted."""
+        return fit_curve(self.residual, self.scaled(curve), self.nuisances, self.groups)
+
+
+def _starts_of(fits: Sequence[CurveFit]) -> list[CurveFit]:
+    """The best on the grid, which is not always the one that leads furthest, and another: of the other onset if any is near.
+
+    A law as good as exact and one that is off on the grid cannot be weighed against each other: where a share of the
+    evidence speaks for either onset, both are refined.
+    """
+    ranked = sorted(fits, key=lambda item: -item.log_evidence)
+    first = ranked[0]
+    others = [
+        item
+        for item in ranked
+        if item.curve.since != first.curve.since and item.log_evidence > _OTHER_ONSET * first.log_evidence
+    ]
+    return [first, *(others or ranked[1:])[: _STARTS - 1]]
+
+
 def _refined(
-    variant: Variant,
-    fit: CurveFit,
-    residual: NDArray[np.float64],
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
-    respond: Responder,
-    whitener: Whitener,
+    variant: Variant, fit: CurveFit, seen: _Seen, respond: Responder
 ) -> tuple[Variant, NDArray[np.float64]] | None:
     best, strength = variant, fit.best
 
@@ -110,13 +163,16 @@ def _refined(
 
     def curve_of(item: Variant, responses: NDArray[np.float64]) -> Curve:
         like = fit.curve
-        return item.curve(whitener.apply(responses), spread=like.spread, jitter=like.jitter, exact=like.exact)
+        return item.curve(seen.apply(responses), spread=like.spread, jitter=like.jitter, exact=like.exact)
+
+    def fitted(curve: Curve) -> CurveFit:
+        return fit_curve(seen.residual, curve, seen.nuisances, seen.groups)
 
     def tried(item: Variant) -> CurveFit | None:
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fit_curve(residual, curve_of(item, answer[0]), nuisances, groups)
+        return fitted(curve_of(item, answer[0]))
 
     inner = [
         item
@@ -128,7 +184,7 @@ def _refined(
         return None
     strength = here.best
     for _ in range(_ROUNDS if inner else 0):
-        steps = _newton(residual, here, best, inner, nuisances, groups, respond, whitener)
+        steps = _newton(here, best, inner, seen, respond)
         before = here.log_evidence
         for share in (1.0, 0.3, 0.1):
             parameters = dict(best.parameters)
@@ -148,7 +204,7 @@ def _refined(
             return None
         # a response that saturates is known near its nodes only: they are laid where the strength turns out to be
         curve = curve_of(final, answer[0])
-        found = min(max(fit_curve(residual, curve, nuisances, groups).best, variant.low), variant.high)
+        found = min(max(fitted(curve).best, variant.low), variant.high)
         if abs(math.log(found / strength)) < _CENTRED:
             break
         strength = found
@@ -158,14 +214,7 @@ def _refined(
 
 
 def _newton(
-    residual: NDArray[np.float64],
-    here: CurveFit,
-    variant: Variant,
-    inner: Sequence[Parameter],
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
-    respond: Responder,
-    whitener: Whitener,
+    here: CurveFit, variant: Variant, inner: Sequence[Parameter], seen: _Seen, respond: Responder
 ) -> dict[str, float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them.
 
@@ -182,9 +231,10 @@ def _newton(
         moved = {**variant.parameters, item.name: _moved(item, value, steps[-1])}
         asked.append(replace(variant, parameters=moved, strengths=(strength,)))
     answer = respond(asked)
-    rows = [at] + [(whitener.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
+    rows = [at] + [(seen.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
     kept = [inner[number].name for number in sorted(answer)]
-    left, slopes, wide = widened_for(residual - at, np.stack(rows), here.curve, strength, nuisances, groups, _LAW_ERROR)
+    found = widened_for(seen.residual, here.curve, strength, seen.nuisances, seen.groups, _LAW_ERROR)
+    left, slopes, wide = (seen.residual - at) / found.root, np.stack(rows) / found.root, found.nuisances
     normal = wide.inner(slopes, slopes)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12

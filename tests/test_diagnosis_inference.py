@@ -416,3 +416,63 @@ def test_what_sessions_without_an_effect_show_by_chance_is_taken_off_alone_and_i
         taken = 4.0 if "effect0" in effects else 0.0
         # an unknown effect is doubted in proportion to what the best of the others explains
         assert evidence == pytest.approx(plain[effects] - taken, abs=1e-6 if effects != (UNKNOWN,) else 0.5)
+
+
+def test_a_law_that_predicts_much_where_nothing_is_seen_loses_to_one_that_does_not():
+    rng = np.random.default_rng(21)
+    seen, unseen = np.zeros(PROBES), np.zeros(PROBES)
+    seen[:100] = rng.standard_normal(100)
+    unseen[300:400] = 20.0 * rng.standard_normal(100)
+    right, wrong = (
+        Curve(
+            effect="lag",
+            variant=name,
+            parameters={},
+            low=0.5,
+            high=500.0,
+            strengths=np.array([1.0]),
+            responses=response[None, :],
+        )
+        for name, response in (("since the calibration", seen), ("always", seen + unseen))
+    )
+    # the right one's law is off by a tenth from place to place as well
+    off = np.repeat(1.0 + 0.1 * rng.standard_normal(30), 20)
+    residual = 200.0 * off * seen + rng.standard_normal(PROBES)
+    nuisances = Nuisances(np.zeros((PROBES, 1)))
+    found = {curve.variant: fit_curve(residual, curve, nuisances, GROUPS) for curve in (right, wrong)}
+    assert found["since the calibration"].best == pytest.approx(200.0, rel=0.1)
+    explained = 0.5 * float(residual @ residual)
+    assert found["since the calibration"].log_evidence > 0.99 * explained
+    # 4000 standard deviations where nothing is seen are not "a law off by a share"
+    assert found["always"].log_evidence < found["since the calibration"].log_evidence - 0.01 * explained
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_second_effect_seen_where_the_first_cannot_act_is_not_doubted(there):
+    rng = np.random.default_rng(22)
+    objects = np.arange(PROBES) < 300
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[objects] = rng.standard_normal(300)
+    weak[200:320] = rng.standard_normal(120)  # on objects as well, but for its last twenty probes
+    made = [
+        Curve(
+            effect=name,
+            variant="",
+            parameters={},
+            low=0.5,
+            high=5000.0,
+            strengths=np.array([1.0]),
+            responses=direction[None, :],
+        )
+        for name, direction in (("scatter", strong), ("lag", weak))
+    ]
+    # what the first's law leaves on objects looks like the second there
+    left = 12.0 * np.where(objects, weak, 0.0)
+    residual = 2000.0 * strong + left + rng.standard_normal(PROBES)
+    if there:
+        residual += 12.0 * np.where(objects, 0.0, weak)
+    options = {"loose": ("scatter",)}
+    doubted = weigh(residual, np.zeros((PROBES, 1)), made, **options)
+    assert doubted[0].effects == ("scatter",)
+    found = weigh(residual, np.zeros((PROBES, 1)), made, elsewhere={"scatter": ~objects}, **options)
+    assert found[0].effects == (("lag", "scatter") if there else ("scatter",))

@@ -360,8 +360,9 @@ def _answer(
     progress: Progress,
 ) -> dict[str, Any]:
     limits = campaign.limits
-    choice = choose(rows, goal=limits.a90, most_false_alarms=limits.maximum_false_alarm_rate)
-    front = set(pareto_front(rows))
+    most = limits.maximum_false_alarm_rate
+    choice = choose(rows, goal=limits.a90, most_false_alarms=most)
+    front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
     for number, row in enumerate(rows):
         ratio, alike = None, False
         if choice.best is not None and number != choice.best and row["a90"] is not None:
@@ -369,8 +370,8 @@ def _answer(
             if _apart(best, row):
                 ratio = {"value": row["a90"] / best["a90"], "low": None, "high": None, "paired": "nothing"}
             else:
-                progress.tell(f"comparing {row['label']} with {best['label']}")
-                ratio = _ratio_to_best(directory, tasks[best["setting"]], tasks[row["setting"]], campaign.curve)
+                pair = tasks[best["setting"]], tasks[row["setting"]]
+                ratio = _ratio_to_best(directory, *pair, campaign.curve, progress.tell)
                 alike = indistinct(ratio)
         row |= {
             "pareto": number in front,
@@ -379,11 +380,10 @@ def _answer(
             "ratio_to_best": ratio,
             "alike": alike,
         }
-        over = limits.maximum_false_alarm_rate
-        if row["a90"] is not None and not takes_part(row, over):
+        if row["a90"] is not None and not takes_part(row, most):
             rate = row["false_alarm_rate"]
             told = "unknown" if rate is None else f"{100 * rate['value']:.3g} %"
-            row["reason"] = f"false alarms {told}, allowed are {100 * (over or 0.0):g} %"
+            row["reason"] = f"false alarms {told}, allowed are {100 * (most or 0.0):g} %"
     unit = UNITS[campaign.curve.size]
 
     def named(number: int | None) -> str | None:
@@ -395,7 +395,7 @@ def _answer(
         "size": campaign.curve.size,
         "unit": unit,
         "goal": limits.a90,
-        "maximum_false_alarm_rate": limits.maximum_false_alarm_rate,
+        "maximum_false_alarm_rate": most,
         "networks": campaign.training.networks,
         "settings": len(rows),
         "feasible": sum(bool(row["feasible"]) for row in rows),
@@ -405,9 +405,7 @@ def _answer(
         "meets_goal": choice.meets,
         "pareto": [str(rows[number]["setting"]) for number in sorted(front)],
         "alike": [str(row["setting"]) for row in rows if row["alike"]],
-        "sentence": sentence(
-            rows, choice, goal=limits.a90, unit=unit, most_false_alarms=limits.maximum_false_alarm_rate
-        ),
+        "sentence": sentence(rows, choice, goal=limits.a90, unit=unit, most_false_alarms=most),
         "rows": rows,
     }
     return dict(plain(result))
@@ -418,7 +416,9 @@ def _apart(best: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return best["a90_high"] is not None and other["a90_low"] is not None and best["a90_high"] < other["a90_low"]
 
 
-def _ratio_to_best(directory: Path, best: Task, other: Task, curve: CurveOptions) -> dict[str, Any]:
+def _ratio_to_best(
+    directory: Path, best: Task, other: Task, curve: CurveOptions, tell: Callable[[str], None]
+) -> dict[str, Any]:
     """a90 of a setting over that of the best, with its 95 % interval; on the same test images it is a paired comparison."""
     key = digest({"best": best["curve_key"], "other": other["curve_key"]})
     kept = directory / "compare" / f"{key[:20]}.json"
@@ -426,6 +426,7 @@ def _ratio_to_best(directory: Path, best: Task, other: Task, curve: CurveOptions
         held: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
         if held.get("key") == key:
             return dict(held["ratio"])
+    tell(f"comparing {Path(other['folder']).name} with the best")
     ratio = compare_tables(Path(best["folder"]) / "hits.csv", Path(other["folder"]) / "hits.csv", curve)
     _write_json(kept, {"key": key, "ratio": ratio})
     return ratio

@@ -51,6 +51,9 @@ def write_report(
         sentence=answer["sentence"],
         size=_size_label(answer),
         trained=[_trained_row(row, seconds) for row in _in_order(rows) if row["trained"]],
+        columns={
+            name: any(row[name] is not None for row in rows if row["trained"]) for name in ("motion_px", "cnr_object")
+        },
         left_out=[_left_out_row(row) for row in rows if not row["trained"]],
         notes=_notes(rows),
         recommended=next((row for row in rows if row["recommended"]), None),
@@ -69,24 +72,34 @@ def plot_intervals(rows: Sequence[Mapping[str, Any]], *, size: str, goal: float 
     figure, axes = figure_with_axes(10, 1.4 + 0.32 * len(ordered))
     axis = axes[0, 0]
     height = np.arange(len(ordered))[::-1]
-    largest = max(max(row["a90"], row["a90_high"] or 0.0) for row in ordered)
+    ends = [row[name] for row in ordered for name in ("a90", "a90_high", "a90_upper") if row[name] is not None]
+    # bounds far beyond all estimates would squeeze the others; they stand in the table
+    end = min(1.06 * max([*ends, goal or 0.0]), 2.0 * max(*(row["a90"] for row in ordered), goal or 0.0, 0.0))
     for y, row in zip(height, ordered, strict=True):
         colour = _colour(row)
-        low, high = (row["a90"] if row[name] is None else row[name] for name in ("a90_low", "a90_high"))
+        low = row["a90"] if row["a90_low"] is None else row["a90_low"]
+        high = end if row["a90_high"] is None else min(row["a90_high"], end)
         axis.plot([low, high], [y, y], color=colour, linewidth=2.2 if row["recommended"] else 1.4)
         axis.plot([row["a90"]], [y], "o", color=colour, markerfacecolor=colour if row["recommended"] else "white")
         if row["a90_upper"] is not None:
             axis.plot([row["a90_upper"]], [y], "|", color=colour, markersize=11, markeredgewidth=1.6)
-        if row["a90_high"] is None:
+        if row["a90_high"] is None or row["a90_high"] > end:
+            told = "no upper end" if row["a90_high"] is None else f"to {row['a90_high']:.3g}"
             axis.annotate(
-                "no upper end", (row["a90"], y), xytext=(8, -3), textcoords="offset points", fontsize=7, color=colour
+                told,
+                (1.0, y),
+                (-3, 4),
+                xycoords=("axes fraction", "data"),
+                textcoords="offset points",
+                fontsize=7,
+                color=colour,
+                ha="right",
             )
-        largest = max(largest, row["a90_upper"] or 0.0)
     if goal is not None:
         axis.axvline(goal, color="black", linewidth=0.9, linestyle=":")
         axis.annotate("goal", (goal, height[0] + 0.55), fontsize=8, ha="center", annotation_clip=False)
     axis.set_yticks(height, [row["label"] for row in ordered], fontsize=9)
-    axis.set(xlim=(0, 1.06 * max(largest, goal or 0.0)), ylim=(-0.7, len(ordered) - 0.3))
+    axis.set(xlim=(0, end), ylim=(-0.7, len(ordered) - 0.3))
     axis.set_xlabel(f"{size} at POD 90 %: estimate, two-sided 95 % interval, one-sided 95 % bound (tick)")
     for colour, label in ((_TAKEN, "recommended"), (_ALIKE, "not shown to be worse than the best"), (_OTHER, "worse")):
         if any(_colour(row) == colour for row in ordered):
@@ -118,7 +131,7 @@ def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
             axis.plot([value, value], [low, high], color=colour, linewidth=1, alpha=0.6)
             axis.plot([value], [row["a90"]], "o", color=colour, markersize=9 if row["recommended"] else 6)
         axis.set(xscale="log", xlabel=title, ylabel=f"{size} at POD 90 %" if column == 0 else "")
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, min(axis.get_ylim()[1], 2.0 * max(row["a90"] for row in rows)))
         _few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
     kinds = [
         ("recommended", _TAKEN, "recommended"),
@@ -127,7 +140,8 @@ def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
     for name, colour, label in kinds:
         if any(row[name] for row in rows):
             axes[0, 0].plot([], [], "o", color=colour, label=label)
-    axes[0, 0].plot([], [], "o", color=_OTHER, label="beaten by another")
+    if any(not row["pareto"] and not row["recommended"] for row in rows):
+        axes[0, 0].plot([], [], "o", color=_OTHER, label="beaten by another")
     axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
     return png_of(figure)
 
@@ -169,6 +183,7 @@ def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
         if row["a90"] is not None:
             axis.plot([row["a90"]], [0.9], "o", color=colour, markersize=5)
         axis.set(ylim=(-0.03, 1.03))
+        axis.locator_params(axis="x", nbins=4)
         axis.set_title(str(row["label"]) + (" *" if row["recommended"] else ""), fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel(size)
@@ -228,22 +243,21 @@ def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[s
     if row["pareto"]:
         marks.append("front")
     if row["reason"]:
-        marks.append(str(row["reason"]))
+        # the figures in brackets stand among the warnings
+        marks.append(str(row["reason"]).partition(" (")[0])
     spent = seconds.get(row["setting"])
     return {
         "label": row["label"],
         "setting": f"{row['low']}; {row['high']}",
         "recommended": row["recommended"],
-        "a90": _number(row["a90"]),
-        "interval": _interval(row["a90_low"], row["a90_high"]) if row["a90"] is not None else _DASH,
+        "a90": _DASH if row["a90"] is None else f"{row['a90']:.3g} ({_interval(row['a90_low'], row['a90_high'])})",
         "upper": _number(row["a90_upper"]),
-        "a50": _number(row["a50"]),
         "ratio": _ratio(ratio),
-        "hits": f"{row['n_hits']} of {row['n']}",
+        "hits": f"{row['n_hits']}/{row['n']}",
         "alarms": _DASH
         if alarms is None
-        else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.3g} to {100 * alarms['high']:.3g})",
-        "dose": _DASH if dose is None else f"{dose['value']:.3g} ({_interval(dose['low'], dose['high'])})",
+        else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.2g} to {100 * alarms['high']:.2g})",
+        "dose": _number(None if dose is None else dose["value"]),
         "throughput": _number(row["throughput_per_s"]),
         "motion": _number(row["motion_px"]),
         "cnr": _number(row["cnr_object"]),
@@ -311,6 +325,5 @@ def _facts(campaign: Campaign, answer: Mapping[str, Any]) -> list[str]:
 
 def _limits(campaign: Campaign) -> list[str]:
     """The limits that the campaign states, in its own words."""
-    return [
-        f"{name} = {value:g}" for name, value in asdict(campaign.limits).items() if value not in (None, True, False)
-    ] + ([] if campaign.limits.extrapolation else ["extrapolation = false"])
+    stated = [f"{name} = {value:g}" for name, value in asdict(campaign.limits).items() if isinstance(value, float)]
+    return stated if campaign.limits.extrapolation else [*stated, "extrapolation = false"]

@@ -195,7 +195,7 @@ def begun(whole, folder, *, without=""):
     return folder
 
 
-def test_a_stopped_sweep_whose_processes_die_goes_on_to_the_same_bytes(line, whole, tmp_path):
+def test_a_stopped_sweep_goes_on_in_processes_that_die_to_the_same_bytes(line, whole, tmp_path):
     campaign, folder = read_campaign(line / "campaign.toml"), begun(whole, tmp_path / "stopped")
     rows = []
 
@@ -204,7 +204,7 @@ def test_a_stopped_sweep_whose_processes_die_goes_on_to_the_same_bytes(line, who
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sweep(campaign, folder, Processes(1), progress=Progress(advance=stop))
+        sweep(campaign, folder, Here(), progress=Progress(advance=stop))
     assert not (folder / "sweep.json").exists()
     finished = list((folder / "settings").glob("*/row.json"))
     assert len(rows) == len(finished) == 1
@@ -563,12 +563,6 @@ def test_settings_are_compared_on_the_same_images(tmp_path):
     found = compare_tables(first, second, CurveOptions())
     assert found["paired"] == "image"
     assert found["low"] < found["value"] < found["high"]
-    # other names are other images
-    third = tmp_path / "3.csv"
-    third.write_text(second.read_text().replace(",p", ",q"))
-    apart = compare_tables(first, third, CurveOptions())
-    assert apart["paired"] == "nothing"
-    assert apart["high"] / apart["low"] >= found["high"] / found["low"]
 
 
 @given(share=st.floats(0.01, 0.9), averaged=st.integers(1, 40))

@@ -180,7 +180,11 @@ class DaskCluster:
                 )
 
     def run(self, tasks: Sequence[Task], done: Done) -> None:
-        """Do all tasks; when this is interrupted those that wait are taken back."""
+        """Do all tasks; when this is interrupted those that wait are taken back.
+
+        Raises:
+            RaytwinError: the scheduler went away.
+        """
         distributed = _distributed()
         waiting = {self._submit(task, 1): (task, 1) for task in tasks}
         finished = distributed.as_completed(list(waiting), loop=self._client.loop, raise_errors=False)
@@ -189,6 +193,10 @@ class DaskCluster:
                 task, attempt = waiting.pop(future)
                 if future.status == "finished":
                     done(task, "")
+                elif self._client.status != "running":
+                    raise RaytwinError(
+                        "the Dask scheduler went away; what is finished is kept, and the same command goes on"
+                    )
                 elif attempt < TRIES:
                     again = self._submit(task, attempt + 1)
                     waiting[again] = (task, attempt + 1)
@@ -198,7 +206,8 @@ class DaskCluster:
                     done(task, f"failed {TRIES} times: {_line(error) if error else f'the task was {future.status}'}")
                 future.release()
         except BaseException:
-            self._client.cancel(list(waiting), force=True)
+            if self._client.status == "running":
+                self._client.cancel(list(waiting), force=True)
             raise
 
     def close(self) -> None:

@@ -19,6 +19,11 @@ from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curv
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
+_REACH, _REACH_CHANCE = (
+    0.6,
+    30.0,
+)  # share of the best evidence from which an effect is refined, and log evidence below that
+_REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
@@ -65,9 +70,7 @@ def refine(
     """
     result = []
     done: set[str] = set()
-    for hypothesis in sorted(hypotheses, key=lambda item: -item.log_evidence):
-        if not hypothesis.effects or hypothesis.effects == (UNKNOWN,):
-            continue
+    for hypothesis in _within_reach(hypotheses):
         for effect in hypothesis.effects:
             if effect in done or len(done) >= _MOST_EFFECTS:
                 continue
@@ -86,6 +89,32 @@ def refine(
                 if found is not None:
                     result.append(found)
     return result
+
+
+def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best known effect or pair, and those that refinement could bring past it, best first.
+
+    On forty sessions refinement added up to 22 % to the evidence of a leading effect and up to 7 % where it was above 1000;
+    no effect with less than nine tenths of the leading one's came near it.
+    """
+    known = sorted(
+        (item for item in hypotheses if item.effects and item.effects != (UNKNOWN,)),
+        key=lambda item: -item.log_evidence,
+    )
+    if not known:
+        return []
+    alone = {item.effects[0]: item.log_evidence for item in known if len(item.effects) == 1}
+    top = known[0].log_evidence
+
+    def near(item: Hypothesis) -> bool:
+        if len(item.effects) == 1:
+            return item.log_evidence > _REACH * top - _REACH_CHANCE
+        # the second of a pair: what it adds to the first, against what the best adds
+        first = max(alone[effect] for effect in item.effects)
+        best = max(top - first, 0.0)
+        return item.log_evidence - first > 0.5 * best - _REACH_OF_PAIRS
+
+    return [known[0], *(item for item in known[1:] if near(item))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

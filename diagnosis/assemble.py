@@ -234,6 +234,7 @@ def build_problem(
     *,
     variants: Sequence[Variant],
     calibrated_elsewhere: bool = False,
+    side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
     """Probes, nuisances and effect responses of a session.
@@ -244,6 +245,7 @@ def build_problem(
         variants: effects to try.
         calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
             marked as calibrating).
+        side: of the squares of the panel's pixels that the acquisition has for pixels.
         progress: called with the name of each stage.
 
     Raises:
@@ -622,7 +624,7 @@ def build_problem(
             + dark_noise_of(item)
         )
         if kind == "object":
-            white = white + render_variance(signal)
+            white = white + render_variance(signal, side=side)
             if acquisition.scenes[item.series.scene].kind not in ("edge", "disc"):
                 # steps of wedges and outlines of products are rendered no better than their maps' pixels
                 mask = mask & ~_near_steps(signal)

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from ..calibration.priors import ATTENUATION_SCALE, PRIORS, UNDECLARED_SCINTILLATOR
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
+from ..generator.effects.effect import Parameter
 from ..generator.twin import Estimate, Twin
+from .coarse import in_squares, pixels_in_square
 from .inference import Curve
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
@@ -120,7 +122,7 @@ class Variant:
     """An effect with its inner parameters fixed.
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
-    the strength; strengths at which the response is computed.
+    the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here.
     """
 
     effect: str
@@ -131,6 +133,7 @@ class Variant:
     low: float
     high: float
     strengths: tuple[float, ...]
+    fitted: tuple[Parameter, ...] = ()
     options: Mapping[str, str] = field(default_factory=dict)
 
     def curve(
@@ -166,14 +169,17 @@ class Variant:
         )
 
 
-def variants_of(effect: Effect) -> list[Variant]:
+def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     """The variants of an effect that compete: ends and middle of each inner parameter, both signs, both onsets.
+
+    side: of the squares of the panel's pixels that frames have for pixels; lengths in pixels and what is counted by pixel
+    are those of the panel.
 
     What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
     after it; what acts on objects alone is the same either way; the rest is tried both ways.
     """
-    strength = effect.strength
-    inner = [item for item in effect.parameters[1:] if item.fitted]
+    strength, *others = (in_squares(effect.id, item, side) for item in effect.parameters)
+    inner = [item for item in others if item.fitted]
     choices: list[dict[str, float]] = [{}]
     for item in inner:
         if item.log:
@@ -194,7 +200,11 @@ def variants_of(effect: Effect) -> list[Variant]:
         grown = [{**choice, item.name: value} for choice in choices for value in values]
         choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
     if effect.id in _CHOICES:
-        choices = [{item.name: item.default for item in inner} | dict(choice) for choice in _CHOICES[effect.id]]
+        choices = [
+            {item.name: item.default for item in inner}
+            | {name: value / pixels_in_square(effect.id, name, side) for name, value in choice.items()}
+            for choice in _CHOICES[effect.id]
+        ]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
     shares = _SHARES_OF.get(effect.id, STRENGTH_SHARES)
@@ -218,14 +228,16 @@ def variants_of(effect: Effect) -> list[Variant]:
                 low=low,
                 high=high,
                 strengths=nodes,
+                fitted=tuple(inner),
             )
         )
     return result
 
 
-def catalogue_variants(*, without: Sequence[str] = ()) -> list[Variant]:
-    """The variants of the whole catalogue, less the effects in `without`."""
-    return [variant for name, effect in EFFECTS.items() if name not in without for variant in variants_of(effect)]
+def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Variant]:
+    """The variants of the whole catalogue, less the effects in `without`; side as in `variants_of`."""
+    kept = (effect for name, effect in EFFECTS.items() if name not in without)
+    return [variant for effect in kept for variant in variants_of(effect, side=side)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..generator.effects import AppliedEffect
+from ..generator.effects.effect import Parameter
 from ..generator.twin import Twin
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def coarse_factor(shape: tuple[int, int]) -> int:
     return max(1, min(factor, min(shape) // LEAST_SIDE))
 
 
-def _in_pixels(effect: str, name: str, factor: int) -> float:
+def pixels_in_square(effect: str, name: str, factor: int) -> float:
     """By what a parameter that was found in squares is multiplied to mean pixels."""
     if (effect, name) in (("motion_blur", "strength"), ("misregistration", "strength"), ("mtf_tail", "reach_px")):
         return float(factor)  # lengths
@@ -46,9 +47,15 @@ def _in_pixels(effect: str, name: str, factor: int) -> float:
     return 1.0
 
 
+def in_squares(effect: str, parameter: Parameter, factor: int) -> Parameter:
+    """A parameter with its range as it is where squares stand for pixels."""
+    share = pixels_in_square(effect, parameter.name, factor)
+    return replace(parameter, low=parameter.low / share, high=parameter.high / share, default=parameter.default / share)
+
+
 def parameters_in_pixels(effect: str, parameters: Mapping[str, float], factor: int) -> dict[str, float]:
     """Parameters of an effect, strength with them, that were found with squares of pixels."""
-    return {name: value * _in_pixels(effect, name, factor) for name, value in parameters.items()}
+    return {name: value * pixels_in_square(effect, name, factor) for name, value in parameters.items()}
 
 
 def in_pixels(diagnosis: "Diagnosis", *, twin: Twin, factor: int) -> "Diagnosis":
@@ -70,7 +77,7 @@ def in_pixels(diagnosis: "Diagnosis", *, twin: Twin, factor: int) -> "Diagnosis"
     )
     causes = []
     for cause in diagnosis.causes:
-        share = _in_pixels(cause.effect, "strength", factor)
+        share = pixels_in_square(cause.effect, "strength", factor)
         value, low, high = cause.strength
         causes.append(
             replace(

@@ -156,8 +156,9 @@ def diagnose(
         problem = build_problem(
             session.acquisition,
             session.twin,
-            variants=catalogue_variants(without=left_out),
+            variants=catalogue_variants(without=left_out, side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
+            side=session.factor,
             progress=progress,
         )
     except InputError as error:

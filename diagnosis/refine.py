@@ -12,7 +12,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..generator.effects import EFFECTS
 from ..generator.effects.effect import Parameter
 from .changes import KEPT_AS_THEY_ARE, Variant
 from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
@@ -204,9 +203,7 @@ def _refined(
         return fitted(curve_of(item, answer[0]))
 
     inner = [
-        item
-        for item in EFFECTS[variant.effect].parameters[1:]
-        if item.fitted and item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
+        item for item in variant.fitted if item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
     ]
     here = tried(near(best.parameters, (1.0,)))
     if here is None:

@@ -18,7 +18,7 @@ LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to
 _STRAY_PX = 2.0  # radius over which light that strays is taken as even
 _WEAK = 0.05
 _BEYOND_PX = 12  # of a picture's border that its splines hold
-_FAR_SHARES = ((9, 0.01), (25, 0.003))  # (pixels, share)
+_FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
 
@@ -43,16 +43,19 @@ def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True) -> NDArray[np.float64]:
+def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1) -> NDArray[np.float64]:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
     far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
-    else: a share of the range within some pixels stays open.
+    else: a share of the range within some of the panel's pixels stays open; side: of the squares that the picture has for
+    pixels.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
     result = np.zeros(signal_DN.shape)
-    for size, share in ((3, RENDER_SHARE), *(_FAR_SHARES if far else ())):
+    reaches = ((reach, share) for reach, share in _FAR_SHARES if far)
+    for reach, share in ((1, RENDER_SHARE), *reaches):
+        size = 2 * math.ceil(reach / side) + 1
         local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
         result = np.maximum(result, share * local)
     return np.asarray(result**2, dtype=np.float64)

@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from raytwin.acquisition.coarser import means_of_squares
 from raytwin.cli import main
 from raytwin.diagnosis import coarse
+from raytwin.diagnosis.changes import variants_of
 from raytwin.diagnosis.coarse import LARGEST_PIXELS, LEAST_SIDE, coarse_factor, parameters_in_pixels
+from raytwin.diagnosis.registration import render_variance
+from raytwin.generator.effects import EFFECTS
 
 
 @given(rows=st.integers(1, 5000), columns=st.integers(1, 5000))
@@ -52,6 +55,25 @@ def test_strengths_found_with_squares_are_those_of_the_pixels():
         "strength": 5.0,
         "reach_px": 6.0,
     }
+
+
+def test_ranges_of_lengths_and_shares_are_those_of_the_panel_s_pixels():
+    for effect in EFFECTS.values():
+        here, fine = variants_of(effect, side=5), variants_of(effect)
+        assert [item.parameters.keys() for item in here] == [item.parameters.keys() for item in fine]
+        for small, large in zip(here, fine, strict=True):
+            # what was found with squares, put in pixels, is what the catalogue allows
+            back = parameters_in_pixels(effect.id, {**small.parameters, "strength": small.high}, 5)
+            assert back == pytest.approx({**large.parameters, "strength": large.high})
+            for item in small.fitted:
+                high = parameters_in_pixels(effect.id, {item.name: item.high}, 5)[item.name]
+                assert high == pytest.approx(next(other.high for other in large.fitted if other.name == item.name))
+
+
+def test_the_far_end_of_a_blur_stays_open_over_as_many_of_the_panel_s_pixels():
+    edge = np.where(np.arange(100) < 50, 1000.0, 0.0) * np.ones((20, 1))
+    open_px = {side: np.count_nonzero(render_variance(edge, side=side)[10, 50:] > 0) for side in (1, 2, 4)}
+    assert open_px == {1: 12, 2: 6, 4: 3}
 
 
 def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path, capsys, monkeypatch):

@@ -247,8 +247,9 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         problem = build_problem(
             session.acquisition,
             session.twin,
-            variants=catalogue_variants(without=arguments.without),
+            variants=catalogue_variants(without=arguments.without, side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
+            side=session.factor,
             progress=bar.set_description_str,
         )
     found = distinguishability(problem)

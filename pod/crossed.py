@@ -16,6 +16,7 @@ Source: Bates, Maechler, Bolker & Walker, J. Stat. Softw. 67 (2015) 1, doi:10.18
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +40,8 @@ from .trials import Trials
 Array = NDArray[np.float64]
 Codes = NDArray[np.intp]
 
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(61)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+_FARTHEST = 8.5  # standard deviations to which means over a normal effect are taken
+_STEP, _STEP_OF_LINK = 0.25, 0.4  # widest step of such a mean, in standard deviations and on the link's scale
 _ZERO_SD = 1e-3  # a standard deviation (of eta) below it is reported and treated as 0
 LARGEST_SD = (
     8.0  # on the link's scale: beyond it a level is all hits or all misses and its spread has no finite estimate
@@ -62,9 +63,22 @@ class MixedFit:
 
 
 def averaged_pod(eta: Array, sd: float, *, link: Link) -> Array:
-    """Population-averaged POD, E[g^-1(eta + sd Z)], for each eta; Gauss-Hermite with 61 nodes."""
+    """Population-averaged POD, E[g^-1(eta + sd Z)], for each eta.
+
+    The trapezoidal rule over Z, whose error falls as exp(-const / step) for smooth links: the step follows sd, as fixed
+    Gauss-Hermite nodes lie too far apart where sd is several times the link's own width.
+    """
     eta = np.asarray(eta, dtype=float)
-    return np.asarray(link.pod_from_eta(eta[..., None] + sd * _NODES) @ _WEIGHTS)
+    step = min(_STEP, _STEP_OF_LINK / max(abs(sd), 1e-12))
+    nodes, weights = _normal_nodes(2 * math.ceil(_FARTHEST / step) + 1)
+    return np.asarray(link.pod_from_eta(eta[..., None] + sd * nodes) @ weights)
+
+
+@lru_cache(maxsize=64)
+def _normal_nodes(count: int) -> tuple[Array, Array]:
+    nodes = np.linspace(-_FARTHEST, _FARTHEST, count)
+    weights = np.exp(-0.5 * nodes**2)
+    return nodes, weights / weights.sum()
 
 
 def averaged_eta(pod: float, sd: float, *, link: Link) -> float:

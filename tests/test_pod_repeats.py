@@ -29,11 +29,27 @@ def test_averaged_eta_undoes_averaged_pod():
             assert averaged_pod(np.array(eta), sd, link=link) == pytest.approx(0.9, abs=1e-10)
 
 
-def test_averaged_probit_has_its_closed_form():
+@pytest.mark.parametrize("sd", [0.1, 0.7, 3.0, 8.0])
+def test_averaged_probit_has_its_closed_form(sd):
     # E[Phi(eta + s Z)] = Phi(eta / sqrt(1 + s^2))
-    eta = np.linspace(-3, 3, 13)
-    expected = LINKS["probit"].pod_from_eta(eta / math.sqrt(1 + 0.7**2))
-    assert averaged_pod(eta, 0.7, link=LINKS["probit"]) == pytest.approx(expected, abs=1e-9)
+    eta = np.linspace(-3, 3, 13) * math.sqrt(1 + sd**2)
+    expected = LINKS["probit"].pod_from_eta(eta / math.sqrt(1 + sd**2))
+    assert averaged_pod(eta, sd, link=LINKS["probit"]) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("link", LINKS)
+@pytest.mark.parametrize("sd", [0.5, 8.0])
+def test_averages_over_wide_and_narrow_spreads_are_the_integral(link, sd):
+    from scipy.integrate import quad
+
+    for eta in (-6.0, 0.3, 2.1):
+
+        def density(z, eta=eta):
+            pod = float(LINKS[link].pod_from_eta(np.array(eta + sd * z)))
+            return pod * math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+
+        whole = quad(density, -8.5, 8.5, points=[-eta / sd], limit=400, epsabs=1e-11)[0]
+        assert averaged_pod(np.array(eta), sd, link=LINKS[link]) == pytest.approx(whole, abs=1e-8)
 
 
 @pytest.mark.parametrize("link", LINKS)

@@ -40,7 +40,16 @@ from .probes import (
     time_templates,
     transmission_templates,
 )
-from .registration import LARGEST_PX, Placement, gradient, register, render_variance
+from .registration import (
+    CELL_SD_PX,
+    LARGEST_PX,
+    SHARP_PX,
+    Placement,
+    gradient,
+    register,
+    register_drawn,
+    render_variance,
+)
 from .session import SessionSeries, only_own_noise, read_session
 from .summaries import BLOCK_PX, LAGS, FirstLook, SeriesSummary, look_at_series, summarise_series
 
@@ -419,6 +428,7 @@ def build_problem(
         if item.series.kind in ("flat", "object") and "gain" not in item.series.corrected:
             measured = measured / np.where(good, gain, 1.0)
         corrected[item.name] = measured
+    sharp = base.noise.psf_sigma_px.value < SHARP_PX
     placements: dict[str, Placement] = {}
     first_of_place: set[str] = set()
     for members in _places(kept).values():
@@ -435,19 +445,19 @@ def build_problem(
         placement = register([corrected[item.name] for item in members], models, noises, clean)
         if not placement.found:
             continue
+
+        def drawn(
+            at: tuple[float, float], scene: Sequence[SessionSeries] = tuple(members)
+        ) -> list[NDArray[np.float64]]:
+            found = (expect(replace(item.request, displacement_px=at), nothing).signal_DN for item in scene)
+            return [np.broadcast_to(np.asarray(signal, dtype=np.float64), shape) for signal in found]
+
         # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
-        for _ in range(_PLACEMENTS):
-            moved_requests = {
-                item.name: replace(item.request, displacement_px=(placement.row_px, placement.column_px))
-                for item in members
-            }
-            models = [
-                np.broadcast_to(
-                    np.asarray(expect(moved_requests[item.name], nothing).signal_DN, dtype=np.float64), shape
-                )
-                for item in members
-            ]
-            rest = register([corrected[item.name] for item in members], models, noises, clean)
+        pictures = [corrected[item.name] for item in members]
+        if sharp:
+            placement = register_drawn(pictures, drawn, noises, clean, placement)
+        for _ in range(0 if sharp else _PLACEMENTS):
+            rest = register(pictures, drawn((placement.row_px, placement.column_px)), noises, clean)
             placement = replace(
                 rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
             )
@@ -721,6 +731,7 @@ def build_problem(
                 frozenset(index for index, change in enumerate(all_changes) if change.label in scales.UNEVEN),
                 contexts[item.name].previous_signal_DN,
                 shape,
+                CELL_SD_PX if sharp else scales.REGISTERED_SD_PX,
             )
         )
         if flats and kind in ("flat", "object") and not item.calibrates and "gain" not in item.series.corrected:
@@ -1031,11 +1042,19 @@ def _new_outliers(
         if summary.frames > 9:
             ratio = summary.pair_variance_DN2 / max(float(np.median(summary.pair_variance_DN2[good])), 1e-12)
             signal = np.broadcast_to(np.asarray(expected[item.name].signal_DN), shape)
-            limit = 1.0 + 8.0 * math.sqrt(3.0 / summary.frames)
-            outlying |= (ratio > max(limit, 2.5)) & good
+            outlying |= (ratio > max(_largest_ratio(summary.frames), 2.5)) & good
     outlying &= good
     # a detector full of outliers is a pattern, not a set of defects
     return outlying if outlying.sum() < 0.1 * good.sum() else np.zeros(shape, dtype=bool)
+
+
+@lru_cache(maxsize=64)
+def _largest_ratio(frames: int) -> float:
+    """Variance from differences of successive frames over its expectation that one pixel in ten million passes by chance."""
+    from scipy.stats import chi2
+
+    freedom = 2.0 * (frames - 1.0) / 3.0  # successive differences share frames
+    return float(chi2.isf(1e-7, freedom) / freedom)
 
 
 def _memory(summary: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
@@ -1076,6 +1095,7 @@ def _block(
     uneven: frozenset[int],
     previous_DN: float | None,
     shape: tuple[int, int],
+    registered_sd_px: float,
 ) -> dict[str, Any]:
     names = projection.names() + [
         ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit) for probe in scalar_probes
@@ -1092,7 +1112,7 @@ def _block(
         ]
     )
     residual = np.concatenate([projection.apply(residual_map), scalar_residual])
-    local = _local_nuisances(item, projection, signal, scalar_probes, thicker, base_scalars)
+    local = _local_nuisances(item, projection, signal, scalar_probes, thicker, base_scalars, registered_sd_px)
     block = {
         "item": item,
         "names": names,
@@ -1213,6 +1233,7 @@ def _local_nuisances(
     scalar_probes: Sequence[Scalar],
     thicker: dict[str, tuple[Map, dict[str, float]]],
     base_scalars: Mapping[str, float],
+    registered_sd_px: float,
 ) -> dict[str, NDArray[np.float64]]:
     """Factors of one series, by name; equal names in several series are one nuisance."""
     series = item.series
@@ -1259,8 +1280,8 @@ def _local_nuisances(
         dy, dx = gradient(signal)
         scene = series.scene
         place = f"{scene} at {series.source_object_mm or 0:g}"
-        images[f"column of {place}"] = scales.REGISTERED_SD_PX * dx
-        images[f"row of {place}"] = scales.REGISTERED_SD_PX * dy
+        images[f"column of {place}"] = registered_sd_px * dx
+        images[f"row of {place}"] = registered_sd_px * dy
         images[f"outline of {place}"] = scales.OUTLINE_SD_PX * np.asarray(np.hypot(dy, dx))
         row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
         across = np.linspace(-0.5, 0.5, columns)[None, :] * columns

@@ -22,6 +22,7 @@ from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .refine import refine
+from .registration import SHARP_PX
 from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
@@ -45,6 +46,8 @@ _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  #
 DOUBT = 0.13
 # log evidence: of 64 sealed sessions without effect six showed 4 to 8 of a focal spot, edges being drawn no better
 _CHANCE = {"focal_spot": 5.0}
+# the same where edges are sharper than a third of a pixel, as in squares of pixels: a panel without effect showed 6
+_SHARP_CHANCE = dict.fromkeys(("focal_spot", "mtf_tail", "motion_blur", "misregistration", "k_fluorescence"), 8.0)
 # photons followed one by one reach shadows that no kernel fills: up to 2e-3 of scatter's log evidence
 _LOOSE = ("object_scatter",)
 _VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
@@ -259,7 +262,7 @@ def judge(
             priors=priors or Priors(),
             power=POWER,
             loose=_LOOSE,
-            chance=_CHANCE,
+            chance=_SHARP_CHANCE if problem.base.noise.psf_sigma_px.value < SHARP_PX else _CHANCE,
             elsewhere=elsewhere,
         )
 

@@ -6,11 +6,13 @@ where they lie; the displacement itself stays as a probe.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..generator._fine_picture import FINE
 
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
 _CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
@@ -19,6 +21,8 @@ _STRAY_PX = 2.0  # radius over which light that strays is taken as even
 _WEAK = 0.05
 _BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
+SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
+CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
 
@@ -43,18 +47,20 @@ def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1) -> NDArray[np.float64]:
+def render_variance(
+    signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1, reach_px: int = 1
+) -> NDArray[np.float64]:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
     far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
     else: a share of the range within some of the panel's pixels stays open; side: of the squares that the picture has for
-    pixels.
+    pixels; reach_px: of an edge, in the picture's pixels.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
     result = np.zeros(signal_DN.shape)
     reaches = ((reach, share) for reach, share in _FAR_SHARES if far)
-    for reach, share in ((1, RENDER_SHARE), *reaches):
+    for reach, share in ((reach_px * side, RENDER_SHARE), *reaches):
         size = 2 * math.ceil(reach / side) + 1
         local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
         result = np.maximum(result, share * local)
@@ -152,6 +158,62 @@ def register(
         step = -((vectors * inverse) @ vectors.T) @ right
         current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
     return _placement(current, covariance)
+
+
+def register_drawn(
+    measured: Sequence[NDArray[np.floating]],
+    draw: Callable[[tuple[float, float]], Sequence[NDArray[np.floating]]],
+    variance: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    start: Placement,
+) -> Placement:
+    """Placement, in whole cells of the drawing, of a scene whose edges are too sharp for anything finer.
+
+    A picture with little blur cannot be moved by a part of a cell without ringing, nor resampled. From `start` and from no
+    displacement, whichever leaves less, the scene goes to the neighbour that leaves least until none leaves less.
+
+    Args:
+        measured, variance, mask: as in `register`.
+        draw: pictures (row, column) of all series with the scene displaced along rows and columns, px.
+        start: where splines have it.
+    """
+    inner = mask.copy()
+    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
+        edge[...] = False
+    doubts = [render_variance(model, far=False, reach_px=2) / RENDER_SHARE**2 for model in draw((0.0, 0.0))]
+    known: dict[tuple[int, int], float] = {}
+
+    def left(cell: tuple[int, int]) -> float:
+        """What is left with the scene there, level and smooth light left free."""
+        if cell not in known:
+            total = 0.0
+            for image, model, noise, doubt in zip(
+                measured, draw((cell[0] / FINE, cell[1] / FINE)), variance, doubts, strict=True
+            ):
+                apart = np.asarray(image - model, dtype=np.float64)
+                weight = 1.0 / (noise + _CAUTION[-1] ** 2 * doubt)[inner]
+                residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
+                level = np.asarray(model, dtype=np.float64)[inner]
+                total += float((residual * weight) @ residual)
+                total -= float((level * weight) @ residual) ** 2 / (float((level * weight) @ level) + 1e-30)
+            known[cell] = total
+        return known[cell]
+
+    most = round(LARGEST_PX * FINE)
+    first = (round(start.row_px * FINE), round(start.column_px * FINE))
+    at = min(((0, 0), first), key=left)
+    while True:
+        around = [(at[0] + row, at[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        best = min((cell for cell in around if max(map(abs, cell)) <= most), key=left)
+        if left(best) >= left(at):
+            break
+        at = best
+    return Placement(
+        row_px=at[0] / FINE,
+        column_px=at[1] / FINE,
+        row_sd_px=max(start.row_sd_px, CELL_SD_PX),
+        column_sd_px=max(start.column_sd_px, CELL_SD_PX),
+    )
 
 
 def _stray(residual: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:

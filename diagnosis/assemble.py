@@ -454,13 +454,15 @@ def build_problem(
 
         # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
         pictures = [corrected[item.name] for item in members]
-        if sharp:
-            placement = register_drawn(pictures, drawn, noises, clean, placement)
-        for _ in range(0 if sharp else _PLACEMENTS):
-            rest = register(pictures, drawn((placement.row_px, placement.column_px)), noises, clean)
-            placement = replace(
-                rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
-            )
+        if sharp or acquisition.scenes[members[0].series.scene].kind in ("edge", "disc"):
+            placement = register_drawn(pictures, drawn, noises, clean, placement, whole_cells=sharp)
+        else:
+            # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
+            for _ in range(_PLACEMENTS):
+                rest = register(pictures, drawn((placement.row_px, placement.column_px)), noises, clean)
+                placement = replace(
+                    rest, row_px=placement.row_px + rest.row_px, column_px=placement.column_px + rest.column_px
+                )
         if math.hypot(placement.row_px, placement.column_px) > LARGEST_PX:
             continue  # nowhere near its maps: compared as it is, and the gap says so
         first_of_place.add(members[0].name)
@@ -731,7 +733,7 @@ def build_problem(
                 frozenset(index for index, change in enumerate(all_changes) if change.label in scales.UNEVEN),
                 contexts[item.name].previous_signal_DN,
                 shape,
-                CELL_SD_PX if sharp else scales.REGISTERED_SD_PX,
+                sharp,
             )
         )
         if flats and kind in ("flat", "object") and not item.calibrates and "gain" not in item.series.corrected:
@@ -1095,7 +1097,7 @@ def _block(
     uneven: frozenset[int],
     previous_DN: float | None,
     shape: tuple[int, int],
-    registered_sd_px: float,
+    sharp: bool,
 ) -> dict[str, Any]:
     names = projection.names() + [
         ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit) for probe in scalar_probes
@@ -1112,7 +1114,7 @@ def _block(
         ]
     )
     residual = np.concatenate([projection.apply(residual_map), scalar_residual])
-    local = _local_nuisances(item, projection, signal, scalar_probes, thicker, base_scalars, registered_sd_px)
+    local = _local_nuisances(item, projection, signal, scalar_probes, thicker, base_scalars, sharp)
     block = {
         "item": item,
         "names": names,
@@ -1233,7 +1235,7 @@ def _local_nuisances(
     scalar_probes: Sequence[Scalar],
     thicker: dict[str, tuple[Map, dict[str, float]]],
     base_scalars: Mapping[str, float],
-    registered_sd_px: float,
+    sharp: bool,
 ) -> dict[str, NDArray[np.float64]]:
     """Factors of one series, by name; equal names in several series are one nuisance."""
     series = item.series
@@ -1280,8 +1282,9 @@ def _local_nuisances(
         dy, dx = gradient(signal)
         scene = series.scene
         place = f"{scene} at {series.source_object_mm or 0:g}"
-        images[f"column of {place}"] = registered_sd_px * dx
-        images[f"row of {place}"] = registered_sd_px * dy
+        registered_px = CELL_SD_PX if sharp else scales.REGISTERED_SD_PX
+        images[f"column of {place}"] = registered_px * dx
+        images[f"row of {place}"] = registered_px * dy
         images[f"outline of {place}"] = scales.OUTLINE_SD_PX * np.asarray(np.hypot(dy, dx))
         row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
         across = np.linspace(-0.5, 0.5, columns)[None, :] * columns

@@ -6,7 +6,7 @@ where they lie; the displacement itself stays as a probe.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,9 @@ _WEAK = 0.05
 _BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
+_DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
+_LARGEST_STEP_PX = 0.25
+_WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
 CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
@@ -47,20 +50,18 @@ def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(
-    signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1, reach_px: int = 1
-) -> NDArray[np.float64]:
+def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1) -> NDArray[np.float64]:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
     far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
     else: a share of the range within some of the panel's pixels stays open; side: of the squares that the picture has for
-    pixels; reach_px: of an edge, in the picture's pixels.
+    pixels.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
     result = np.zeros(signal_DN.shape)
     reaches = ((reach, share) for reach, share in _FAR_SHARES if far)
-    for reach, share in ((reach_px * side, RENDER_SHARE), *reaches):
+    for reach, share in ((side, RENDER_SHARE), *reaches):
         size = 2 * math.ceil(reach / side) + 1
         local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
         result = np.maximum(result, share * local)
@@ -166,54 +167,128 @@ def register_drawn(
     variance: Sequence[NDArray[np.floating]],
     mask: NDArray[np.bool_],
     start: Placement,
+    *,
+    whole_cells: bool,
+    prior_px: float = 1.0,
 ) -> Placement:
-    """Placement, in whole cells of the drawing, of a scene whose edges are too sharp for anything finer.
+    """Placement of a scene by drawing it where it may lie: nothing that was measured is resampled.
 
-    A picture with little blur cannot be moved by a part of a cell without ringing, nor resampled. From `start` and from no
-    displacement, whichever leaves less, the scene goes to the neighbour that leaves least until none leaves less.
+    In whole cells of the drawing first: from `start` or from no displacement, whichever leaves less, to the neighbour that
+    leaves least until none leaves less. Then by Gauss-Newton with slopes by differences of drawn pictures; a step is taken
+    only where less is left after it.
 
     Args:
-        measured, variance, mask: as in `register`.
+        measured, variance, mask, prior_px: as in `register`.
         draw: pictures (row, column) of all series with the scene displaced along rows and columns, px.
         start: where splines have it.
+        whole_cells: no finer than that; a picture with little blur cannot be moved by a part of a cell without ringing.
     """
     inner = mask.copy()
     for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
         edge[...] = False
-    doubts = [render_variance(model, far=False, reach_px=2) / RENDER_SHARE**2 for model in draw((0.0, 0.0))]
+    images = [np.asarray(image, dtype=np.float64) for image in measured]
+
+    models = draw((0.0, 0.0))
+    # every pixel alike: with the noise of the shadow, or with edges taken as doubtful, a blur that the twin does not know
+    # would pull an edge away; doubts of rendering are those that any number of series share
+    doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
+    fit = _LeftOver(
+        images=images,
+        inner=inner,
+        weights=[
+            1.0 / len(images) / (float(np.max(noise[inner])) + _CAUTION[-1] ** 2 * float(np.max(doubt[inner])))
+            for noise, doubt in zip(variance, doubts, strict=True)
+        ],
+        away=[inner / (noise + 100.0 * doubt) for noise, doubt in zip(variance, doubts, strict=True)],
+    )
     known: dict[tuple[int, int], float] = {}
 
     def left(cell: tuple[int, int]) -> float:
-        """What is left with the scene there, level and smooth light left free."""
         if cell not in known:
-            total = 0.0
-            for image, model, noise, doubt in zip(
-                measured, draw((cell[0] / FINE, cell[1] / FINE)), variance, doubts, strict=True
-            ):
-                apart = np.asarray(image - model, dtype=np.float64)
-                weight = 1.0 / (noise + _CAUTION[-1] ** 2 * doubt)[inner]
-                residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
-                level = np.asarray(model, dtype=np.float64)[inner]
-                total += float((residual * weight) @ residual)
-                total -= float((level * weight) @ residual) ** 2 / (float((level * weight) @ level) + 1e-30)
-            known[cell] = total
+            known[cell] = fit.of(draw((cell[0] / FINE, cell[1] / FINE)))
         return known[cell]
 
     most = round(LARGEST_PX * FINE)
-    first = (round(start.row_px * FINE), round(start.column_px * FINE))
-    at = min(((0, 0), first), key=left)
+    cell = min(((0, 0), (round(start.row_px * FINE), round(start.column_px * FINE))), key=left)
     while True:
-        around = [(at[0] + row, at[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        best = min((cell for cell in around if max(map(abs, cell)) <= most), key=left)
-        if left(best) >= left(at):
+        around = [(cell[0] + row, cell[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        best = min((one for one in around if max(map(abs, one)) <= most), key=left)
+        if left(best) >= _WORTH_A_CELL * left(cell):
             break
-        at = best
-    return Placement(
-        row_px=at[0] / FINE,
-        column_px=at[1] / FINE,
-        row_sd_px=max(start.row_sd_px, CELL_SD_PX),
-        column_sd_px=max(start.column_sd_px, CELL_SD_PX),
-    )
+        cell = best
+    current = np.array(cell) / FINE
+    if whole_cells:
+        sds = np.maximum([start.row_sd_px, start.column_sd_px], CELL_SD_PX)
+        return _placement(current, np.diag(sds**2))
+    models = draw((float(current[0]), float(current[1])))
+    rest = fit.of(models)
+    covariance: NDArray[np.float64] = np.eye(2) * prior_px**2
+    for _ in range(_DRAWN_ROUNDS):
+        moved = [draw((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
+        slopes = [
+            np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
+            for model, *pair in zip(models, *moved, strict=True)
+        ]
+        normal, right = fit.slope(models, slopes)
+        # along a single edge nothing shows the displacement: a weak direction stays where it is
+        values, vectors = np.linalg.eigh(normal)
+        weak = values < _WEAK * values[-1]
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
+        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        step = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        for part in (1.0, 0.4, 0.1):
+            there = np.clip(current + part * step, -LARGEST_PX, LARGEST_PX)
+            pictures = draw((float(there[0]), float(there[1])))
+            after = fit.of(pictures)
+            if after < rest:
+                break
+        else:
+            break
+        near = float(np.hypot(*(there - current))) < _DRAWN_ENOUGH_PX
+        rest, current, models = after, there, pictures
+        if near:
+            break
+    return _placement(current, covariance)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _LeftOver:
+    """What pictures leave of measured ones, level and smooth light left free.
+
+    Fields: images, measured (row, column); inner, pixels that count (row, column); weights of the pixels of each image; away
+    (row, column), weights with which light that strays is seen.
+    """
+
+    images: Sequence[NDArray[np.float64]]
+    inner: NDArray[np.bool_]
+    weights: Sequence[float]
+    away: Sequence[NDArray[np.float64]]
+
+    def _residuals(
+        self, models: Sequence[NDArray[np.floating]]
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+        """Residual and level (pixel,) and weight of each image, the level fitted."""
+        for image, model, weight, away in zip(self.images, models, self.weights, self.away, strict=True):
+            apart = np.asarray(image - model, dtype=np.float64)
+            residual = (apart - _stray(apart, away))[self.inner]
+            level = np.asarray(model, dtype=np.float64)[self.inner]
+            share = float(level @ residual) / (float(level @ level) + 1e-30)
+            yield residual - share * level, level, weight
+
+    def of(self, models: Sequence[NDArray[np.floating]]) -> float:
+        """Sum of squares."""
+        return sum(weight * float(residual @ residual) for residual, _, weight in self._residuals(models))
+
+    def slope(
+        self, models: Sequence[NDArray[np.floating]], slopes: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Normal matrix (2, 2) and right side (2,) of the step that leaves least, for slopes (2, pixel) of each picture."""
+        normal, right = np.zeros((2, 2)), np.zeros(2)
+        for (residual, level, weight), design in zip(self._residuals(models), slopes, strict=True):
+            cross = design @ level
+            normal += weight * (design @ design.T - np.outer(cross, cross) / (float(level @ level) + 1e-30))
+            right += weight * (design @ residual)
+        return normal, right
 
 
 def _stray(residual: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,14 +1,16 @@
 """Statistics of a series against what was planted in its frames."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from raytwin.diagnosis.assemble import _memory
 from raytwin.diagnosis.probes import Areas, MapProjection, Template, _log_variance_of_steps, _MovingPicture
-from raytwin.diagnosis.registration import Placement, register, resample
+from raytwin.diagnosis.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
 
@@ -265,3 +267,33 @@ def test_pixels_that_jump_and_stay_have_a_memory_and_noisy_ones_have_none():
         shares.append(found[0])
     assert abs(shares[0]) < 4 * np.sqrt(1.6 / (frames * count))
     assert shares[1] > 0.25
+
+
+@pytest.mark.parametrize("blur_px", [0.3, 1.2])
+@pytest.mark.parametrize("whole_cells", [False, True])
+def test_a_sharp_edge_is_placed_by_drawing_it_also_where_it_is_blurred_more_than_known(blur_px, whole_cells):
+    rows, columns = np.mgrid[:80, :80]
+
+    def picture(row_px, column_px, sigma_px):
+        # an opaque disc: dark and far less noisy inside
+        apart = np.hypot(rows - 40 - row_px, columns - 38 - column_px) - 20.0
+        return 100.0 + 30_000.0 * ndtr(apart / sigma_px)
+
+    rng = np.random.default_rng(4)
+    truth = (1.4, -0.7)
+    variance = picture(*truth, blur_px) / 10.0
+    measured = picture(*truth, blur_px) + np.sqrt(variance) * rng.standard_normal((80, 80))
+    start = Placement(row_px=0.0, column_px=0.0, row_sd_px=0.1, column_sd_px=0.1)
+    found = register_drawn(
+        [measured],
+        lambda at: [picture(*at, 0.3)],
+        [variance],
+        np.ones((80, 80), bool),
+        start,
+        whole_cells=whole_cells,
+    )
+    tolerance = 0.17 if whole_cells else 0.06
+    assert (found.row_px, found.column_px) == pytest.approx(truth, abs=tolerance)
+    if whole_cells:
+        assert found.row_px * 3 == pytest.approx(round(found.row_px * 3))
+        assert found.row_sd_px >= 1 / (3 * math.sqrt(12))

@@ -126,3 +126,21 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
     reshaped(lambda names: names, (1, 70_000))
     assert main(["diagnose", str(session), "-o", str(tmp_path / "line"), "--json"]) == 2
     assert "at least 16 rows and columns" in capsys.readouterr().err
+
+
+def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypatch):
+    session = tmp_path / "session.h5"
+    words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "6", "--products", "1"]
+    assert main(["lab", "-o", str(session), *words]) == 0
+    found = {}
+    for name, largest in (("fine", 96 * 96), ("squares", 48 * 48)):
+        monkeypatch.setattr(coarse, "LARGEST_PIXELS", largest)
+        capsys.readouterr()
+        assert main(["diagnose", str(session), "-o", str(tmp_path / name), "--plan", "--json"]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    strengths = {name: dict(zip(plan["effects"], plan["strengths"], strict=True)) for name, plan in found.items()}
+    assert "motion_blur" in strengths["squares"]
+    for effect, strength in strengths["squares"].items():
+        assert strength == pytest.approx(strengths["fine"][effect], rel=1e-6)
+    assert "quantisation" in found["squares"]["cannot_be_judged"]
+    assert "quantisation" not in found["squares"]["effects"]

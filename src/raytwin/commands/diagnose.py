@@ -236,6 +236,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
 
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
+    from ..diagnosis.coarse import UNSEEN, pixels_in_square
     from ..diagnosis.plan import distinguishability, table_text
     from ..diagnosis.preparation import mislabelled, prepare_session
     from ..files import whole_file
@@ -244,24 +245,28 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
         if session.suspects:
             raise mislabelled(acquisition, session.suspects)
+        unseen = UNSEEN if session.factor > 1 else {}
         problem = build_problem(
             session.acquisition,
             session.twin,
-            variants=catalogue_variants(without=arguments.without, side=session.factor),
+            variants=catalogue_variants(without=(*arguments.without, *unseen), side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
             side=session.factor,
             progress=bar.set_description_str,
         )
     found = distinguishability(problem)
+    shares = [pixels_in_square(effect, "strength", session.factor) for effect in found.effects]
+    found = replace(found, strengths=found.strengths * shares)
+    cannot = {**problem.missing_effects, **unseen}
     data = {
         "effects": list(found.effects),
         "strengths": found.strengths.tolist(),
         "from_none": found.from_none.tolist(),
         "between": found.between.tolist(),
-        "cannot_be_judged": dict(problem.missing_effects),
+        "cannot_be_judged": cannot,
     }
     with whole_file(arguments.output / "plan.json") as temporary:
         temporary.write_text(json.dumps(jsonable(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    missing = [f"{effect} cannot be judged: {reason}" for effect, reason in problem.missing_effects.items()]
+    missing = [f"{effect} cannot be judged: {reason}" for effect, reason in cannot.items()]
     answer(data, as_json=arguments.json, text="\n".join([table_text(found), *missing]))
     return 0

@@ -235,13 +235,13 @@ def minimise(
         new_gradient = _gradient(function, trial)
         change = new_gradient - gradient
         along = float(moved @ change)
-        if along > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
-            stretched = model @ moved
-            model = (
-                model
-                + np.outer(change, change) / along
-                - np.outer(stretched, stretched) / max(float(moved @ stretched), 1e-300)
-            )
+        stretched = model @ moved
+        bent = float(moved @ stretched)
+        # a step along which nothing bends, measured or modelled, says nothing of the curvature
+        if along > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change) and bent > 1e-10 * float(
+            np.linalg.norm(moved) * np.linalg.norm(stretched)
+        ):
+            model = model + np.outer(change, change) / along - np.outer(stretched, stretched) / bent
         elif iteration % 5 == 4:
             model = second_differences(function, trial, trial_value)
         point, value, gradient, fresh = trial, trial_value, new_gradient, False

@@ -1,9 +1,10 @@
-"""Numbers as JSON has them, and one canonical text for each value, so that a hash of it means something."""
+"""Numbers as JSON has them, one canonical text for each value, so that a hash of it means something, and objects read back."""
 
 import hashlib
 import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,3 +33,12 @@ def canonical(value: Any) -> bytes:
 def digest(value: Any) -> str:
     """SHA-256 of the canonical JSON text, 64 hexadecimal digits."""
     return hashlib.sha256(canonical(value)).hexdigest()
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """A file's JSON object, or nothing where there is none that can be read."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -14,11 +14,7 @@ import json
 import os
 import secrets
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -28,6 +24,8 @@ from typing import Any
 
 from ..errors import InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
+from ._children import THREAD_VARIABLES, ChildError, Children, KilledError, StoppedError
+from ._once import only_one
 from ._plain import canonical, digest
 from .blind_cases import BlindCase, draw_cases, is_development_seed, names_of_sets, seal_of, sealed_text
 from .blind_code import check_frozen_code, code_digest, freeze_code, same_code
@@ -36,7 +34,6 @@ CASE_TIMEOUT_S = 3600.0
 _ERROR_LINES = 400  # characters of an error that are kept
 _SECOND = "second.h5"
 _KEPT_VARIABLES = ("PATH", "HOME", "LANG", "LC_ALL", "PYTHONPATH", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "SYSTEMROOT")
-_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,10 +108,6 @@ class OpenedCheck:
     versions: tuple[str, ...]
 
 
-class _StoppedError(Exception):
-    """The run was stopped; nothing is recorded."""
-
-
 class Processes:
     """Measuring and diagnosing in processes of their own; `stop` ends those that run."""
 
@@ -123,9 +116,7 @@ class Processes:
         self._options = options
         self._code = code
         self._timeout_s = timeout_s
-        self._running: set[subprocess.Popen[str]] = set()
-        self._lock = threading.Lock()
-        self._stopped = threading.Event()
+        self._children = Children()
 
     def work(self) -> Work:
         """These processes as a worker's steps."""
@@ -162,49 +153,29 @@ class Processes:
 
     def stop(self) -> None:
         """End every process that runs; later ones are not started."""
-        with self._lock:
-            self._stopped.set()
-            for process in self._running:
-                process.kill()
+        self._children.stop()
 
     def _run(self, module: str, words: Sequence[str], *, folder: Path, given: str) -> None:
         environment = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
-        environment |= dict.fromkeys(_THREADS, "1") | {"TMPDIR": str(folder)}
+        environment |= dict.fromkeys(THREAD_VARIABLES, "1") | {"TMPDIR": str(folder)}
         if self._code is not None:
             environment["PYTHONPATH"] = os.pathsep.join(
                 filter(None, (str(self._code), environment.get("PYTHONPATH", "")))
             )
-        command = [sys.executable, "-P", "-m", f"{__package__}.{module}", *words]
-        with self._lock:
-            if self._stopped.is_set():
-                raise _StoppedError
-            process = subprocess.Popen(
-                command,
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,  # a key press reaches the parent alone, which then ends its children
+
+        def once() -> None:
+            self._children.run(
+                module, words, given=given, environment=environment, folder=folder, timeout_s=self._timeout_s
             )
-            self._running.add(process)
+
         try:
-            _, errors = process.communicate(given, timeout=self._timeout_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
-            raise RuntimeError(f"{module} took longer than {self._timeout_s:g} s") from None
-        finally:
-            with self._lock:
-                self._running.discard(process)
-        if self._stopped.is_set():
-            raise _StoppedError
-        if process.returncode < 0:
-            raise RuntimeError(f"{module} was ended by {signal.Signals(-process.returncode).name}")
-        if process.returncode:
-            lines = [line for line in errors.strip().splitlines() if line.strip()] or [f"exit {process.returncode}"]
-            raise RuntimeError(f"{module}: {lines[-1][:_ERROR_LINES]}")
+            try:
+                once()
+            except KilledError:
+                # somebody else's doing, such as a machine short of memory: what the case holds plays no part in it
+                once()
+        except ChildError as error:
+            raise RuntimeError(f"{module}: {error}") from None
 
 
 def begin_check(folder: Path, options: BlindOptions, *, development: bool = False) -> tuple[str, tuple[BlindCase, ...]]:
@@ -258,7 +229,7 @@ def begin_check(folder: Path, options: BlindOptions, *, development: bool = Fals
         }
         _write_json(seal_path, page)
         return seal, cases
-    page = _read_json(seal_path)
+    page = _read_json(seal_path, "sha256", "code_sha256")
     salt = _salt(folder)
     if page.get("options_sha256") != _options_digest(options, salt):
         raise InputError(
@@ -346,7 +317,7 @@ def run_check(
     """
     answers = folder / "answers"
     answers.mkdir(exist_ok=True)
-    with _only_one(folder), _workplace(folder) as place:
+    with only_one(folder, "a check"), _workplace(folder) as place:
         left = unanswered(folder, cases)
         begin(len(left))
         if (folder / "answers.json").exists() and left:
@@ -386,26 +357,40 @@ def open_check(folder: Path, options: BlindOptions, cases: Sequence[BlindCase]) 
         raise InputError(
             str(folder), received=f"{len(missing)} cases without an answer", expected="an answer to every case"
         )
-    hashes = {answer_path(folder, case).name: sha256_of_file(answer_path(folder, case)) for case in cases}
+    hashes = _hashes_of_answers(folder, cases)
     closed = folder / "answers.json"
     if not closed.exists():
         _write_json(closed, {"sha256": digest(hashes), "answers": hashes})
-    elif _read_json(closed)["answers"] != hashes:
+    kept = _read_json(closed, "answers")["answers"]
+    touched = [name for name in {**hashes, **kept} if kept.get(name) != hashes.get(name)]
+    if not any(name.endswith(".npz") for name in kept):
+        # checks of earlier versions closed the answers without the inner products beside them
+        touched = [name for name in touched if not name.endswith(".npz")]
+    if touched:
         raise InputError(
             str(folder / "answers"),
-            received="answers that are not those that were closed before the labels were opened",
+            received=f"{', '.join(touched[:3])}{' ...' if len(touched) > 3 else ''}: not those that were closed before the"
+            " labels were opened",
             expected="untouched answers",
             remedy="run the check again in another folder",
         )
     salt = _salt(folder)
-    seal = str(_read_json(folder / "seal.json")["sha256"])
+    seal = str(_read_json(folder / "seal.json", "sha256")["sha256"])
     if seal_of(cases, salt) != seal:
         raise InputError(
             str(folder / "seal.json"), received=seal, expected="the hash of the labels that the seed draws"
         )
-    if not (folder / "labels.json").exists():
-        with whole_file(folder / "labels.json") as temporary:
+    labels = folder / "labels.json"
+    if not labels.exists():
+        with whole_file(labels) as temporary:
             temporary.write_bytes(sealed_text(cases, salt))
+    elif sha256_of_file(labels) != seal:
+        raise InputError(
+            str(labels),
+            received=f"text that hashes to {sha256_of_file(labels)[:12]}",
+            expected=f"the labels that were sealed, {seal[:12]}",
+            remedy="put the file back as it was written",
+        )
     shutil.rmtree(folder / ".private", ignore_errors=True)
     answers = tuple(_read_json(answer_path(folder, case)) for case in cases)
     versions = sorted({str(item["code_sha256"]) for item in answers if item.get("code_sha256")})
@@ -417,6 +402,13 @@ def open_check(folder: Path, options: BlindOptions, cases: Sequence[BlindCase]) 
         folder=folder,
         versions=tuple(versions),
     )
+
+
+def _hashes_of_answers(folder: Path, cases: Sequence[BlindCase]) -> dict[str, str]:
+    """SHA-256 of every answer, and of the inner products beside it where there are any, by file name."""
+    pairs = ((answer_path(folder, case), statistics_path(folder, case.stream, case.index)) for case in cases)
+    files = [path for pair in pairs for path in pair if path.exists()]
+    return {path.name: sha256_of_file(path) for path in files}
 
 
 def unanswered(folder: Path, cases: Sequence[BlindCase]) -> list[BlindCase]:
@@ -456,7 +448,7 @@ def _run_case(
             measured_s = time.perf_counter() - begun
             result = work.judge(session, withheld(case, options), case.stream == "train")
             result |= {"error": "", "measured_s": measured_s, "acquisition_sha256": sha256_of_file(session)}
-        except (_StoppedError, KeyboardInterrupt, SystemExit):
+        except (StoppedError, KeyboardInterrupt, SystemExit):
             raise
         except Exception as error:
             result = {"error": " ".join(str(error).split())[:_ERROR_LINES] or type(error).__name__}
@@ -492,35 +484,17 @@ def _workplace(folder: Path) -> Iterator[Path]:
         shutil.rmtree(place, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def _only_one(folder: Path) -> Iterator[None]:
-    """No second run in the same folder at the same time, where the system can say so."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    with open(folder / ".lock", "w", encoding="ascii") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InputError(
-                "-o", received=f"{folder}, where a check is running", expected="a folder that no other run works in"
-            ) from None
-        yield
-
-
 def _salt(folder: Path) -> str:
     private = folder / ".private" / "salt"
     if private.exists():
         return private.read_text(encoding="ascii")
     labels = folder / "labels.json"
     if labels.exists():
-        return str(_read_json(labels)["salt"])
+        return str(_read_json(labels, "salt")["salt"])
     raise InputError(
         str(folder),
         received="a seal without its salt",
-        expected="a check as it was begun",
+        expected="a check as it was left: its hidden folder .private while it runs, labels.json afterwards",
         remedy="begin again in another folder",
     )
 
@@ -529,13 +503,20 @@ def _options_digest(options: BlindOptions, salt: str) -> str:
     return digest({"salt": salt, "options": asdict(options)})
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, *words: str) -> dict[str, Any]:
+    """The JSON object of a file, which has these words."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
         value = None
-    if not isinstance(value, dict):
-        raise InputError(str(path), received="no JSON object", expected="what a blind check wrote")
+    missing = [word for word in words if not isinstance(value, dict) or word not in value]
+    if not isinstance(value, dict) or missing:
+        raise InputError(
+            str(path),
+            received=f"no {missing[0]} in it" if isinstance(value, dict) else "no JSON object",
+            expected="what a blind check wrote",
+            remedy="put the file back as it was written, or begin again in another folder",
+        )
     return value
 
 

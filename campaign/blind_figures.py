@@ -261,7 +261,7 @@ def plot_limits(outcomes: Sequence[Outcome]) -> bytes:
         strength = EFFECTS[name].strength
         axis.set(xscale="log", ylim=(-0.05, 1.05), xlim=(strength.low * 0.8, strength.high * 1.25))
         ticks = [strength.low, math.sqrt(strength.low * strength.high), strength.high]
-        axis.set_xticks(ticks, [f"{value:.2g}" for value in ticks])
+        axis.set_xticks(ticks, [f"{float(f'{value:.2g}'):g}" for value in ticks])
         axis.set_xticks([], minor=True)
         axis.set_title(f"{name.replace('_', ' ')}, {strength.unit}", fontsize=8)
         axis.tick_params(labelsize=7, which="both")

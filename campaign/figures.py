@@ -27,6 +27,16 @@ def figure_with_axes(width: float, height: float, rows: int = 1, columns: int = 
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def figure_with_panels(count: int, columns: int, *, width: float, height: float) -> tuple[Any, list[Any]]:
+    """A figure of `count` panels, each of width x height inches, in rows of at most `columns`; and its axes in order."""
+    columns = min(count, columns)
+    lines = -(-count // columns)
+    figure, axes = figure_with_axes(width * columns, height * lines, lines, columns)
+    for axis in axes.flat[count:]:
+        axis.set_axis_off()
+    return figure, list(axes.flat[:count])
+
+
 def png_of(figure: Any) -> bytes:
     """The figure as PNG, the same bytes whenever it is made."""
     buffer = io.BytesIO()
@@ -102,7 +112,7 @@ def plot_validation(rows: Sequence[dict[str, Any]]) -> bytes:
         )
         axis.axvline(0, color="grey", linewidth=0.8)
         axis.set(xlabel="predicted over measured - 1, %", title=title, yticks=height)
-        axis.set_yticklabels([row["setting"].replace(",", ", ") for row in rows] if column == 0 else [], fontsize=8)
+        axis.set_yticklabels([row["setting"].replace(",", ", ") for row in rows] if column == 0 else [], fontsize=9)
     return png_of(figure)
 
 
@@ -121,7 +131,7 @@ def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
     figure, axes = figure_with_axes(3.3 * len(exposures) + 3.3, 8.2, 3, len(exposures) + 1)
     axes[0, 0].imshow(image, vmin=low, vmax=high, cmap="gray")
     axes[0, 0].contour(mask, [0.5], colors="red", linewidths=0.8)
-    axes[0, 0].set_title(f"reference, 1 s; bone of {size:.2g} mm,\ncontrast {contrast:.3f} (outlined)", fontsize=9)
+    axes[0, 0].set_title(f"reference, 1 s; bone of {size:.2g} mm,\ncontrast {contrast:.3f} (outlined)", fontsize=12)
     for axis in axes[1:, 0]:
         axis.axis("off")
     for column, exposure in enumerate(exposures, start=1):
@@ -132,7 +142,7 @@ def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
             with read_dataset(directory / f"{kind}_{exposure:g}ms.h5") as dataset:
                 found = [i for i, one in enumerate(dataset.rows) if name in (one.image, one.image.rpartition("-")[0])]
                 axis.imshow(dataset.images(found[0])[0], vmin=low, vmax=high, cmap="gray")
-            axis.set_title(f"{title}, {exposure:g} ms", fontsize=9)
+            axis.set_title(f"{title}, {exposure:g} ms", fontsize=12)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
     return png_of(figure)
@@ -140,23 +150,24 @@ def plot_examples(directory: Path, exposures: Sequence[float]) -> bytes:
 
 def plot_training(training: dict[str, Any]) -> bytes:
     """Training and validation loss of the shared network and of the networks of every exposure. PNG."""
-    names = list(training)
-    figure, axes = figure_with_axes(3.2 * len(names), 3.2, 1, len(names))
-    for column, name in enumerate(names):
-        axis = axes[0, column]
+    from matplotlib.ticker import MaxNLocator
+
+    figure, axes = figure_with_panels(len(training), 3, width=3.6, height=2.9)
+    for number, (axis, name) in enumerate(zip(axes, training, strict=True)):
         for index, network in enumerate(training[name]["networks"]):
             losses = network["losses"]
             axis.plot(np.arange(1, len(losses) + 1), losses, color=f"C{index}", linewidth=1)
             axis.plot(network["validation_epochs"], network["validation_losses"], ".--", color=f"C{index}", linewidth=1)
-        axis.set(title=f"{name}", xlabel="epoch", ylabel="loss (dashed: validation)" if column == 0 else "")
+        title = f"{name.removesuffix('ms')} ms" if name.endswith("ms") else name
+        axis.set(title=title, xlabel="epoch", ylabel="" if number % 3 else "loss (dashed: validation)")
+        axis.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     return png_of(figure)
 
 
 def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exposures: Sequence[float]) -> bytes:
     """POD against contrast: a thin curve a network, a thick one for all; hits and misses as ticks; a90 intervals. PNG."""
-    figure, axes = figure_with_axes(4.1 * len(exposures), 4.0, 1, len(exposures))
-    for column, exposure in enumerate(exposures):
-        axis = axes[0, column]
+    figure, axes = figure_with_panels(len(exposures), 2, width=5.2, height=3.8)
+    for number, (axis, exposure) in enumerate(zip(axes, exposures, strict=True)):
         for kind, colour, label, offset in (("real", REAL, "measured", 0.0), ("test", GENERATED, "generated", 0.025)):
             name = f"{kind}_{exposure:g}ms"
             if name not in hits:
@@ -184,9 +195,10 @@ def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exp
                     axis.plot([low, high], [0.9 - offset] * 2, color=colour, linewidth=1.4)
         axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
         axis.set(title=f"{exposure:g} ms", xlabel="contrast $\\Delta R$", ylim=(-0.1, 1.12))
+        if number % 2 == 0:
+            axis.set_ylabel("probability of detection")
         if axis.get_legend_handles_labels()[0]:
-            axis.legend(loc="lower right", fontsize=8)
-    axes[0, 0].set_ylabel("probability of detection")
+            axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.13), fontsize=9)
     return png_of(figure)
 
 

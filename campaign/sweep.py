@@ -9,11 +9,10 @@ What is finished is kept under the hash of what decides it: twin, references, se
 was stopped goes on where it was, a setting that is added costs that setting, and a limit that is changed costs nothing.
 """
 
-import contextlib
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,8 @@ from typing import Any
 from ..errors import FitError, InputError, RaytwinError
 from ..files import whole_file
 from ..generator.twin_io import read_twin
-from ._plain import digest, plain
+from ._once import only_one
+from ._plain import digest, plain, read_object
 from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
@@ -141,9 +141,11 @@ def run_sweep(
     """
     progress = progress or Progress()
     _claim(directory)
-    with _only_one(directory):
+    with only_one(directory, "a sweep"):
         found = tuple(outlooks) if outlooks is not None else look_ahead(campaign)
         basis = basis_of(campaign, version=version)
+        if another := _answer_of_another(directory, campaign, basis):
+            progress.tell(another)
         data = (directory / "references").resolve()
         tasks: dict[str, Task] = {}
         errors: dict[str, str] = {}
@@ -188,9 +190,9 @@ def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
     """Seconds that each trained setting took, by its text; not in sweep.json, whose bytes say nothing of when it was made."""
     found = {}
     for row in rows:
-        path = directory / row["folder"] / "seconds.json" if row["folder"] else None
-        if path is not None and path.exists():
-            found[str(row["setting"])] = float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
+        seconds = read_object(directory / row["folder"] / "seconds.json").get("seconds") if row["folder"] else None
+        if seconds is not None:
+            found[str(row["setting"])] = float(seconds)
     return found
 
 
@@ -321,12 +323,12 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
     if task is None or error:
         return dict(plain(row))
     folder = Path(task["folder"])
-    trial = json.loads((folder / "trial.json").read_text(encoding="utf-8"))
+    trial = read_object(folder / "trial.json")
     row["folder"] = f"settings/{folder.name}"
     row["warnings"] = list(dict.fromkeys([*row["warnings"], *trial["warnings"]]))
     if trial["refused"]:
         return dict(plain(row | {"feasible": False, "reason": trial["refused"]}))
-    curve = json.loads((folder / "pod.json").read_text(encoding="utf-8"))
+    curve = read_object(folder / "pod.json")
     alarms = curve["false_alarms"]
     row |= {
         "trained": True,
@@ -422,10 +424,9 @@ def _ratio_to_best(
     """a90 of a setting over that of the best, with its 95 % interval; on the same test images it is a paired comparison."""
     key = digest({"best": best["curve_key"], "other": other["curve_key"]})
     kept = directory / "compare" / f"{key[:20]}.json"
-    if kept.exists():
-        held: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-        if held.get("key") == key:
-            return dict(held["ratio"])
+    held = read_object(kept)
+    if held.get("key") == key:
+        return dict(held["ratio"])
     tell(f"comparing {Path(other['folder']).name} with the best")
     ratio = compare_tables(Path(best["folder"]) / "hits.csv", Path(other["folder"]) / "hits.csv", curve)
     _write_json(kept, {"key": key, "ratio": ratio})
@@ -484,28 +485,22 @@ def _claim(directory: Path) -> None:
     _write_json(marker, {"format": "raytwin-sweep", "version": 1})
 
 
+def _answer_of_another(directory: Path, campaign: Campaign, basis: Mapping[str, Any]) -> str:
+    """What to say where the folder holds the answer of another campaign, which this one's replaces; nothing where it does not."""
+    held = read_object(directory / "sweep.json")
+    name = held.get("campaign", "")
+    differs = [word for word, value in plain(basis).items() if held.get(word) != value]
+    if not name or (not differs and name == campaign.path.name):
+        return ""
+    what = ", ".join(word.removesuffix("_sha256").replace("_", " ") for word in differs)
+    had = f", with another {what}: all settings are trained anew" if differs else ""
+    return f"{directory} holds the answer of {name}{had}; what was trained for it stays, its sweep.json, csv and report do not"
+
+
 def marker_of(directory: Path) -> Path:
     """A file that is there once the folder is a sweep's: what workers on other machines must see."""
     _claim(directory)
     return (directory / _MARKER).resolve()
-
-
-@contextlib.contextmanager
-def _only_one(folder: Path) -> Iterator[None]:
-    """No second run in the same folder at the same time, where the system can say so."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    with open(folder / ".lock", "w", encoding="ascii") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InputError(
-                "-o", received=f"{folder}, where a sweep is running", expected="a folder that no other run works in"
-            ) from None
-        yield
 
 
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -104,32 +104,34 @@ def sentence(
             return f"None of the {len(rows)} settings was tried; the reasons stand with the rows."
         if any(row.get("a90") is not None for row in rows):
             return "No setting has both an a90 and as few false alarms as asked for."
-        most = max((row for row in rows if row.get("n")), key=lambda row: row["n_hits"] / row["n"])
+        most = max((row for row in rows if row.get("n")), key=lambda row: row["n_hits"] / row["n"], default=None)
+        if most is None:
+            return (
+                f"None of the {trained} settings that were tried met a foreign object of known size: there is no POD."
+            )
         found = f"Most was found at {most['label']}: {most['n_hits']} of {most['n']}."
         return (
             f"None of the {trained} settings that were tried has an a90 that the data support: larger objects, more images or"
             f" more training are wanted, or less noise. {found if most['n_hits'] else 'No object was found at any of them.'}"
         )
     row = rows[choice.recommended]
-    facts = _facts(row, unit)
-    upper = row.get("a90_upper")
-    bound = "no upper bound" if upper is None else f"upper bound {_sized(upper, unit)}"
-    if goal is None:
-        text = f"Take {row['label']}: of {count} settings with an a90 it has the smallest 95 % upper bound ({facts}; {bound})."
-        if count == 1:
-            text = f"Take {row['label']}: the only setting with an a90 ({facts}; {bound})."
+    upper = row.get("a90_upper")  # the best row has none only where no row has one
+    facts = f"{_facts(row, unit)}; " + ("no upper bound" if upper is None else f"upper bound {_sized(upper, unit)}")
+    take = f"Take {row['label']}:"
+    if goal is None and count == 1:
+        text = f"{take} the only setting with an a90 ({facts})."
+    elif goal is None and upper is None:
+        text = f"{take} none of {count} settings with an a90 has a 95 % upper bound, and its a90 is the smallest ({facts})."
+    elif goal is None:
+        text = f"{take} of {count} settings with an a90 it has the smallest 95 % upper bound ({facts})."
     elif choice.meets:
         number = sum((one.get("a90_upper") or math.inf) <= goal for one in rows if takes_part(one, most_false_alarms))
-        text = (
-            f"Take {row['label']}: the fastest of {number} settings whose a90 is shown to lie below {_sized(goal, unit)}"
-            f" ({facts}; {bound})."
-        )
-        if number == 1:
-            text = f"Take {row['label']}: the only setting whose a90 is shown to lie below {_sized(goal, unit)} ({facts}; {bound})."
+        which = "the only setting" if number == 1 else f"the fastest of {number} settings"
+        text = f"{take} {which} whose a90 is shown to lie below {_sized(goal, unit)} ({facts})."
     else:
+        smallest = "the smallest a90" if upper is None else "the smallest 95 % upper bound"
         text = (
-            f"No setting is shown to reach a90 = {_sized(goal, unit)}; the smallest 95 % upper bound is that of {row['label']}"
-            f" ({facts}; {bound})."
+            f"No setting is shown to reach a90 = {_sized(goal, unit)}; {smallest} is that of {row['label']} ({facts})."
         )
     return text + _alike_text(rows, choice, most_false_alarms)
 

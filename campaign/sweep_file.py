@@ -176,11 +176,22 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
     """
     file = Path(path)
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
+        text = file.read_text(encoding="utf-8")
+        content = tomllib.loads(text)
     except FileNotFoundError:
         raise InputError(str(path), received="no such file", expected="a campaign file (TOML)") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        what = "a folder" if file.is_dir() else f"a file that cannot be read ({error.strerror})"
+        raise InputError(str(path), received=what, expected="a campaign file (TOML)") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(str(path), received=f"text that is not TOML ({error})", expected="a campaign file") from None
+    if not text.strip():
+        raise InputError(
+            str(path),
+            received="an empty file",
+            expected="a campaign file (TOML) with twin, references and settings",
+            remedy="docs/campaigns.md has an example",
+        )
     words = _Words(content, file.name)
     tables = {name: words.table(name) for name in _TABLES if name != "setting"}
     settings = _settings(words.tables("setting"), tables["grid"], file.name)
@@ -366,7 +377,8 @@ class _Words:
             return None
         place = folder / self.text(word, None)
         if not place.is_file():
-            raise self.error(word, f"{place}, which is not there", "a file; paths are relative to the campaign file")
+            what = "a folder" if place.is_dir() else "which is not there"
+            raise self.error(word, f"{place}, {what}", "a file; paths are relative to the campaign file")
         return place
 
     def table(self, word: str) -> "_Words":

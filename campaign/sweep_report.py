@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from ..files import whole_file
-from .figures import figure_with_axes, png_of
+from .figures import figure_with_axes, figure_with_panels, png_of
 from .sweep_choice import paces
 from .sweep_file import Campaign
 
 _DASH = "–"
 _TAKEN, _ALIKE, _OTHER, _FRONT = "#1b7f3b", "#335588", "#8a8a8a", "#c23b22"
 _MOST_CURVES = 8
+_CURVES_A_LINE = 4
 _MOST_BARS = 60
+_FEWEST_TICKS = 3
 
 
 def write_report(
@@ -55,6 +57,8 @@ def write_report(
             name: any(row[name] is not None for row in rows if row["trained"]) for name in ("motion_px", "cnr_object")
         },
         left_out=[_left_out_row(row) for row in rows if not row["trained"]],
+        bars=_MOST_BARS if len(shown) > _MOST_BARS else 0,
+        curves=_MOST_CURVES if sum(bool(row["line"] or row["points"]) for row in rows) > _MOST_CURVES else 0,
         notes=_notes(rows),
         recommended=next((row for row in rows if row["recommended"]), None),
         facts=_facts(campaign, answer),
@@ -68,23 +72,29 @@ def write_report(
 
 def plot_intervals(rows: Sequence[Mapping[str, Any]], *, size: str, goal: float | None) -> bytes:
     """a90 of each setting with its two-sided 95 % interval and one-sided bound, the smallest bound first. PNG."""
-    ordered = _in_order(rows)[:_MOST_BARS]
+    ordered = _in_order(rows)
+    taken = [row for row in ordered[_MOST_BARS:] if row["recommended"]]
+    ordered = [*ordered[: _MOST_BARS - len(taken)], *taken]
     figure, axes = figure_with_axes(10, 1.4 + 0.32 * len(ordered))
     axis = axes[0, 0]
     height = np.arange(len(ordered))[::-1]
     ends = [row[name] for row in ordered for name in ("a90", "a90_high", "a90_upper") if row[name] is not None]
     # bounds far beyond all estimates would squeeze the others; they stand in the table
-    end = min(1.06 * max([*ends, goal or 0.0]), 2.0 * max(*(row["a90"] for row in ordered), goal or 0.0, 0.0))
+    largest = max(*(row["a90"] for row in ordered), goal or 0.0, 0.0)
+    end = min(1.06 * max([*ends, goal or 0.0]), 2.0 * largest)
+    if any(row["a90_high"] is None for row in ordered):
+        end = max(end, 1.4 * largest)  # room for the words beside an interval without an end
     for y, row in zip(height, ordered, strict=True):
         colour = _colour(row)
-        low = row["a90"] if row["a90_low"] is None else row["a90_low"]
+        low = 0.0 if row["a90_low"] is None else row["a90_low"]
         high = end if row["a90_high"] is None else min(row["a90_high"], end)
         axis.plot([low, high], [y, y], color=colour, linewidth=2.2 if row["recommended"] else 1.4)
         axis.plot([row["a90"]], [y], "o", color=colour, markerfacecolor=colour if row["recommended"] else "white")
         if row["a90_upper"] is not None:
             axis.plot([row["a90_upper"]], [y], "|", color=colour, markersize=11, markeredgewidth=1.6)
         if row["a90_high"] is None or row["a90_high"] > end:
-            told = "no upper end" if row["a90_high"] is None else f"to {row['a90_high']:.3g}"
+            open_ended = "no upper end" if row["a90_low"] is not None else "no interval"
+            told = open_ended if row["a90_high"] is None else f"to {row['a90_high']:.3g}"
             axis.annotate(
                 told,
                 (1.0, y),
@@ -97,7 +107,9 @@ def plot_intervals(rows: Sequence[Mapping[str, Any]], *, size: str, goal: float 
             )
     if goal is not None:
         axis.axvline(goal, color="black", linewidth=0.9, linestyle=":")
-        axis.annotate("goal", (goal, height[0] + 0.55), fontsize=8, ha="center", annotation_clip=False)
+        axis.annotate(
+            "goal", (goal, 0.0), (3, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8
+        )
     axis.set_yticks(height, [row["label"] for row in ordered], fontsize=9)
     axis.set(xlim=(0, end), ylim=(-0.7, len(ordered) - 0.3))
     axis.set_xlabel(f"{size} at POD 90 %: estimate, two-sided 95 % interval, one-sided 95 % bound (tick)")
@@ -120,40 +132,48 @@ def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
             "air kerma of a pair, uGy",
         ),
     ]
+    largest = max(row["a90"] for row in rows)
+    ends = [row["a90_high"] for row in rows if row["a90_high"] is not None]
+    top = min(1.06 * max([*ends, 1.1 * largest]), 2.0 * largest)
     figure, axes = figure_with_axes(11, 4.2, 1, 2)
     for column, (values, title) in enumerate(panels):
         axis = axes[0, column]
         for value, row in zip(values, rows, strict=True):
             if not (math.isfinite(value) and value > 0):
                 continue
-            low, high = (row["a90"] if row[name] is None else row[name] for name in ("a90_low", "a90_high"))
+            # an interval without an end leaves the picture
+            low, high = (end if row[name] is None else row[name] for name, end in (("a90_low", 0.0), ("a90_high", top)))
             colour = _TAKEN if row["recommended"] else _FRONT if row["pareto"] else _OTHER
             axis.plot([value, value], [low, high], color=colour, linewidth=1, alpha=0.6)
             axis.plot([value], [row["a90"]], "o", color=colour, markersize=9 if row["recommended"] else 6)
         axis.set(xscale="log", xlabel=title, ylabel=f"{size} at POD 90 %" if column == 0 else "")
-        axis.set_ylim(0, min(axis.get_ylim()[1], 2.0 * max(row["a90"] for row in rows)))
+        axis.set_ylim(0, top)
         _few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
+    others = [row for row in rows if not row["recommended"]]
     kinds = [
-        ("recommended", _TAKEN, "recommended"),
-        ("pareto", _FRONT, "no other beats it in a90, dose and throughput"),
+        ("recommended", _TAKEN, len(others) < len(rows)),
+        ("no other beats it in a90, dose and throughput", _FRONT, any(row["pareto"] for row in others)),
+        ("beaten by another", _OTHER, any(not row["pareto"] for row in others)),
     ]
-    for name, colour, label in kinds:
-        if any(row[name] for row in rows):
+    for label, colour, there in kinds:
+        if there:
             axes[0, 0].plot([], [], "o", color=colour, label=label)
-    if any(not row["pareto"] and not row["recommended"] for row in rows):
-        axes[0, 0].plot([], [], "o", color=_OTHER, label="beaten by another")
-    axes[0, 0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
+    # of the whole figure: a legend of one panel would make that panel narrower
+    figure.legend(fontsize=8, loc="outside upper left", ncols=3, frameon=False)
     return png_of(figure)
 
 
 def _few_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, in plain numbers."""
+    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers."""
     if not values:
         return
     lowest, highest = min(values) / 1.25, max(values) * 1.25
     decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
-    ticks = [step * 10.0**power for power in decades for step in (1, 2, 5)]
-    inside = [tick for tick in ticks if lowest <= tick <= highest]
+    inside: list[float] = []
+    for steps in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9)):
+        if len(inside) < _FEWEST_TICKS:
+            ticks = [step * 10.0**power for power in decades for step in steps]
+            inside = [tick for tick in ticks if lowest <= tick <= highest]
     axis.set_xticks(inside, [f"{tick:g}" for tick in inside])
     axis.minorticks_off()
     axis.set_xlim(lowest, highest)
@@ -166,10 +186,8 @@ def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
         fitted, key=lambda row: (not row["recommended"], not row["pareto"], row["a90"] is None, row["a90"] or 0.0)
     )
     chosen = ranked[:_MOST_CURVES]
-    columns = min(len(chosen), 4)
-    lines = -(-len(chosen) // columns)
-    figure, axes = figure_with_axes(3.1 * columns, 2.9 * lines, lines, columns)
-    for axis, row in zip(axes.flat, chosen, strict=False):
+    figure, axes = figure_with_panels(len(chosen), _CURVES_A_LINE, width=3.1, height=2.9)
+    for number, (axis, row) in enumerate(zip(axes, chosen, strict=True)):
         colour = _colour(row)
         line = row["line"]
         if line:
@@ -185,12 +203,10 @@ def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
         axis.set(ylim=(-0.03, 1.03))
         axis.locator_params(axis="x", nbins=4)
         axis.set_title(str(row["label"]) + (" *" if row["recommended"] else ""), fontsize=9)
-    for axis in axes[-1]:
-        axis.set_xlabel(size)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("probability of detection")
-    for axis in list(axes.flat)[len(chosen) :]:
-        axis.set_axis_off()
+        if number + _CURVES_A_LINE >= len(chosen):
+            axis.set_xlabel(size)
+        if number % _CURVES_A_LINE == 0:
+            axis.set_ylabel("probability of detection")
     return png_of(figure)
 
 

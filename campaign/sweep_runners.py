@@ -6,23 +6,19 @@ randomness and threads, so that what they write does not depend on where, in whi
 
 import json
 import os
-import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..errors import InputError, MissingDependencyError, RaytwinError
+from ._children import THREAD_VARIABLES, Children, StoppedError
 from .sweep_trial import Task, run_task
 
 Done = Callable[[Task, str], None]  # the task, and why it failed (empty: it did not)
 
 TRIES = 2
 _ERROR_LETTERS = 400
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 INSTALL_COMMAND = "pip install '.[cluster]'"
 
 
@@ -49,18 +45,12 @@ class Here:
         """Nothing to close."""
 
 
-class _StoppedError(Exception):
-    """The run was stopped."""
-
-
 class Processes:
     """In processes of their own, `workers` at once; each task has its own, so that one that dies takes nothing along."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
-        self._running: set[subprocess.Popen[str]] = set()
-        self._lock = threading.Lock()
-        self._stopped = threading.Event()
+        self._children = Children()
 
     def run(self, tasks: Sequence[Task], done: Done) -> None:
         """Do all tasks; when this is interrupted the processes are ended."""
@@ -79,50 +69,14 @@ class Processes:
 
     def close(self) -> None:
         """End what runs; later tasks are not started."""
-        with self._lock:
-            self._stopped.set()
-            for process in self._running:
-                process.kill()
+        self._children.stop()
 
     def _attempts(self, task: Task) -> str:
         return _tried(lambda: self._one(task))
 
     def _one(self, task: Task) -> None:
-        threads = dict.fromkeys(_THREAD_VARIABLES, str(task["threads"]))
-        with self._lock:
-            if self._stopped.is_set():
-                raise _StoppedError
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", f"{__package__}.sweep_trial"],
-                env=os.environ | threads,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,  # a key press reaches the parent alone, which then ends its children
-            )
-            self._running.add(process)
-        try:
-            # standard input stays open: its end tells the child that its parent is gone
-            if process.stdin is None or process.stderr is None:
-                raise RuntimeError("a process without pipes")
-            process.stdin.write(json.dumps(task) + "\n")
-            process.stdin.flush()
-            errors = process.stderr.read()
-            code = process.wait()
-        finally:
-            with self._lock:
-                self._running.discard(process)
-            for stream in (process.stdin, process.stderr):
-                if stream is not None:
-                    stream.close()
-        if self._stopped.is_set():
-            raise _StoppedError
-        if code < 0:
-            raise RuntimeError(f"the process was ended by {signal.Signals(-code).name}")
-        if code:
-            lines = [line for line in errors.strip().splitlines() if line.strip()] or [f"exit {code}"]
-            raise RuntimeError(lines[-1])
+        environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(task["threads"]))
+        self._children.run("sweep_trial", given=json.dumps(task), environment=environment, leash=True)
 
 
 class DaskCluster:
@@ -239,7 +193,7 @@ def _tried(work: Callable[[], None]) -> str:
     for _ in range(TRIES):
         try:
             work()
-        except (_StoppedError, MissingDependencyError):
+        except (StoppedError, MissingDependencyError):
             raise
         except Exception as failure:
             error = failure

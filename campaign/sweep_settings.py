@@ -179,11 +179,12 @@ def open_references(path: Path, word: str) -> Dataset:
     try:
         return read_dataset(path)
     except InputError as error:
+        another = "raytwin import" in error.remedy  # a file of another kind; else one that is cut off or damaged
         raise InputError(
             f"{word}, {error.argument}",
             received=error.received,
-            expected="a dataset file with reference images (or a description, .toml)",
-            remedy="`raytwin import reference` makes one of an acquisition or of folders",
+            expected="a dataset file with reference images (or a description, .toml)" if another else error.expected,
+            remedy="`raytwin import reference` makes one of an acquisition or of folders" if another else error.remedy,
         ) from None
 
 
@@ -297,8 +298,8 @@ def _check(
             room = 2.0**bits - 1.0 - twin.dark_DN.value
             if found.mean_DN.value > room:
                 raise _Refused(
-                    f"the detector saturates at {setting.kV:g} kV: {found.mean_DN.value:.4g} DN above dark in the open beam,"
-                    f" room for {room:.4g} DN"
+                    f"the detector saturates at {setting.kV:g} kV: {found.mean_DN.value:.0f} DN above dark in the open beam,"
+                    f" room for {room:.0f} DN"
                 )
     if known["extrapolated"] and not limits.extrapolation:
         raise _Refused("outside the calibrated range, and extrapolation = false")

@@ -27,7 +27,7 @@ from ..acquisition.pairs import split_by_product
 from ..acquisition.setting import setting_from_text
 from ..errors import FileFormatError, InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
-from ._plain import canonical, digest, plain
+from ._plain import canonical, digest, plain, read_object
 from .sweep_file import Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
 from .sweep_settings import open_references, start_pair, twin_at
 from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
@@ -169,7 +169,7 @@ def prepare_references(campaign: Campaign, folder: Path, basis: Mapping[str, Any
     """
     key = digest(basis)
     note = folder / "dealt.json"
-    if _read(note).get("key") == key and (folder / "learn.h5").exists() and (folder / "test.h5").exists():
+    if read_object(note).get("key") == key and (folder / "learn.h5").exists() and (folder / "test.h5").exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -191,6 +191,7 @@ def prepare_references(campaign: Campaign, folder: Path, basis: Mapping[str, Any
                     expected="images with and without foreign objects",
                     remedy="more products, or other shares (test_share, validation_share)",
                 )
+        note.unlink(missing_ok=True)  # what is written from here on is another campaign's until all of it is there
         _write_dealt(references, folder / "learn.h5", learn, splits)
         write_selected(source, folder / "test.h5", selection=tried, split="test")
     with whole_file(note) as temporary:
@@ -235,17 +236,17 @@ def is_done(task: Task) -> bool:
     """Whether nothing of a task is left to do."""
     folder = Path(task["folder"])
     if task["kind"] == "start":
-        return bool(_read(folder / "start.json").get("key") == task["key"])
+        return bool(read_object(folder / "start.json").get("key") == task["key"])
     trial = _tried(task)
     if not trial:
         return False
-    return bool(trial["refused"]) or bool(_read(folder / "pod.json").get("key") == task["curve_key"])
+    return bool(trial["refused"]) or bool(read_object(folder / "pod.json").get("key") == task["curve_key"])
 
 
 def _tried(task: Task) -> dict[str, Any]:
     """What a setting's trial left, if it is this one's and its hit table is the one it wrote; else nothing."""
     folder = Path(task["folder"])
-    trial = _read(folder / "trial.json")
+    trial = read_object(folder / "trial.json")
     if trial.get("key") != task["key"]:
         return {}
     hits = folder / "hits.csv"
@@ -276,7 +277,7 @@ def run_task(task: Task, *, tell: Tell = lambda line: None) -> None:
         task = {**task, "device": choose_device(task["device"])}
         (_run_start if task["kind"] == "start" else _run_setting)(task, tell)
     seconds = Path(task["folder"]) / "seconds.json"
-    spent = _read(seconds).get("seconds", 0.0) + time.monotonic() - began
+    spent = read_object(seconds).get("seconds", 0.0) + time.monotonic() - began
     with whole_file(seconds) as temporary:
         temporary.write_text(json.dumps({"seconds": round(spent, 1)}) + "\n", encoding="utf-8")
 
@@ -299,18 +300,22 @@ def _run_start(task: Task, tell: Tell) -> None:
     else:
         own = _references_own(task)
     recipe = _recipe(training, clear)
-    first = folder / "first"
-    train_on_file(
-        clear,
-        first,
-        recipe=replace(recipe, steps=training["start_steps"], epochs=None),
-        networks=1,
-        seed=task["seed"],
-        device=task["device"],
-        tell=tell,
-        name="start",
-    )
-    chosen = first
+
+    def train(path: Path, chosen: "Recipe", steps: int, *, name: str, said: str, start: Path | None = None) -> Path:
+        train_on_file(
+            path,
+            folder / name,
+            recipe=replace(chosen, steps=steps, epochs=None),
+            networks=1,
+            seed=task["seed"],
+            start_from=start,
+            device=task["device"],
+            tell=tell,
+            name=said,
+        )
+        return folder / name
+
+    learnt = train(clear, recipe, training["start_steps"], name="first", said="start")
     if training["mixed_steps"] and training["start_shares"]:
         parts = []
         images = max(training["images"] // len(training["start_shares"]), _FEWEST_START_IMAGES)
@@ -322,24 +327,14 @@ def _run_start(task: Task, tell: Tell) -> None:
         if not mixed.exists():
             with ExitStack() as stack:
                 concatenate_datasets([stack.enter_context(read_dataset(part)) for part in parts], mixed)
-        chosen = folder / "mixed"
         later = recipe_for_fine_tuning(recipe)
-        train_on_file(
-            mixed,
-            chosen,
-            recipe=replace(later, steps=training["mixed_steps"], epochs=None),
-            networks=1,
-            seed=task["seed"],
-            start_from=first,
-            device=task["device"],
-            tell=tell,
-            name="start, noisier images",
-        )
+        steps = training["mixed_steps"]
+        learnt = train(mixed, later, steps, name="mixed", said="start, noisier images", start=learnt)
         _remove(*parts, mixed)
     if described:
         _remove(clear)
     with whole_file(folder / "start.json") as temporary:
-        temporary.write_bytes(canonical({"key": task["key"], "networks": chosen.name}))
+        temporary.write_bytes(canonical({"key": task["key"], "networks": learnt.name}))
 
 
 def _run_setting(task: Task, tell: Tell) -> None:
@@ -388,7 +383,7 @@ def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
     start = None
     if task["start"] is not None:
         recipe = recipe_for_fine_tuning(recipe)
-        start = Path(task["start"]) / _read(Path(task["start"]) / "start.json")["networks"]
+        start = Path(task["start"]) / read_object(Path(task["start"]) / "start.json")["networks"]
     networks = folder / "networks"
     train_on_file(
         train,
@@ -426,7 +421,7 @@ def _generate(
     source = Path(task["learn"] if part == "train" else task["test"])
     noted = path.with_suffix(".json")
     if path.exists() and noted.exists():
-        return tuple(_read(noted)["warnings"])
+        return tuple(read_object(noted)["warnings"])
     whole = path.with_name(f"{path.stem}_drawn.h5")
     summary: GenerationSummary
     if source.suffix.lower() == ".toml":
@@ -508,15 +503,6 @@ def _recipe(training: Mapping[str, Any], dataset: Path) -> "Recipe":
     with read_dataset(dataset) as images:
         smallest = min(images.shape)
     return replace(RECIPES[training["recipe"]], batch=training["batch"], crop_px=crop if 0 < crop < smallest else None)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """A JSON object, or nothing where there is none that can be read."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
 
 
 # ------------------------------------------------------------------------------------------------ a process of its own

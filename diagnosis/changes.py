@@ -91,6 +91,7 @@ ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube v
 LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
 LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
 GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
+GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
 POSITION_SD_PX = 0.15  # of a scene against its thickness maps
 REGISTERED_SD_PX = 0.02  # of what registration leaves of it
 SHARPNESS_FLOOR = 1.0  # of a scene's map probes at edges, in their own sds: rendering beyond all the nuisances

@@ -13,9 +13,10 @@ from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from ..generator.twin import Twin
-from .assemble import Problem, build_problem, can_show
+from .assemble import Problem, build_problem
 from .changes import DEFINED_SD, catalogue_variants
 from .coarse import UNSEEN, in_pixels
+from .forward_model import can_show
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, law_terms, weigh_hypotheses
 from .next_series import best_measurement, proposal_text
 from .plan import WORTH_IT, best_repeat, repeat_text
@@ -35,9 +36,20 @@ _OUTRIGHT_NODES = 800
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
-# of the gap's sum of squares: right explanations of twelve sessions had less than 0.001, off-focal radiation named glare
-# 0.27 to 0.42 in three
-_MOST_CONTRADICTED = 0.1
+# of the gap's sum of squares: right explanations of twelve sessions had less than 0.001, lost bits 0.103, off-focal radiation
+# named glare 0.27 to 0.42 in three
+_MOST_CONTRADICTED = 0.15
+# of all squares that an explanation may leave beyond what nuisances, laws and noise usually take: of sixty right ones one left
+# 0.09 and the others below 0.05, seams of tiles named gain map and bad pixels 0.13 to 0.16
+_MOST_UNFIT = 0.11
+_USUALLY_LEFT = 0.6  # of a probe's square where nothing is wrong: floors make it more than counting noise
+# what an effect does by chance, rms over what is expected: right gain maps and output drifts 0.4 to 0.8, tiles and their seams
+# named gain map 3.4 to 8.7
+_MOST_PULLED = 2.0
+# times the strength that the rest shows, which what it does by chance may have: slow and fast parts of a drift are not one law
+_LOOSELY_TIED = {"output_drift": 3.0}
+_LEAST_CHANCES = 5  # parts of what an effect does by chance that must show
+_LEAST_UNFIT = 0.1  # of the probes' number: what is usually left is no better known
 _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
 _UNSEEN = 3.0  # standard deviations of a probe
 STRAINED_FROM = 5.0  # prior standard deviations
@@ -268,6 +280,7 @@ def judge(
             loose=_LOOSE,
             chance=_SHARP_CHANCE if problem.base.noise.psf_sigma_px.value < SHARP_PX else _CHANCE,
             elsewhere=elsewhere,
+            places=problem.places,
         )
 
     whitened = whitening.curves(problem.curves)
@@ -280,6 +293,7 @@ def judge(
         residual=residual,
         nuisances=shared,
         groups=problem.groups,
+        places=problem.places,
         respond=problem.respond,
         whitener=whitening,
     )
@@ -322,7 +336,11 @@ def judge(
             verdict = "explained"
     tell("held-out data")
     gap, held_out, shares = _held_out(problem, leading, rng)
-    if leading.effects and leading.effects != (UNKNOWN,) and _leaves_too_much(gap, _plausible(leading)):
+    if (
+        leading.effects
+        and leading.effects != (UNKNOWN,)
+        and (_leaves_too_much(gap, _plausible(leading)) or _misfit(problem, leading).refused)
+    ):
         # the best of the wrong ones
         verdict = "unknown_effect"
         moved = _VETO * (1.0 - none - unknown)
@@ -518,6 +536,56 @@ def _leaves_too_much(gap: Gap, plausible: bool) -> bool:
         return True
     left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
     return left > _MOST_LEFT and (not plausible or gap.left is None or gap.left > _MOST_LEFT_TYPICALLY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Misfit:
+    """What speaks against an explanation on all probes.
+
+    Fields: left: squares beyond what nuisances, laws and noise usually take, over those that there were; pulled: what effects do
+    by chance, rms over what is expected of it, the largest of the effects.
+    """
+
+    left: float
+    pulled: float
+
+    @property
+    def refused(self) -> bool:
+        """Whether it is too much for an explanation."""
+        return self.left > _MOST_UNFIT or self.pulled > _MOST_PULLED
+
+
+def _misfit(problem: Problem, leading: Hypothesis) -> _Misfit:
+    """How an explanation with the strengths that fit all probes best leaves them."""
+    residual, factors, own = problem.residual, [problem.factors], np.ones(len(problem.residual))
+    width = problem.factors.shape[1]
+    chances: list[slice] = []
+    for effect in leading.effects:
+        curve, strength = leading.variants[effect], leading.strengths[effect][0]
+        residual = residual - curve.response(strength)
+        of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
+        if curve.jitter is not None:
+            own = own + strength**2 * curve.jitter
+        if curve.spread is not None:
+            factors.append(strength * _LOOSELY_TIED.get(effect, 1.0) * curve.spread)
+            chances.append(slice(width, width + curve.spread.shape[1]))
+            width += curve.spread.shape[1]
+        factors.append(of_law)
+        width += of_law.shape[1]
+        own = own + of_probe
+    root = np.sqrt(own)
+    allowed = Nuisances(np.concatenate(factors, axis=1) / root[:, None])
+    # what nuisances and laws are pulled by counts as well
+    beyond = float(residual / root @ allowed.solve(residual / root)) - _USUALLY_LEFT * len(residual)
+    there = float(problem.residual @ Nuisances(problem.factors).solve(problem.residual))
+    left = beyond / max(there, 1e-12) if beyond > _LEAST_UNFIT * len(residual) else 0.0
+    found, known = allowed.fitted(residual / root), 1.0 - allowed.variance
+    pulled = [
+        math.sqrt(float(np.sum(found[chance][seen] ** 2) / np.sum(known[chance][seen])))
+        for chance in chances
+        if np.count_nonzero(seen := known[chance] > 0.5) >= _LEAST_CHANCES
+    ]
+    return _Misfit(left=left, pulled=max(pulled, default=0.0))
 
 
 def _with_doubt(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
@@ -742,7 +810,9 @@ def _strengths_on(
                 jitter=None if curve.jitter is None else curve.jitter[fit],
                 exact=None if curve.exact is None else curve.exact[fit],
             )
-            result = fit_curve((problem.residual - others)[fit], part, inner, problem.groups[fit])
+            result = fit_curve(
+                (problem.residual - others)[fit], part, inner, problem.groups[fit], places=problem.places[fit]
+            )
             strengths[effect] = result.best
     return strengths
 

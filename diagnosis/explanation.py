@@ -10,6 +10,9 @@ from .diagnose import Cause, Diagnosis, Place
 _NAMED_DOUBTS = 3
 _NAMED_STRAINED = 3
 _NAMED_UNTESTED = 8
+_NAMED_FAMILIES = 4
+_SHAPED_LIKE = "like "  # templates of what effects would do
+_KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
 _AXIS_WORDS = {
     "level": "brightness",
     "noise": "noise",
@@ -42,7 +45,36 @@ def strength_text(cause: Cause) -> str:
 
 def _place_text(place: Place) -> str:
     what = place.statistic if not place.location else f"{place.statistic}, {place.location}"
+    if place.location.startswith(_SHAPED_LIKE):
+        effect = place.location.removeprefix(_SHAPED_LIKE).split(" ")[0]
+        what = f"{place.statistic}, in the shape of: {title_of(effect)}"
     return f"{_AXIS_WORDS.get(place.axis, place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
+
+
+def _family_text(axis: str, kind: str, scene: str) -> str:
+    """One axis of a kind of series, or of those of a scene."""
+    return f"{_AXIS_WORDS.get(axis, axis)} of {scene or _KIND_WORDS.get(kind, kind)}"
+
+
+def _signature_text(diagnosis: Diagnosis) -> str:
+    """Where an effect outside the catalogue is seen most, and its largest departures, one a kind of series and axis."""
+    series = {view.session.name: view.session.series for view in diagnosis.problem.views}
+    largest: dict[str, float] = {}
+    for place in diagnosis.where:
+        # objects of all scenes together: a signature is not one product's
+        kind = series[place.series].kind if place.series in series else ""
+        family = _family_text(place.axis, kind, "" if kind else place.series)
+        if abs(place.z) > abs(largest.get(family, 0.0)):
+            largest[family] = place.z
+    text = ""
+    axis, _, where = diagnosis.unknown_location.partition(" of ")
+    if where:
+        kind, _, scene = where.partition(" ")
+        text = f" It is seen most in the {_family_text(axis, kind, scene)}."
+    if largest:
+        shown = sorted(largest.items(), key=lambda item: -abs(item[1]))[:_NAMED_FAMILIES]
+        text += f" Its signature: {'; '.join(f'{family} (z {z:+.0f})' for family, z in shown)}."
+    return text
 
 
 def _where_text(places: Sequence[Place]) -> str:
@@ -110,8 +142,8 @@ def _verdict_text(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "unknown_effect":
         return (
             f"{where} No effect of the catalogue, and no pair of them, explains it (probability"
-            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue), seen in the"
-            f" {diagnosis.unknown_location}. {figures}."
+            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue).{_signature_text(diagnosis)}"
+            f" {figures}."
         )
     if diagnosis.verdict == "ambiguous":
         named = ", ".join(f"{title_of(cause.effect)} ({cause.probability:.2f})" for cause in diagnosis.causes[:5])

@@ -41,7 +41,7 @@ APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
 _TIMES_SEEN = (
-    3.0  # what a law predicts in a group over what is seen there, up to which it may be off by a share of itself
+    1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
 )
 _MOVES = 0.3  # standard deviations of a probe by which an effect is said to move it
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
@@ -180,6 +180,14 @@ class Nuisances:
 
         return np.asarray(cho_solve((self._cholesky, True), self.factors.T @ vector))
 
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """Variance (factor,) of nuisances once the probes are seen, prior variance 1."""
+        from scipy.linalg import solve_triangular
+
+        half = solve_triangular(self._cholesky, np.eye(len(self._cholesky)), lower=True)
+        return np.asarray(np.sum(half**2, axis=0))
+
     def predicted_sd(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviations (probe,) of other probes with these factors, once the nuisances are fitted on the own ones."""
         from scipy.linalg import solve_triangular
@@ -287,13 +295,16 @@ def fit_curve(
     nuisances: Nuisances,
     groups: NDArray[np.intp],
     *,
+    places: NDArray[np.intp] | None = None,
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
 ) -> CurveFit:
     """Evidence of one curve over none, its strength integrated over the log-uniform plausible range.
 
     The law's inaccuracy is a random factor a group and a part of each probe's own, both in proportion to what the
-    nuisances leave of the response at the best strength (found in rounds).
+    nuisances leave of the response at the best strength (found in rounds) and to what is seen in each of `places` (groups
+    where absent).
     """
+    places = groups if places is None else places
     if curve.by_chance_alone:
         return _fit_chance(residual, curve, nuisances)
     nodes = curve.responses
@@ -327,7 +338,7 @@ def fit_curve(
     for law_error, share in law_errors:
         best = start
         for _ in range(3):
-            effective = _credible(curve.weights(np.array([best]))[0] @ solved, seen, groups)
+            effective = _credible(curve.weights(np.array([best]))[0] @ solved, seen, places)
             extra = _law_factors(curve, best, effective, groups, law_error)
             own = _own_variance(curve, best, effective, law_error)
             if extra.shape[1] == 0 and float(own.max()) < _LEAST_FACTOR:
@@ -386,16 +397,16 @@ def _fit_chance(residual: NDArray[np.float64], curve: Curve, nuisances: Nuisance
 
 
 def _credible(
-    response: NDArray[np.float64], seen: NDArray[np.float64], groups: NDArray[np.intp]
+    response: NDArray[np.float64], seen: NDArray[np.float64], places: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """The part of a response (probe,) that its law's inaccuracy is a share of: in each group no more than `_TIMES_SEEN` what is seen.
+    """The part of a response (probe,) that its law's inaccuracy is a share of: in each place no more than `_TIMES_SEEN` what is seen.
 
     A law that predicts thousands of standard deviations where nothing is seen is wrong by all of them, not off by a share.
     """
-    predicted = np.bincount(groups, weights=response**2)
-    found = np.bincount(groups, weights=np.maximum(seen**2, 1.0))
+    predicted = np.bincount(places, weights=response**2)
+    found = np.bincount(places, weights=np.maximum(seen**2, 1.0))
     share = np.sqrt(np.minimum(1.0, _TIMES_SEEN**2 * found / np.maximum(predicted, 1e-12)))
-    return np.asarray(response * share[groups])
+    return np.asarray(response * share[places])
 
 
 def _law_factors(
@@ -447,10 +458,12 @@ def widened_for(
     nuisances: Nuisances,
     groups: NDArray[np.intp],
     law_error: float,
+    *,
+    places: NDArray[np.intp] | None = None,
 ) -> Widened:
     """What may vary beside a curve at a strength whose law may be off by law_error; residual (probe,) is what is seen."""
     effective = curve.weights(np.array([strength]))[0] @ nuisances.solve_all(curve.responses)
-    effective = _credible(effective, nuisances.solve(residual), groups)
+    effective = _credible(effective, nuisances.solve(residual), groups if places is None else places)
     return _widened(
         nuisances,
         _law_factors(curve, strength, effective, groups, law_error),
@@ -563,6 +576,7 @@ def weigh_hypotheses(
     loose: Collection[str] = (),
     chance: Mapping[str, float] | None = None,
     elsewhere: Mapping[str, NDArray[np.bool_]] | None = None,
+    places: NDArray[np.intp] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -580,9 +594,12 @@ def weigh_hypotheses(
         loose: effects whose law leaves something where it predicts nothing: a second effect beside them is doubted in full.
         elsewhere: effect -> probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is
             not doubted.
+        places: place of each probe (probe,), within which a law is off by a share of no more than what is seen there; the
+            groups where absent.
     """
     priors, chance, elsewhere = priors or Priors(), chance or {}, elsewhere or {}
-    fits = [fit_curve(residual, curve, nuisances, groups, law_errors=law_errors) for curve in curves]
+    places = groups if places is None else places
+    fits = [fit_curve(residual, curve, nuisances, groups, places=places, law_errors=law_errors) for curve in curves]
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
         by_effect.setdefault(fit.curve.effect, []).append(fit)
@@ -615,7 +632,7 @@ def weigh_hypotheses(
     for first in ranked[:pairs_from]:
         # the second is looked for in what the first leaves, over all its variants
         leading = singles[first]
-        states = _states_of(leading, residual, nuisances, groups, law_errors, table)
+        states = _states_of(leading, residual, nuisances, groups, places, law_errors, table)
         for second, second_fits in by_effect.items():
             key = (min(first, second), max(first, second))
             if second == first or key in done:
@@ -625,7 +642,7 @@ def weigh_hypotheses(
             # the first's own variants were averaged above; its best stands for them
             starts.append((evidence_of[first] - leading.log_evidence, first, second, start))
     overlaps = _overlaps([start for *_, start in starts], evidence_of, nuisances, table)
-    apart = _Apart(residual, nuisances, groups, law_errors)
+    apart = _Apart(residual, nuisances, groups, places, law_errors)
 
     def doubted(number: int, evidence: float) -> float:
         """Evidence of a pair less what the first's law may have left of it for the second to take up."""
@@ -645,7 +662,7 @@ def weigh_hypotheses(
     for rank, number in enumerate(sorted(range(len(starts)), key=lambda number: -ahead[number])):
         more, first, second, start = starts[number]
         errors = law_errors if rank < _PAIRS_IN_FULL else ()
-        evidence, strengths, chosen = _finish_pair(residual, start, nuisances, groups, errors, table=table)
+        evidence, strengths, chosen = _finish_pair(residual, start, nuisances, groups, places, errors, table=table)
         key = (min(first, second), max(first, second))
         raw.append((key, doubted(number, evidence + more), math.log(priors.pair / n_pairs), strengths, chosen, ""))
     parts = groups if unknown_groups is None else unknown_groups
@@ -685,11 +702,13 @@ class _Apart:
         residual: NDArray[np.float64],
         nuisances: Nuisances,
         groups: NDArray[np.intp],
+        places: NDArray[np.intp],
         law_errors: Sequence[tuple[float, float]],
     ) -> None:
         self._residual = residual
         self._nuisances = nuisances
         self._groups = groups
+        self._places = places
         self._law_errors = law_errors
         self._within: dict[bytes, Nuisances] = {}
         self._found: dict[tuple[bytes, str], float] = {}
@@ -712,6 +731,7 @@ class _Apart:
                 _of_probes(fit.curve, part),
                 nuisances,
                 self._groups[part],
+                places=self._places[part],
                 law_errors=self._law_errors,
             ).log_evidence
             for fit in fits
@@ -760,6 +780,7 @@ def _states_of(
     residual: NDArray[np.float64],
     nuisances: Nuisances,
     groups: NDArray[np.intp],
+    places: NDArray[np.intp],
     law_errors: Sequence[tuple[float, float]],
     table: _NodeTable,
 ) -> list[_State]:
@@ -771,7 +792,7 @@ def _states_of(
     result = [state(nuisances, table.nodes, residual, 0.0)]
     curve = leading.curve
     effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
-    effective = _credible(effective, nuisances.solve(residual), groups)
+    effective = _credible(effective, nuisances.solve(residual), places)
     for law_error, probability in law_errors:
         extra = _law_factors(curve, leading.best, effective, groups, law_error)
         own = _own_variance(curve, leading.best, effective, law_error)
@@ -838,6 +859,7 @@ def _finish_pair(
     pair: _PairStart,
     nuisances: Nuisances,
     groups: NDArray[np.intp],
+    places: NDArray[np.intp],
     law_errors: Sequence[tuple[float, float]],
     *,
     table: _NodeTable,
@@ -856,8 +878,8 @@ def _finish_pair(
         for law_error, probability in law_errors:
             start = grid.best
             for _ in range(2):
-                effective_a = _credible(a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)], seen, groups)
-                effective_b = _credible(b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :], seen, groups)
+                effective_a = _credible(a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)], seen, places)
+                effective_b = _credible(b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :], seen, places)
                 extra = np.concatenate(
                     [
                         _law_factors(a, start[0], effective_a, groups, law_error),

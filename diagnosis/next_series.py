@@ -329,7 +329,9 @@ def best_measurement(
             begin_s = max(view.session.request.start_s for view in problem.views) + _LATER_S
             members = _write(path, line, planned, begin_s, rng)
             with open_acquisition(path) as acquisition:
-                taken = build_problem(acquisition, problem.base, variants=asked, calibrated_elsewhere=True).released()
+                taken = build_problem(
+                    acquisition, problem.base, variants=asked, calibrated_elsewhere=True, side=problem.side
+                ).released()
     except RaytwinError:
         return None  # the twin cannot draw them: a repeat or the table of what isolates effects is named instead
     now = _separation(problem, None, np.zeros(0, dtype=np.intp), first, second)

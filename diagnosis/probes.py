@@ -17,17 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.series import ExpectedSeries
+from .fixed_pattern import Pattern
+from .noise_correlation import autocovariance, correlation_sum
 from .registration import gradient
 from .summaries import BLOCK_PX, LAGS, SeriesSummary
 
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
-OUTLIER_SD = 7.0
 _LEAST_FREEDOM = 5.0  # of a variance whose logarithm is still near enough a Gaussian number
 _LEAST_OUTLIERS, _LEAST_FRAMES = 5, 6  # pixels, and frames of each, that show what lasts from frame to frame
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
+FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
 # what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
@@ -46,6 +48,7 @@ FLOORS: Mapping[str, float] = {
     "codes": 0.03,
     "fixed_pattern": 0.025,  # of the value, as for its blocks
     "fixed_pattern blocks": 0.5,  # a pattern's grain is its own: white in the model, coarser in some panels
+    "fixed_pattern lines": 0.1,
     "outliers": 0.3,
     "memory of outliers": 0.02,
 }
@@ -81,32 +84,6 @@ class ProbeName:
     statistic: str
     location: str
     unit: str
-
-
-def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:
-    """Correlation of the quantum part at a lag; 0 beyond what the model gives."""
-    table = expected.noise_autocovariance
-    r, c = abs(dr), abs(dc)
-    return float(table[r, c]) if r < table.shape[0] and c < table.shape[1] else 0.0
-
-
-def correlation_sum(expected: ExpectedSeries, rows: int, columns: int) -> float:
-    """Sum of the quantum part's correlations over lags with triangular weights of a rows x columns block."""
-    table = expected.noise_autocovariance
-    return _correlation_sum(table.tobytes(), table.shape, rows, columns)
-
-
-@lru_cache(maxsize=512)
-def _correlation_sum(table: bytes, shape: tuple[int, int], rows: int, columns: int) -> float:
-    lags = np.frombuffer(table).reshape(shape)
-    return float(_triangle(rows, shape[0]) @ lags @ _triangle(columns, shape[1]))
-
-
-@lru_cache(maxsize=64)
-def _triangle(length: int, lags: int) -> NDArray[np.float64]:
-    """Weights (lags,) of lags to both sides in the variance of a sum of `length` neighbours, over that of one."""
-    lag = np.arange(lags)
-    return np.asarray(np.where(lag == 0, 1.0, 2.0 * np.maximum(1.0 - lag / length, 0.0)))
 
 
 def _lag_loss(expected: ExpectedSeries) -> float:
@@ -168,11 +145,12 @@ class ScalarContext:
     """What scalar probes of a series refer to; the same for measured frames and forward model.
 
     Fields: kind; frames; good (row, column); labels (row, column); label_names; reference_signal_DN: mean signal of the
-    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise_DN2,
-    block_noise_DN2: of the corrected mean frame from pixel to pixel and of block means; quantum_DN2: the base model's quantum
-    variance of one frame; dark_DN: the base model's mean dark;
-    counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere;
-    areas: the good pixels label by label.
+    base model (1 for darks); previous_signal_DN: of the exposure before an afterglow; calibrates; codes_usable; pattern_noise: what
+    noise alone leaves of a pattern in the corrected mean frame; quantum_DN2: the base model's quantum variance of one frame;
+    dark_DN: the base model's mean dark;
+    counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
+    of the panel's pixels in these frames, None where all are alike; areas: the good pixels label by label; label_gain
+    (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
     kind: str
@@ -184,15 +162,22 @@ class ScalarContext:
     previous_signal_DN: float | None
     calibrates: bool
     codes_usable: bool
-    pattern_noise_DN2: float
-    block_noise_DN2: float
+    pattern_noise: Pattern
     quantum_DN2: float
     dark_DN: float
     counts_all_outliers: bool
+    gain: NDArray[np.floating] | None = None
     areas: "Areas" = field(init=False)
+    label_gain: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "areas", Areas.of(self.good, self.labels, len(self.label_names)))
+        areas = Areas.of(self.good, self.labels, len(self.label_names))
+        label_gain = np.ones(len(self.label_names))
+        if self.gain is not None:
+            whole, parts = areas.means(np.asarray(self.gain, dtype=np.float64) ** 2)
+            label_gain = np.where(parts > 0.0, parts, whole) / whole
+        object.__setattr__(self, "areas", areas)
+        object.__setattr__(self, "label_gain", label_gain)
 
 
 @lru_cache(maxsize=64)
@@ -240,7 +225,8 @@ def expected_scalars(
         correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
         lines = [(row if dr == 0 else 0.0) + (column if dc == 0 else 0.0) for dr, dc in LAGS]
         for label, name in enumerate(context.label_names):
-            q, w = float(label_q[label]) * keep, float(label_w[label])
+            # an area whose pixels are brighter than others by their gain is noisier by its square
+            q, w = float(label_q[label] * context.label_gain[label]) * keep, float(label_w[label])
             shared = moving.pixels(label)
             here = max(q + w + row + column + shared, _LEAST_DN2)
             variance_name, correlation_names = _noise_names(name)
@@ -308,18 +294,29 @@ def expected_scalars(
         added = (mean_q - context.quantum_DN2) / context.frames
         neighbours = 1.0 - autocovariance(expected, 0, 1)
         lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
-        values["fixed_pattern"] = math.sqrt(max(1.0 + (pattern + added * neighbours) / context.pattern_noise_DN2, 1e-3))
-        values["fixed_pattern blocks"] = math.sqrt(
-            max(1.0 + (pattern + lasting) / BLOCK_PX**2 / context.block_noise_DN2, 1e-3)
-        )
+        noise = context.pattern_noise
+        values["fixed_pattern"] = math.sqrt(max(1.0 + (pattern + added * neighbours) / noise.pixel_DN2, 1e-3))
+        if noise.blocks_DN2 is not None:
+            values["fixed_pattern blocks"] = math.sqrt(
+                max(1.0 + (pattern + lasting) / BLOCK_PX**2 / noise.blocks_DN2, 1e-3)
+            )
+        if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
+            # a pattern is no more alike along a line than across it; lines that change leave their mean
+            for name, noise_DN2, line, length in (
+                (FIXED_ROWS, noise.rows_DN2, row, columns),
+                (FIXED_COLUMNS, noise.columns_DN2, column, rows),
+            ):
+                values[name] = 0.5 * math.log(
+                    max(1.0 + ((pattern + added) / length + line / context.frames) / noise_DN2, 1e-3)
+                )
         # about half of the hot ones are lost in a flat's light
         hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
         seen = hot if context.kind == "dark" else bad - 0.5 * hot
         values["outliers"] = math.sqrt(seen * n_good + 0.375)
-        if context.counts_all_outliers:
-            values["outliers in any series"] = math.sqrt(bad * n_good + 0.375)
         # what bad pixels add is new in every frame
         values["memory of outliers"] = 0.0
+    if context.counts_all_outliers:
+        values["outliers in any series"] = math.sqrt(expected.bad_pixel_share * n_good + 0.375)
     return values
 
 
@@ -417,8 +414,7 @@ def measured_scalars(
     context: ScalarContext,
     *,
     dark_mean_DN: float,
-    fixed_pattern_DN2: float | None,
-    block_pattern_DN2: float | None,
+    pattern: Pattern | None,
     outliers: int | None,
     all_outliers: int,
     memory: tuple[float, int] | None,
@@ -549,26 +545,34 @@ def measured_scalars(
             axis="tails", name="codes", unit="DN", value=step_DN, sd=FLOORS["codes"] * step_DN, sampling_sd=0.0
         )
         result.append(codes)
-    if fixed_pattern_DN2 is not None and not context.calibrates:
+    if pattern is not None and not context.calibrates:
         # in units of the noise: a pattern's rms, which is what a strength means
-        for name, pattern_DN2, noise, freedom in (
-            ("fixed_pattern", fixed_pattern_DN2, context.pattern_noise_DN2, n_good),
-            ("fixed_pattern blocks", block_pattern_DN2, context.block_noise_DN2, n_good / BLOCK_PX**2),
+        expected = context.pattern_noise
+        for name, found_DN2, noise_DN2, freedom in (
+            ("fixed_pattern", pattern.pixel_DN2, expected.pixel_DN2, n_good),
+            ("fixed_pattern blocks", pattern.blocks_DN2, expected.blocks_DN2, n_good / BLOCK_PX**2),
         ):
-            if pattern_DN2 is not None:
-                value = math.sqrt(max(pattern_DN2, 1e-12) / noise)
+            if found_DN2 is not None and noise_DN2 is not None:
+                value = math.sqrt(max(found_DN2, 1e-12) / noise_DN2)
                 sampling = value * math.sqrt(0.75 / freedom)
                 sd = value * math.hypot(math.sqrt(0.75 / freedom), FLOORS[name])
-                pattern = Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling)
-                result.append(pattern)
+                result.append(Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling))
+        # lines may stand out a hundredfold: logarithms; second differences share lines
+        for name, found_DN2, noise_DN2, lines in (
+            (FIXED_ROWS, pattern.rows_DN2, expected.rows_DN2, rows),
+            (FIXED_COLUMNS, pattern.columns_DN2, expected.columns_DN2, columns),
+        ):
+            if found_DN2 is not None and noise_DN2 is not None:
+                value = 0.5 * math.log(max(found_DN2, 1e-12) / noise_DN2)
+                add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
     if outliers is not None and not context.calibrates:
         add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and frames >= _LEAST_FRAMES:
             share, count = memory
             add("tails", "memory of outliers", "1", share, math.sqrt(1.6 / (frames * count)), "memory of outliers")
-        if context.counts_all_outliers:
-            counted = math.sqrt(all_outliers + 0.375)
-            add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")
+    if context.counts_all_outliers:
+        counted = math.sqrt(all_outliers + 0.375)
+        add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")
     return result
 
 

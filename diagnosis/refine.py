@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from ..generator.effects.effect import Parameter
 from .changes import KEPT_AS_THEY_ARE, Variant
-from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, fit_curve, widened_for
+from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Widened, fit_curve, widened_for
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
-_REACH, _REACH_CHANCE = (
-    0.6,
-    30.0,
-)  # share of the best evidence from which an effect is refined, and log evidence below that
+_REACH = 0.6  # share of the best evidence from which an effect is refined
+_REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _STARTS = 2
@@ -56,6 +54,7 @@ def refine(
     groups: NDArray[np.intp],
     respond: Responder,
     whitener: Whitener,
+    places: NDArray[np.intp] | None = None,
 ) -> list[tuple[Variant, NDArray[np.float64]]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
 
@@ -63,7 +62,7 @@ def refine(
         hypotheses: of the first weighing, with whitened curves.
         variants: of the grid, by effect and name.
         curves: of the grid, whitened.
-        residual, nuisances, groups: whitened, as weighed.
+        residual, nuisances, groups, places: whitened, as weighed.
         respond: asks the forward model.
         whitener: of responses.
     """
@@ -74,7 +73,7 @@ def refine(
             if effect in done or len(done) >= _MOST_EFFECTS:
                 continue
             done.add(effect)
-            seen = _Seen(residual=residual, nuisances=nuisances, groups=groups, whitener=whitener)
+            seen = _Seen(residual=residual, nuisances=nuisances, groups=groups, places=places, whitener=whitener)
             for other in hypothesis.effects:
                 if other != effect:
                     seen = seen.beside(hypothesis.variants[other], hypothesis.strengths[other][0])
@@ -93,7 +92,7 @@ def refine(
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best known effect or pair, and those that refinement could bring past it, best first.
 
-    On forty sessions refinement added up to 22 % to the evidence of a leading effect and up to 7 % where it was above 1000;
+    On forty sessions refinement added up to 22 % to the evidence of a leading effect and up to 11 % where it was above 1000;
     no effect with less than nine tenths of the leading one's came near it.
     """
     known = sorted(
@@ -120,22 +119,27 @@ def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 class _Seen:
     """What one effect is fitted to: the residual less what others explain, in units of what their laws leave uncertain.
 
-    Fields: residual (probe,), nuisances and groups as weighed; whitener of responses; root (probe,): standard deviations of
+    Fields: residual (probe,), nuisances, groups and places as weighed; whitener of responses; root (probe,): standard deviations of
     the probes, in whitened ones (None: 1).
     """
 
     residual: NDArray[np.float64]
     nuisances: Nuisances
     groups: NDArray[np.intp]
+    places: NDArray[np.intp] | None
     whitener: Whitener
     root: NDArray[np.float64] | None = None
 
     def beside(self, curve: Curve, strength: float) -> "_Seen":
         """The same once another effect stands at a strength, its law off by _LAW_ERROR."""
-        found = widened_for(self.residual, curve, strength, self.nuisances, self.groups, _LAW_ERROR)
+        found = self.widened(curve, strength)
         root = found.root if self.root is None else self.root * found.root
         rest = (self.residual - curve.response(strength)) / found.root
         return replace(self, residual=rest, nuisances=found.nuisances, root=root)
+
+    def widened(self, curve: Curve, strength: float) -> Widened:
+        """What may vary beside a curve at a strength, its law off by _LAW_ERROR."""
+        return widened_for(self.residual, curve, strength, self.nuisances, self.groups, _LAW_ERROR, places=self.places)
 
     def scaled(self, curve: Curve) -> Curve:
         """A whitened curve in these units."""
@@ -156,7 +160,11 @@ class _Seen:
 
     def fit(self, curve: Curve) -> CurveFit:
         """A whitened curve, fitted."""
-        return fit_curve(self.residual, self.scaled(curve), self.nuisances, self.groups)
+        return self.fit_scaled(self.scaled(curve))
+
+    def fit_scaled(self, curve: Curve) -> CurveFit:
+        """A curve in these units, fitted."""
+        return fit_curve(self.residual, curve, self.nuisances, self.groups, places=self.places)
 
 
 def _starts_of(fits: Sequence[CurveFit]) -> list[CurveFit]:
@@ -193,14 +201,11 @@ def _refined(
         like = fit.curve
         return item.curve(seen.apply(responses), spread=like.spread, jitter=like.jitter, exact=like.exact)
 
-    def fitted(curve: Curve) -> CurveFit:
-        return fit_curve(seen.residual, curve, seen.nuisances, seen.groups)
-
     def tried(item: Variant) -> CurveFit | None:
         answer = respond([item])
         if 0 not in answer:
             return None
-        return fitted(curve_of(item, answer[0]))
+        return seen.fit_scaled(curve_of(item, answer[0]))
 
     inner = [
         item for item in variant.fitted if item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
@@ -230,7 +235,7 @@ def _refined(
             return None
         # a response that saturates is known near its nodes only: they are laid where the strength turns out to be
         curve = curve_of(final, answer[0])
-        found = min(max(fitted(curve).best, variant.low), variant.high)
+        found = min(max(seen.fit_scaled(curve).best, variant.low), variant.high)
         if abs(math.log(found / strength)) < _CENTRED:
             break
         strength = found
@@ -259,7 +264,7 @@ def _newton(
     answer = respond(asked)
     rows = [at] + [(seen.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
     kept = [inner[number].name for number in sorted(answer)]
-    found = widened_for(seen.residual, here.curve, strength, seen.nuisances, seen.groups, _LAW_ERROR)
+    found = seen.widened(here.curve, strength)
     left, slopes, wide = (seen.residual - at) / found.root, np.stack(rows) / found.root, found.nuisances
     normal = wide.inner(slopes, slopes)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0

@@ -141,12 +141,14 @@ def register(
         placement = _placement(current, covariance)
         normal, right = precision.copy(), precision @ current
         for image, model, noise, design, doubtful in zip(splines, models, variance, slopes, doubts, strict=True):
-            apart = _resampled(image, placement) - model
+            picture = _resampled(image, placement)
             doubt = doubtful * caution**2
             weight = share / (noise + doubt)[inner]
             level = model[inner]
-            residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
             level_weight = float((level * weight) @ level) + 1e-30
+            # a brighter beam is no light that strays: smoothed, what it leaves at an edge would look like a displacement
+            apart = picture - float((level * weight) @ picture[inner]) / level_weight * model
+            residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
             cross = (design * weight) @ level
             normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
             right += (design * weight) @ residual - cross * float((level * weight) @ residual) / level_weight
@@ -186,7 +188,7 @@ def register_drawn(
     inner = mask.copy()
     for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
         edge[...] = False
-    images = [np.asarray(image, dtype=np.float64) for image in measured]
+    images = [fill(image, mask) for image in measured]
 
     models = draw((0.0, 0.0))
     # every pixel alike: with the noise of the shadow, or with edges taken as doubtful, a blur that the twin does not know
@@ -213,7 +215,7 @@ def register_drawn(
     while True:
         around = [(cell[0] + row, cell[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
         best = min((one for one in around if max(map(abs, one)) <= most), key=left)
-        if left(best) >= _WORTH_A_CELL * left(cell):
+        if not left(best) < _WORTH_A_CELL * left(cell):
             break
         cell = best
     current = np.array(cell) / FINE
@@ -269,10 +271,13 @@ class _LeftOver:
     ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
         """Residual and level (pixel,) and weight of each image, the level fitted."""
         for image, model, weight, away in zip(self.images, models, self.weights, self.away, strict=True):
-            apart = np.asarray(image - model, dtype=np.float64)
-            residual = (apart - _stray(apart, away))[self.inner]
             level = np.asarray(model, dtype=np.float64)[self.inner]
-            share = float(level @ residual) / (float(level @ level) + 1e-30)
+            power = float(level @ level) + 1e-30
+            # the level first, as in `register`
+            brighter = float(level @ image[self.inner]) / power
+            apart = np.asarray(image - brighter * model, dtype=np.float64)
+            residual = (apart - _stray(apart, away))[self.inner]
+            share = float(level @ residual) / power
             yield residual - share * level, level, weight
 
     def of(self, models: Sequence[NDArray[np.floating]]) -> float:

@@ -184,8 +184,9 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
                 interval_ms = 1000.0 * float(np.median(np.diff(item.time_s)))
             clock = float(item.time_s[-1]) + interval_ms / 1000.0
         else:
-            start = clock
-            clock += item.n_frames * interval_ms / 1000.0 + _GAP_S
+            # beam-off frames follow straight after the exposure
+            start = clock if item.kind == "afterglow" or not result else clock + _GAP_S
+            clock = start + item.n_frames * interval_ms / 1000.0
         scene = acquisition.scenes.get(item.scene) if item.scene else None
         thickness: dict[str, NDArray[np.float32]] | None = None
         if scene is not None and len(scene.thickness_mm):

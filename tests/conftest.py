@@ -193,3 +193,58 @@ def make_model_twin():
         return replace(bare, levels=tuple(levels))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def make_sweep_line(make_model_twin):
+    """Called with a folder: writes into it twin.h5, of 64 x 64 pixels and 90 W, products.toml that describes small fillets
+    with ribs, and references.h5, 20 images of such that the line itself would show in 1 s, not dealt out. Returns the folder.
+    """
+    from raytwin.acquisition import read_dataset
+    from raytwin.acquisition.dataset_io import write_selected
+    from raytwin.acquisition.setting import setting_from_text
+    from raytwin.generator.describe import read_description
+    from raytwin.generator.generate_described import generate_from_description
+    from raytwin.generator.twin_io import write_twin
+
+    products = """
+[[product]]
+shape = "fillet"
+material = "chicken_breast"
+length_mm = [22, 26]
+width_mm = [15, 18]
+height_mm = [8, 14]
+[[foreign_object]]
+name = "rib"
+shape = "rod"
+material = "rib_bone"
+length_mm = [3, 6]
+diameter_mm = [1, 3]
+[images]
+with_foreign_object = 0.7
+products = 8
+"""
+
+    def make(folder):
+        twin = make_model_twin(
+            (64, 64),
+            pixel_mm=0.45,
+            source_object_mm=2970.0,
+            source_detector_mm=3177.0,
+            readout_ms=2.0,
+            maximum_power_w=90.0,
+        )
+        write_twin(folder / "twin.h5", twin)
+        (folder / "products.toml").write_text(products)
+        low, high = (
+            setting_from_text(f"kv={kV},power_w={power_W},exposure_ms=100,filter=Cu:0.05,averaged=10")
+            for kV, power_W in ((40, 40), (90, 45))
+        )
+        description, drawn = read_description(folder / "products.toml"), folder / "drawn.h5"
+        generate_from_description(twin, description, drawn, low=low, high=high, images=20, seed=5, with_counts=False)
+        with read_dataset(drawn) as dataset:
+            write_selected(dataset, folder / "references.h5", selection=slice(None), split="train")
+        drawn.unlink()
+        return folder
+
+    return make

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytwin.campaign._children import ChildError, Children, KilledError
 from raytwin.campaign.blind_cases import (
     SETS,
     case_from_label,
@@ -23,6 +24,7 @@ from raytwin.campaign.blind_cases import (
 )
 from raytwin.campaign.blind_check import (
     BlindOptions,
+    Processes,
     Work,
     answer_path,
     begin_check,
@@ -385,13 +387,13 @@ def test_a_failed_case_is_recorded_and_counted_against_us(tmp_path):
     def judge(path, without, features_only):
         shown = json.loads(path.read_text(encoding="utf-8"))
         if shown["strange"] > 1.0:
-            raise RuntimeError("blind_judge was ended by SIGKILL")
+            raise RuntimeError("blind_judge: ended by SIGKILL")
         return fake_judge(path, without, features_only)
 
     _, check = checked(folder, options, Work(measure=fake_measure, judge=judge))
     failed = [answer for answer in check.answers if answer["error"]]
     assert failed
-    assert {answer["error"] for answer in failed} == {"blind_judge was ended by SIGKILL"}
+    assert {answer["error"] for answer in failed} == {"blind_judge: ended by SIGKILL"}
     result = score_check(check)
     cases = result.scores["scores"]["cases"]
     assert cases["all"] == 20
@@ -410,11 +412,80 @@ def test_answers_changed_after_the_opening_are_noticed(tmp_path):
     _, cases = begin_check(folder, options)
     path = answer_path(folder, cases[1])
     path.write_text(path.read_text(encoding="utf-8").replace('"error":""', '"error":" "'), encoding="utf-8")
-    with pytest.raises(InputError, match="not those that were closed before the labels were opened"):
+    with pytest.raises(InputError, match=r"case_00001\.json: not those that were closed before the labels were opened"):
         open_check(folder, options, cases)
     path.unlink()
     with pytest.raises(InputError, match=r"answers closed, 1 of them gone"):
         run_check(folder, options, cases, WORK)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("answers/case_00001.npz", lambda text: text[:50], r"case_00001\.npz: not those that were closed"),
+        ("answers/case_00001.npz", None, r"case_00001\.npz: not those that were closed"),
+        ("answers.json", lambda text: text[:50], r"answers\.json: got no JSON object; .*put the file back"),
+        ("answers.json", lambda text: b"{}", r"answers\.json: got no answers in it"),
+        ("seal.json", lambda text: b"{}", r"seal\.json: got no sha256 in it"),
+        ("labels.json", None, r"a seal without its salt; .*labels\.json afterwards; begin again in another folder"),
+        ("labels.json", lambda text: b"{}", r"labels\.json: got no salt in it"),
+        ("labels.json", lambda text: text.replace(b'th":', b'th":1', 1), r"labels\.json: .*expected the labels that were sealed"),
+    ],
+)  # fmt: skip
+def test_what_a_finished_check_left_is_known_to_be_untouched(tmp_path, name, change, message):
+    folder = tmp_path / "check"
+    options = BlindOptions(cases=3, seed=FRESH)
+    checked(folder, options)
+    path = folder / name
+    before = path.read_bytes()
+    path.unlink()
+    if change is not None:
+        path.write_bytes(change(before))
+        assert path.read_bytes() != before
+    with pytest.raises(InputError, match=message) as caught:
+        checked(folder, options)
+    assert "\n" not in str(caught.value)
+    path.write_bytes(before)
+    checked(folder, options)
+
+
+def test_answers_closed_without_their_inner_products_as_once_are_still_taken(tmp_path):
+    folder = tmp_path / "check"
+    options = BlindOptions(cases=3, seed=FRESH)
+    checked(folder, options)
+    closed = json.loads((folder / "answers.json").read_text(encoding="utf-8"))
+    assert sum(name.endswith(".npz") for name in closed["answers"]) == 3
+    closed["answers"] = {name: value for name, value in closed["answers"].items() if name.endswith(".json")}
+    (folder / "answers.json").write_text(json.dumps(closed), encoding="utf-8")
+    checked(folder, options)
+
+
+def test_a_process_that_a_signal_ended_is_tried_once_more_and_one_that_failed_is_not(tmp_path, monkeypatch):
+    asked = []
+
+    def ends(*errors):
+        left = list(errors)
+
+        def run(self, module, words, **options):
+            asked.append(module)
+            if left:
+                raise left.pop(0)
+
+        monkeypatch.setattr(Children, "run", run)
+        asked.clear()
+
+    work = Processes(BlindOptions(cases=1, seed=FRESH))
+    killed = KilledError("ended by SIGKILL")
+    ends(killed)
+    work.measure({}, tmp_path / "session.h5")
+    assert asked == ["blind_measure"] * 2
+    ends(killed, killed)
+    with pytest.raises(RuntimeError, match=r"^blind_measure: ended by SIGKILL$"):
+        work.measure({}, tmp_path / "session.h5")
+    ends(ChildError("InputError: no"))
+    with pytest.raises(RuntimeError, match=r"^blind_measure: InputError: no$"):
+        work.measure({}, tmp_path / "session.h5")
+    assert asked == ["blind_measure"]
 
 
 def test_a_changed_seal_is_noticed(tmp_path):
@@ -630,7 +701,21 @@ def test_a_page_is_written_for_a_single_case_too(tmp_path):
 @pytest.mark.slow
 def test_three_small_sessions_end_to_end(tmp_path, capsys):
     folder = tmp_path / "check"
-    words = ["blind-check", "-n", "2", "--seed", "500", "-o", str(folder), "--size", "48", "--frames", "6", "--json"]
+    words = [
+        "blind-check",
+        "-n",
+        "2",
+        "--seed",
+        "500",
+        "-o",
+        str(folder),
+        "--size",
+        "48",
+        "--frames",
+        "6",
+        "--development",
+        "--json",
+    ]
     assert main([*words, "--train-cases", "1", "--only", "E"]) == 0
     printed = capsys.readouterr()
     scores = json.loads(printed.out)

@@ -24,36 +24,16 @@ from raytwin.campaign.sweep_runners import DaskCluster, Here, Processes
 from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, motion_strength_px, start_pair, twin_at
 from raytwin.campaign.sweep_trial import seed_of
 from raytwin.errors import InputError, MissingDependencyError, RaytwinError
-from raytwin.generator.describe import read_description
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.generate import generate_dataset
-from raytwin.generator.generate_described import generate_from_description
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.twin_io import read_twin, write_twin
 
-SHAPE = (64, 64)
 BEAM = "filter=Cu:0.05"
 LONG = (
     setting_from_text(f"kv=40,power_w=40,exposure_ms=100,{BEAM},averaged=10"),
     setting_from_text(f"kv=90,power_w=45,exposure_ms=100,{BEAM},averaged=10"),
 )
-PRODUCTS = """
-[[product]]
-shape = "fillet"
-material = "chicken_breast"
-length_mm = [22, 26]
-width_mm = [15, 18]
-height_mm = [8, 14]
-[[foreign_object]]
-name = "rib"
-shape = "rod"
-material = "rib_bone"
-length_mm = [3, 6]
-diameter_mm = [1, 3]
-[images]
-with_foreign_object = 0.7
-products = 8
-"""
 CAMPAIGN = f"""
 twin = "twin.h5"
 references = "references.h5"
@@ -81,27 +61,11 @@ start_shares = [0.2]
 
 
 @pytest.fixture(scope="module")
-def line(tmp_path_factory, make_model_twin):
-    """A twin of 64 x 64 pixels and references that its own line would show in 1 s."""
-    folder = tmp_path_factory.mktemp("sweep")
-    twin = make_model_twin(
-        SHAPE, pixel_mm=0.45, source_object_mm=2970.0, source_detector_mm=3177.0, readout_ms=2.0, maximum_power_w=90.0
-    )
-    write_twin(folder / "twin.h5", twin)
-    (folder / "products.toml").write_text(PRODUCTS)
-    generate_from_description(
-        twin,
-        read_description(folder / "products.toml"),
-        folder / "drawn.h5",
-        low=LONG[0],
-        high=LONG[1],
-        images=20,
-        seed=5,
-        with_counts=False,
-    )
-    with read_dataset(folder / "drawn.h5") as drawn:
-        write_selected(drawn, folder / "references.h5", selection=slice(None), split="train")
+def line(tmp_path_factory, make_sweep_line):
+    """A twin of 64 x 64 pixels, references that its own line would show in 1 s, and a campaign file."""
+    folder = make_sweep_line(tmp_path_factory.mktemp("sweep"))
     (folder / "campaign.toml").write_text(CAMPAIGN)
+    (folder / "cut.h5").write_bytes((folder / "references.h5").read_bytes()[:-4000])
     return folder
 
 
@@ -212,9 +176,9 @@ def test_a_stopped_sweep_goes_on_in_processes_that_die_to_the_same_bytes(line, w
     before = trial.stat().st_mtime_ns
 
     def kill():
-        while not workers._running:
+        while not workers._children._running:
             time.sleep(0.01)
-        next(iter(workers._running)).kill()
+        next(iter(workers._children._running)).kill()
 
     workers = Processes(2)
     killer = threading.Thread(target=kill)
@@ -297,6 +261,18 @@ def test_only_what_a_changed_campaign_changes_is_done_again(line, whole, tmp_pat
     before = files_of(folder)
     goal = campaign_of(line, words=[("[training]", "[limits]\na90 = 0.2\nmaximum_dose_uGy = 1e6\n[training]")])
     sweep(goal, folder, Spy())  # a limit costs nothing
+    told = []
+    sweep(
+        campaign_of(line, words=[("seed = 3", "seed = 3 # same")]), folder, Spy(), progress=Progress(tell=told.append)
+    )
+    assert told == []
+    named = campaign_of(line, name="named.toml")
+    sweep(named, folder, Spy(), progress=Progress(tell=told.append))
+    assert len(told) == 1 and "holds the answer of other.toml; what was trained for it stays" in told.pop()
+    with pytest.raises(AssertionError):  # the spy refuses to train
+        later = campaign_of(line, name="named.toml", words=[("seed = 3", "seed = 4")])
+        sweep(later, folder, Spy(), progress=Progress(tell=told.append))
+    assert "of named.toml, with another seed: all settings are trained anew" in told[0]
     power = campaign_of(line, words=[("exposure_ms = [20, 50]", "exposure_ms = [50, 20, 30]")])
     spy = Spy(Here())
     answer = sweep(power, folder, spy)
@@ -349,6 +325,8 @@ def test_a_table_that_was_cut_short_is_made_again(line, whole, tmp_path):
     good = hits.read_bytes()
     hits.write_bytes(good[: len(good) // 2])
     spy = Spy(Here())
+    (folder / "sweep.json").write_text("{")
+    next((folder / "settings").glob("*_50ms_*/seconds.json")).write_text("")
     sweep(campaign, folder, spy)
     assert len(spy.asked) == 1
     assert answers_of(folder) == answers_of(whole[0])
@@ -576,6 +554,24 @@ def test_a_file_that_was_not_dealt_out_is_dealt_out(line, tmp_path):
         assert len(learn) + len(test) == 20
 
 
+def test_references_that_another_campaign_began_to_deal_out_are_not_taken_for_ones_own(line, tmp_path, monkeypatch):
+    own, other = campaign_of(line), campaign_of(line, name="later.toml", words=[("seed = 3", "seed = 4")])
+    bases = [sweep_trial.basis_of(one, version="1") for one in (own, other)]
+    sweep_trial.prepare_references(own, tmp_path, bases[0])
+    before = (tmp_path / "learn.h5").read_bytes()
+
+    def killed(*words, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep_trial, "write_selected", killed)
+    with pytest.raises(KeyboardInterrupt):
+        sweep_trial.prepare_references(other, tmp_path, bases[1])
+    monkeypatch.undo()
+    assert (tmp_path / "learn.h5").read_bytes() != before
+    sweep_trial.prepare_references(own, tmp_path, bases[0])
+    assert (tmp_path / "learn.h5").read_bytes() == before
+
+
 def hit_table(path, threshold, *, networks=2, images=14):
     """Hits of networks that see what is larger than a threshold that networks and images vary."""
     rng = np.random.default_rng(7)
@@ -663,6 +659,18 @@ def test_the_smallest_upper_bound_is_recommended_not_the_smallest_estimate():
     assert choose(rows, goal=None, most_false_alarms=None) == Choice(best=1, recommended=1, meets=None)
 
 
+def test_where_no_setting_has_a_bound_the_smallest_estimate_is_recommended_and_said_to_be_that():
+    rows = [row(a90, a90_upper=None) for a90 in (0.2, 0.1)]
+    for goal, said in (
+        (None, "Take a90 0.1: none of 2 settings with an a90 has a 95 % upper bound, and its a90 is the smallest"),
+        (0.15, "No setting is shown to reach a90 = 0.15; the smallest a90 is that of a90 0.1"),
+    ):
+        text = sentence(rows, choose(rows, goal=goal, most_false_alarms=None), goal=goal, unit="")
+        assert text.startswith(f"{said} (a90 0.1, 95 % 0.08 to 0.13;")
+    alone = sentence(rows[:1], choose(rows[:1], goal=None, most_false_alarms=None), goal=None, unit="")
+    assert alone.startswith("Take a90 0.2: the only setting with an a90 (") and "no upper bound" in alone
+
+
 def test_with_a_goal_the_fastest_that_is_shown_to_reach_it_is_recommended():
     rows = [row(0.10, pace=1.0), row(0.12, pace=3.0), row(0.11, pace=3.0, dose=0.5), row(0.16, pace=9.0)]
     assert choose(rows, goal=0.15, most_false_alarms=None) == Choice(best=0, recommended=2, meets=True)
@@ -692,6 +700,10 @@ def test_nothing_is_recommended_where_nothing_has_an_a90():
     rows = [row(None), row(None) | {"n_hits": 9, "label": "best of them"}]
     text = sentence(rows, choose(rows, goal=None, most_false_alarms=None), goal=None, unit="")
     assert "None of the 2 settings" in text and "best of them: 9 of 20" in text
+    unknown = [row(None) | {"n": 0, "n_hits": 0}, row(None) | {"trained": False, "n": None}]
+    assert sentence(unknown, choose(unknown, goal=None, most_false_alarms=None), goal=None, unit="") == (
+        "None of the 1 settings that were tried met a foreign object of known size: there is no POD."
+    )
     untried = [row(None) | {"trained": False, "n": None}]
     assert "was tried" in sentence(untried, choose(untried, goal=None, most_false_alarms=None), goal=None, unit="")
 
@@ -708,7 +720,9 @@ BAD = [
     ('twin = "twin.h5"', 'twin = "absent.h5"', "twin.*not there"),
     ('twin = "twin.h5"', "", "twin.*got nothing; expected a text"),
     ('references = "references.h5"', 'references = "absent.h5"', "references.*not there.*relative to the campaign file"),
-    ('references = "references.h5"', 'references = "twin.h5"', "references.*expected a dataset file"),
+    ('references = "references.h5"', 'references = "twin.h5"', "references.*expected a dataset file.*raytwin import"),
+    ('references = "references.h5"', 'references = "cut.h5"', "references, .*cut.h5.*truncated.*copy or make it again"),
+    ('references = "references.h5"', 'references = "."', "references.*a folder; expected a file"),
     ('references = "references.h5"', 'references = "products.toml"', "start_low and start_high"),
     ("test_share = 0.4", 'test_references = "references.h5"', "test_references.*the file that networks learn from"),
     ("test_share = 0.4", "test_share = 0.95", "test_share.*at most 0.9"),
@@ -768,6 +782,11 @@ def test_a_bad_campaign_file_is_one_line_that_says_what_to_do(line, old, new, me
 def test_no_file_and_no_settings_are_told(line, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_campaign(tmp_path / "absent.toml")
+    with pytest.raises(InputError, match="got a folder; expected a campaign file"):
+        read_campaign(tmp_path)
+    (tmp_path / "empty.toml").write_text("\n")
+    with pytest.raises(InputError, match=r"an empty file; .*; docs/campaigns\.md has an example"):
+        read_campaign(tmp_path / "empty.toml")
     text = 'twin = "twin.h5"\nreferences = "references.h5"\n'
     with pytest.raises(InputError, match="no settings"):
         campaign_of(line, text=text)

@@ -4,31 +4,8 @@ import json
 
 import pytest
 
-from raytwin.acquisition import read_dataset
-from raytwin.acquisition.dataset_io import write_selected
-from raytwin.acquisition.setting import setting_from_text
 from raytwin.cli import main
-from raytwin.generator.describe import read_description
-from raytwin.generator.generate_described import generate_from_description
-from raytwin.generator.twin_io import write_twin
 
-PRODUCTS = """
-[[product]]
-shape = "fillet"
-material = "chicken_breast"
-length_mm = [22, 26]
-width_mm = [15, 18]
-height_mm = [8, 14]
-[[foreign_object]]
-name = "rib"
-shape = "rod"
-material = "rib_bone"
-length_mm = [3, 6]
-diameter_mm = [1, 3]
-[images]
-with_foreign_object = 0.7
-products = 6
-"""
 CAMPAIGN = """
 twin = "twin.h5"
 references = "references.h5"
@@ -54,18 +31,9 @@ object = "rib_bone:2"
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory, make_model_twin):
+def campaign(tmp_path_factory, make_sweep_line):
     """A campaign file with its twin and references of 64 x 64 pixels."""
-    folder = tmp_path_factory.mktemp("sweep")
-    twin = make_model_twin((64, 64), pixel_mm=0.45, source_object_mm=2970.0, source_detector_mm=3177.0, readout_ms=2.0)
-    write_twin(folder / "twin.h5", twin)
-    (folder / "products.toml").write_text(PRODUCTS)
-    low, high = (setting_from_text(f"kv={kV},power_w=40,exposure_ms=100,filter=Cu:0.05,averaged=10") for kV in (40, 90))
-    description = read_description(folder / "products.toml")
-    drawn = folder / "drawn.h5"
-    generate_from_description(twin, description, drawn, low=low, high=high, images=14, seed=5, with_counts=False)
-    with read_dataset(drawn) as dataset:
-        write_selected(dataset, folder / "references.h5", selection=slice(None), split="train")
+    folder = make_sweep_line(tmp_path_factory.mktemp("sweep"))
     (folder / "campaign.toml").write_text(CAMPAIGN)
     return folder / "campaign.toml"
 

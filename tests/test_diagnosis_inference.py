@@ -45,6 +45,20 @@ def curves(rng, effects=8, variants=2, low=0.5, high=100.0):
     return tuple(result)
 
 
+def one_node(effect, response, *, variant="", low=0.5, high=50.0, **more):
+    """An effect known at strength 1 alone."""
+    return Curve(
+        effect=effect,
+        variant=variant,
+        parameters={},
+        low=low,
+        high=high,
+        strengths=np.array([1.0]),
+        responses=np.asarray(response)[None, :],
+        **more,
+    )
+
+
 @pytest.fixture
 def setup():
     rng = np.random.default_rng(5)
@@ -165,15 +179,7 @@ def test_departure_that_no_effect_makes_is_unknown_and_placed(setup):
 def test_effects_with_the_same_response_share_the_probability(setup):
     rng, factors, chosen = setup
     twin = chosen[0]
-    same = Curve(
-        effect="double",
-        variant="0",
-        parameters={},
-        low=twin.low,
-        high=twin.high,
-        strengths=twin.strengths,
-        responses=twin.responses,
-    )
+    same = replace(twin, effect="double", variant="0")
     only = (chosen[0], same, *chosen[2:])
     found = weigh(noise(rng, factors) + twin.response(15.0), factors, only)
     probability = {item.effects: item.probability for item in found}
@@ -207,16 +213,7 @@ def test_what_an_effect_does_by_chance_counts_as_its_own(setup):
     rng = np.random.default_rng(31)
     response = np.zeros(PROBES)
     response[0] = 30.0
-    curve = Curve(
-        effect="gain_map_error",
-        variant="",
-        parameters={},
-        low=0.1,
-        high=3.0,
-        strengths=np.array([1.0]),
-        responses=response[None, :],
-        jitter=np.where(response > 0, 0.0, 25.0),
-    )
+    curve = one_node("gain_map_error", response, low=0.1, high=3.0, jitter=np.where(response > 0, 0.0, 25.0))
     residual = response + noise(rng, factors) + 5.0 * rng.standard_normal(PROBES) * (response == 0)
     assert weigh(residual, factors, [curve])[0].effects == ("gain_map_error",)
     assert weigh(residual, factors, [replace(curve, jitter=None)])[0].effects == (UNKNOWN,)
@@ -254,15 +251,7 @@ def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
     assert [name for name, _ in found] == ["thickness of PMMA in wedge", "tilt x of flat"]
     # 600 probes of unit noise know each to 0.04
     assert [value for _, value in found] == pytest.approx([-12.0, 6.0], abs=0.25)
-    effect = Curve(
-        effect="a",
-        variant="",
-        parameters={},
-        low=0.1,
-        high=10.0,
-        strengths=np.array([1.0]),
-        responses=(factors @ np.array([-12.0, 0.0, 0.0, 0.0]))[None, :],
-    )
+    effect = one_node("a", factors @ np.array([-12.0, 0.0, 0.0, 0.0]), low=0.1, high=10.0)
     named = Hypothesis(
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (1.0, 0.9, 1.1)}, variants={"a": effect}
     )
@@ -274,16 +263,7 @@ def defined_curve(exact):
     rng = np.random.default_rng(6)
     responses = rng.standard_normal(PROBES) * 40.0
     truth = np.where(np.arange(PROBES) < 5, 1.0, 0.7) * 3.0 * responses
-    curve = Curve(
-        effect="a",
-        variant="",
-        parameters={},
-        low=0.5,
-        high=50.0,
-        strengths=np.array([1.0]),
-        responses=responses[None, :],
-        exact=np.arange(PROBES) < 5 if exact else None,
-    )
+    curve = one_node("a", responses, exact=np.arange(PROBES) < 5 if exact else None)
     return curve, truth + rng.standard_normal(PROBES)
 
 
@@ -308,15 +288,7 @@ def test_an_interval_covers_the_variants_that_are_as_likely():
     residual = 4.0 * response + rng.standard_normal(PROBES)
 
     def fit(scale):
-        curve = Curve(
-            effect="a",
-            variant=str(scale),
-            parameters={},
-            low=0.5,
-            high=50.0,
-            strengths=np.array([1.0]),
-            responses=scale * response[None, :],
-        )
+        curve = one_node("a", scale * response, variant=str(scale))
         return fit_curve(residual, curve, Nuisances(np.zeros((PROBES, 1))), GROUPS, law_errors=())
 
     # the same picture at half the size means twice the strength
@@ -331,15 +303,7 @@ def test_a_peak_far_sharper_than_the_nodes_lie_apart_is_found(sharpness):
     rng = np.random.default_rng(6)
     response = sharpness * rng.standard_normal(PROBES)
     residual = 4.0 * response + rng.standard_normal(PROBES)
-    curve = Curve(
-        effect="a",
-        variant="",
-        parameters={},
-        low=0.05,
-        high=50.0,
-        strengths=np.array([1.0]),
-        responses=response[None, :],
-    )
+    curve = one_node("a", response, low=0.05)
     fit = fit_curve(residual, curve, Nuisances(np.zeros((PROBES, 1))), GROUPS, law_errors=())
     exact = float(response @ residual / (response @ response))
     sd = 1.0 / float(np.linalg.norm(response))
@@ -357,18 +321,7 @@ def test_a_second_effect_elsewhere_is_named_beside_a_strong_one():
     strong, weak = np.zeros(PROBES), np.zeros(PROBES)
     strong[:200] = rng.standard_normal(200)
     weak[400:420] = rng.standard_normal(20)
-    made = [
-        Curve(
-            effect=name,
-            variant="",
-            parameters={},
-            low=0.5,
-            high=500.0,
-            strengths=np.array([1.0]),
-            responses=direction[None, :],
-        )
-        for name, direction in (("strong", strong), ("weak", weak))
-    ]
+    made = [one_node(name, direction, high=500.0) for name, direction in (("strong", strong), ("weak", weak))]
     residual = 10.0 * strong + 3.0 * weak + rng.standard_normal(PROBES)
     found = weigh(residual, np.zeros((PROBES, 1)), made)
     assert found[0].effects == ("strong", "weak")
@@ -381,16 +334,7 @@ def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength(
     spread = np.zeros((PROBES, 40))
     for number in range(40):
         spread[15 * number : 15 * number + 5, number] = 1.0  # forty levels, each seen by five probes
-    wandering = Curve(
-        effect="wandering",
-        variant="",
-        parameters={},
-        low=0.1,
-        high=10.0,
-        strengths=np.array([1.0]),
-        responses=np.zeros((1, PROBES)),
-        spread=spread,
-    )
+    wandering = one_node("wandering", np.zeros(PROBES), low=0.1, high=10.0, spread=spread)
     assert wandering.by_chance_alone
     steady = curves(rng, effects=4)
     factors = rng.standard_normal((PROBES, 5))
@@ -424,15 +368,7 @@ def test_a_law_that_predicts_much_where_nothing_is_seen_loses_to_one_that_does_n
     seen[:100] = rng.standard_normal(100)
     unseen[300:400] = 20.0 * rng.standard_normal(100)
     right, wrong = (
-        Curve(
-            effect="lag",
-            variant=name,
-            parameters={},
-            low=0.5,
-            high=500.0,
-            strengths=np.array([1.0]),
-            responses=response[None, :],
-        )
+        one_node("lag", response, variant=name, high=500.0)
         for name, response in (("since the calibration", seen), ("always", seen + unseen))
     )
     # the right one's law is off by a tenth from place to place as well
@@ -447,6 +383,32 @@ def test_a_law_that_predicts_much_where_nothing_is_seen_loses_to_one_that_does_n
     assert found["always"].log_evidence < found["since the calibration"].log_evidence - 0.01 * explained
 
 
+def test_within_a_group_a_law_is_no_share_of_what_it_predicts_in_places_that_show_nothing():
+    rng = np.random.default_rng(23)
+    seen, unseen = np.zeros(PROBES), np.zeros(PROBES)
+    seen[:100], unseen[:100] = rng.standard_normal(100), rng.standard_normal(100)
+    # each group holds later series, which show the effect, and earlier ones, which do not
+    places = 2 * GROUPS + np.tile(np.repeat([0, 1], 10), 30)
+    seen[places % 2 == 1] = 0.0
+    unseen[places % 2 == 0] = 0.0
+    later, always = (
+        one_node("lag", response, variant=name, high=500.0)
+        for name, response in (("since the calibration", seen), ("always", seen + unseen))
+    )
+    off = np.repeat(1.0 + 0.1 * rng.standard_normal(60), 10)
+    residual = 200.0 * off * seen + rng.standard_normal(PROBES)
+    nuisances = Nuisances(np.zeros((PROBES, 1)))
+    explained = 0.5 * float(residual @ residual)
+    found = {item.variant: fit_curve(residual, item, nuisances, GROUPS, places=places) for item in (later, always)}
+    assert found["since the calibration"].log_evidence > 0.99 * explained
+    assert found["since the calibration"].best == pytest.approx(200.0, rel=0.1)
+    apart = found["since the calibration"].log_evidence - found["always"].log_evidence
+    assert apart > 5000.0
+    # groups alone take it for a law that is off by a share
+    alike = [fit_curve(residual, item, nuisances, GROUPS).log_evidence for item in (later, always)]
+    assert alike[0] - alike[1] < 0.25 * apart
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_a_second_effect_seen_where_the_first_cannot_act_is_not_doubted(there):
     rng = np.random.default_rng(22)
@@ -454,18 +416,7 @@ def test_a_second_effect_seen_where_the_first_cannot_act_is_not_doubted(there):
     strong, weak = np.zeros(PROBES), np.zeros(PROBES)
     strong[objects] = rng.standard_normal(300)
     weak[200:320] = rng.standard_normal(120)  # on objects as well, but for its last twenty probes
-    made = [
-        Curve(
-            effect=name,
-            variant="",
-            parameters={},
-            low=0.5,
-            high=5000.0,
-            strengths=np.array([1.0]),
-            responses=direction[None, :],
-        )
-        for name, direction in (("scatter", strong), ("lag", weak))
-    ]
+    made = [one_node(name, direction, high=5000.0) for name, direction in (("scatter", strong), ("lag", weak))]
     # what the first's law leaves on objects looks like the second there
     left = 12.0 * np.where(objects, weak, 0.0)
     residual = 2000.0 * strong + left + rng.standard_normal(PROBES)

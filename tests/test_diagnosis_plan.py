@@ -6,13 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much
+from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much, _misfit
+from raytwin.diagnosis.forward_model import can_show
 from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
-from raytwin.generator.effects import EFFECTS
+from raytwin.generator.effects import EFFECTS, AppliedEffect
+from raytwin.generator.series import SeriesRequest, expected_series
 
 PROBES = 60
 
@@ -197,3 +200,69 @@ def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
     found = whole.with_variants([(variant, np.stack([axis(0)] * len(variant.strengths)))]).curves[-1]
     assert found.since == "calibration"
     np.testing.assert_array_equal(found.spread, later.spread)
+
+
+@pytest.mark.parametrize("effect", sorted(EFFECTS))
+def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(make_model_twin, effect):
+    twin = make_model_twin((24, 24), readout_ms=2.0)
+    setting = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
+    flat = SeriesRequest(kind="flat", setting=setting, frames=6, exposure_ms=20.0, start_s=10.0)
+    dark = SeriesRequest(kind="dark", setting=None, frames=6, exposure_ms=20.0, start_s=20.0, previous=(flat,))
+    slab = {"water": np.full((24, 24), 20.0)}
+    scene = replace(flat, kind="object", thickness_mm=slab, scene_kind="slab", source_object_mm=300.0)
+    scene = replace(scene, source_detector_mm=600.0, product_material="water")
+    strong = next(item for item in EFFECTS[effect].parameters if item.name == "strength").high
+    asked = [flat, dark, replace(dark, kind="afterglow"), scene]
+    for request in asked:
+        applied = AppliedEffect(id=effect, parameters={"strength": strong}, since="always")
+        if can_show(effect, request):
+            continue
+        with_it = expected_series(twin, request, effects=(applied,), use_measured_level=False)
+        without = expected_series(twin, request, effects=(), use_measured_level=False)
+        for name in ("mean_DN", "quantum_variance_DN2", "white_variance_DN2", "row_variance_DN2", "frame_factor_rms"):
+            assert np.array_equal(getattr(with_it, name), getattr(without, name)), (request.kind, name)
+    # objects show whatever there is
+    assert can_show(effect, scene)
+
+
+def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was():
+    rng = np.random.default_rng(8)
+    size = 600
+    groups = np.repeat(np.arange(20), 30)
+    direction, other = np.zeros(size), np.zeros(size)
+    direction[:300] = rng.standard_normal(300)
+    other[300:] = rng.standard_normal(300)
+
+    def misfit(left, off=0.0):
+        response = 30.0 * direction
+        made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
+        noise = 0.7 * rng.standard_normal(size)  # floors make probes' standard deviations wider than their noise
+        residual = response * (1.0 + off) + left * other + noise
+        planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=groups)
+        leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+        return _misfit(planted, leading)
+
+    assert misfit(0.0).left == 0.0
+    # a law that is off by a tenth leaves nothing that it may not
+    assert misfit(0.0, off=0.1).left < 0.01
+    assert misfit(30.0 * np.sqrt(0.5)).left == pytest.approx(0.5 / 1.5, abs=0.06)
+    assert misfit(30.0 * np.sqrt(0.3)).refused
+    assert not misfit(30.0 * np.sqrt(0.03)).refused
+
+
+@pytest.mark.parametrize(("times", "refused"), [(1.0, False), (6.0, True)])
+def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_does(times, refused):
+    rng = np.random.default_rng(9)
+    size = 600
+    waves = 0.3 * rng.standard_normal((size, 30))
+    response = np.zeros(size)
+    response[:50] = 3.0
+    made = replace(
+        curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
+    )
+    residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
+    planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=np.repeat(np.arange(20), 30))
+    leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+    found = _misfit(planted, leading)
+    assert found.pulled == pytest.approx(times, rel=0.35)
+    assert found.refused == refused

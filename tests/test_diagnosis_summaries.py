@@ -8,8 +8,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from raytwin.diagnosis.assemble import _memory
-from raytwin.diagnosis.probes import Areas, MapProjection, Template, _log_variance_of_steps, _MovingPicture
+from raytwin.diagnosis.defects import memory_of
+from raytwin.diagnosis.fixed_pattern import Pattern
+from raytwin.diagnosis.probes import (
+    Areas,
+    MapProjection,
+    ScalarContext,
+    Template,
+    _log_variance_of_steps,
+    _MovingPicture,
+)
 from raytwin.diagnosis.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
@@ -261,7 +269,7 @@ def test_pixels_that_jump_and_stay_have_a_memory_and_noisy_ones_have_none():
     jumping[:, outlying] += 6.0 * (np.cumsum(flips, axis=0) % 2)
     shares = []
     for changed in (noisy, jumping):
-        found = _memory(summary_of(changed.astype(np.float32)), outlying)
+        found = memory_of(summary_of(changed.astype(np.float32)), outlying)
         assert found is not None
         assert found[1] == count
         shares.append(found[0])
@@ -297,3 +305,48 @@ def test_a_sharp_edge_is_placed_by_drawing_it_also_where_it_is_blurred_more_than
     if whole_cells:
         assert found.row_px * 3 == pytest.approx(round(found.row_px * 3))
         assert found.row_sd_px >= 1 / (3 * math.sqrt(12))
+
+
+@pytest.mark.parametrize("brighter", [0.9, 1.06])
+def test_a_beam_of_another_level_displaces_nothing(brighter):
+    rows, columns = np.mgrid[:80, :80]
+
+    def picture(row_px, column_px):
+        # an opaque half: its edge alone tells where it lies
+        return 10.0 + 20_000.0 * ndtr((columns + 0.1 * rows - 44.0 - column_px - 0.1 * row_px) / 0.6)
+
+    variance = picture(0.0, 0.0) / 10.0
+    noise = np.sqrt(variance / 50.0) * np.random.default_rng(6).standard_normal((80, 80))
+    measured = brighter * picture(0.0, 0.0) + noise
+    everywhere = np.ones((80, 80), bool)
+    first = register([measured], [picture(0.0, 0.0)], [variance], everywhere)
+    assert abs(first.column_px) < 0.004
+    found = register_drawn([measured], lambda at: [picture(*at)], [variance], everywhere, first, whole_cells=False)
+    assert abs(found.column_px) < 0.004
+
+
+def test_quanta_of_an_area_whose_pixels_are_brighter_are_noisier_by_the_square_of_their_gain():
+    gain = np.ones(SHAPE)
+    gain[:, : SHAPE[1] // 2] = 1.1
+    labels = np.zeros(SHAPE, dtype=np.int64)
+    labels[:, SHAPE[1] // 2 :] = 1
+    fields = {
+        "kind": "object",
+        "frames": 10,
+        "good": np.ones(SHAPE, bool),
+        "labels": labels,
+        "label_names": ("left", "right"),
+        "reference_signal_DN": 1000.0,
+        "previous_signal_DN": None,
+        "calibrates": False,
+        "codes_usable": False,
+        "pattern_noise": Pattern(pixel_DN2=1.0, blocks_DN2=1.0, rows_DN2=None, columns_DN2=None),
+        "quantum_DN2": 100.0,
+        "dark_DN": 0.0,
+        "counts_all_outliers": False,
+    }
+    assert ScalarContext(**fields).label_gain.tolist() == [1.0, 1.0]
+    left, right = ScalarContext(**fields, gain=gain).label_gain
+    assert left / right == pytest.approx(1.21)
+    # together they are as noisy as calibration found them
+    assert 0.5 * (left + right) == pytest.approx(1.0)

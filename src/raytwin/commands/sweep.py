@@ -95,7 +95,7 @@ def _plan(campaign: "Campaign", arguments: argparse.Namespace) -> int:
     text = "\n".join(
         [
             *_plan_lines(rows),
-            f"{len(rows)} settings, {result['feasible']} feasible, {kept} to train",
+            f"{len(rows)} setting{'s' * (len(rows) != 1)}, {result['feasible']} feasible, {kept} to train",
         ]
     )
     answer(result, as_json=arguments.json, text=text)
@@ -194,6 +194,8 @@ def _runner(arguments: argparse.Namespace, *, version: str) -> "Runner":
 def _told(row: Mapping[str, Any]) -> str:
     if row["a90"] is None:
         return str(row["reason"])
+    if row["a90_low"] is None and row["a90_high"] is None:
+        return f"a90 {row['a90']:.3g}, no interval"
     return f"a90 {row['a90']:.3g} ({_shown(row['a90_low'])} to {_shown(row['a90_high'])})"
 
 

@@ -1,0 +1,113 @@
+"""Pixels that stand out of the panel and are not known to be bad: they count as outliers and are left out of all else."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..generator.series import ExpectedSeries
+from .calibrated_maps import CalibratedMaps
+from .even_maps import full_size, signal_map
+from .fixed_pattern import smooth_part
+from .session import SessionSeries
+from .summaries import FirstLook
+
+_OUTLYING = 8.0  # standard deviations from which a pixel stands out
+_LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
+_MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
+
+
+def new_outliers(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    looks: Mapping[str, FirstLook],
+    maps: CalibratedMaps,
+) -> NDArray[np.bool_]:
+    """Pixels in use (row, column) that stand out in any dark or flat, or in all objects where no later dark or flat shows them.
+
+    Args:
+        kept: series that can be compared.
+        expected: by the twin with all pixels alike, by name.
+        looks: mean frames and variances, by name.
+        maps: dark and gain map of the calibrating series.
+    """
+    good, shape = maps.good, maps.good.shape
+    outlying = np.zeros(shape, dtype=bool)
+    for item in kept:
+        if item.series.kind not in ("dark", "flat"):
+            continue
+        look = looks[item.name]
+        residual = look.mean_DN - maps.darks.under(item)
+        if item.series.kind == "flat":
+            signal = signal_map(expected[item.name], shape)
+            residual = maps.over_gain(residual)
+            residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
+        residual = residual - smooth_part(residual, good)
+        centre = float(np.median(residual[good]))
+        spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
+        outlying |= np.abs(residual - centre) > _OUTLYING * max(spread, 1e-9)
+        if look.frames > 9:
+            ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), 1e-12)
+            outlying |= (ratio > max(_largest_ratio(look.frames), 2.5)) & good
+    if not any(item.series.kind in ("dark", "flat") and not item.calibrates for item in kept):
+        outlying |= _out_in_every_object(kept, expected, looks, maps)
+    outlying &= good
+    # a detector full of outliers is a pattern, not a set of defects
+    return outlying if outlying.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
+
+
+def _out_in_every_object(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    looks: Mapping[str, FirstLook],
+    maps: CalibratedMaps,
+) -> NDArray[np.bool_]:
+    """Pixels that stand out of their neighbours whatever lies before them: defects where no later flat or dark shows them."""
+    from scipy.ndimage import median_filter
+
+    good = maps.good
+    # a hot one stands out of the longer exposures alone
+    alike: dict[tuple[float | None, float | None], list[SessionSeries]] = {}
+    for item in kept:
+        if item.series.kind == "object" and not item.calibrates:
+            alike.setdefault((item.series.kV, item.series.exposure_ms), []).append(item)
+    found = np.zeros(good.shape, dtype=bool)
+    for members in alike.values():
+        if len({item.series.scene for item in members}) < _LEAST_SCENES:
+            continue
+        times = np.zeros(good.shape)
+        for item in members:
+            measured = maps.over_gain(looks[item.name].mean_DN - maps.darks.under(item))
+            residual = measured - full_size(expected[item.name].signal_DN, good.shape)
+            residual = residual - median_filter(residual, size=5, mode="nearest")
+            times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
+        found |= times >= _NEARLY_ALWAYS * len(members)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _largest_ratio(frames: int) -> float:
+    """Variance from differences of successive frames over its expectation that one pixel in ten million passes by chance."""
+    from scipy.stats import chi2
+
+    freedom = 2.0 * (frames - 1.0) / 3.0  # successive differences share frames
+    return float(chi2.isf(1e-7, freedom) / freedom)
+
+
+def memory_of(look: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
+    """Median share of outlying pixels' variance that lasts from frame to frame, and their number; None: none is noisy."""
+    stack, pair = look.stack_variance_DN2[outlying], look.pair_variance_DN2[outlying]
+    seen = stack > 0
+    if not seen.any():
+        return None
+    return float(np.median(1.0 - pair[seen] / stack[seen])), int(np.count_nonzero(seen))
+
+
+def counting_series(kept: Sequence[SessionSeries]) -> str:
+    """The later series that pixels standing out anywhere are counted with; empty where dead or hot ones cannot show."""
+    later = [item for item in kept if not item.calibrates and item.series.kind in ("dark", "flat")]
+    if later:
+        return later[-1].name if {item.series.kind for item in later} == {"dark", "flat"} else ""
+    objects = [item for item in kept if not item.calibrates and item.series.kind == "object"]
+    return objects[-1].name if len({item.series.scene for item in objects}) >= _LEAST_SCENES else ""

@@ -1,0 +1,293 @@
+"""What is no effect and may differ all the same: nuisances of one series, and what effects do by chance there.
+
+A nuisance is a response (probe,) of one prior standard deviation, not shrunk; equal names in several series are one nuisance.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import changes as scales
+from .even_maps import Map
+from .noise_correlation import correlation_sum
+from .registration import CELL_SD_PX, gradient
+from .responses import Moved, SessionModel
+from .series_probes import SeriesProbes
+from .session import SessionSeries
+from .summaries import BLOCK_PX, LAGS
+
+Columns = dict[str, NDArray[np.float64]]
+_Images = dict[str, NDArray[np.floating]]
+_UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
+_GAIN_MAP_MODES = 3  # cosines along each side
+
+
+def local_nuisances(
+    probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved], *, sharp: bool
+) -> Columns:
+    """Nuisances of one series by name.
+
+    Args:
+        probes: of the series.
+        signal: expected (row, column), DN.
+        thicker: what a scene with one material thicker by THICKNESS_SD would show, by material.
+        sharp: pixels see no farther than themselves.
+    """
+    item = probes.series.session
+    columns: Columns = {
+        "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
+    }
+    images: _Images = {}  # of nuisances that change the mean frame alone
+    if item.request.beam_on:
+        columns |= _of_beam(probes)
+        images |= _of_field(item, signal)
+    else:
+        images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
+    if item.series.kind == "object":
+        dy, dx = gradient(signal)
+        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, thicker)
+        images |= _of_scene(item, dy, dx, sharp=sharp)
+    return columns | _projected(probes, images)
+
+
+def _projected(probes: SeriesProbes, images: Mapping[str, NDArray[np.floating]]) -> Columns:
+    """Responses to changes of the mean frame (row, column), DN, by the same names."""
+    found = probes.of_maps(np.stack(list(images.values())).astype(np.float32))
+    return dict(zip(images, found, strict=True))
+
+
+def _voltage(item: SessionSeries) -> str:
+    series = item.series
+    return f"unknown kV ({series.current_mA}, {series.power_W})" if series.kV is None else f"{series.kV:g} kV"
+
+
+def _beam(item: SessionSeries) -> str:
+    return f"{_voltage(item)} " + "+".join(str(layer) for layer in item.series.filters)
+
+
+def _place(item: SessionSeries) -> str:
+    return f"{item.series.scene} at {item.series.source_object_mm or 0:g}"
+
+
+def _of_beam(probes: SeriesProbes) -> Columns:
+    """Gain of a beam, noise of pixels that are brighter than others, and correlation of neighbours."""
+    item, context = probes.series.session, probes.series.context
+    brighter = dict(zip(context.label_names, context.label_gain, strict=True))
+    # without a voltage, or a calibrating flat of two frames, the noise of a beam is known only from its own series
+    gain_sd = _UNKNOWN_GAIN_SD if item.series.kV is None or item.own_noise else scales.GAIN_OF_BEAM_SD
+    columns: Columns = {
+        f"gain of {_beam(item)}": probes.of_scalars(
+            lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
+        ),
+        # by their electronics (noise as the gain's square) or by the light that they catch (as the gain)
+        "noise of bright pixels": probes.of_scalars(
+            lambda probe: (
+                0.5 * scales.GAIN_EXPONENT_SD * math.log(brighter.get(probe.name.removeprefix("log_variance "), 1.0))
+            )
+        ),
+    }
+    for lag in LAGS:
+        # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
+        texture = _texture(probes, lag)
+        columns[f"texture {lag}"] = texture
+        columns[f"texture {lag} at {_voltage(item)}"] = scales.TEXTURE_OF_BEAM_SHARE * texture
+    return columns
+
+
+def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
+    ending = f"({lag[0]},{lag[1]})"
+    return probes.of_scalars(
+        lambda probe: scales.TEXTURE_SD if probe.name.startswith("correlation") and probe.name.endswith(ending) else 0.0
+    )
+
+
+def _of_field(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
+    """Level of beam and series, and gradient of the field."""
+    rows, columns = signal.shape
+    y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
+    x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
+    return {
+        f"level of {_beam(item)}": scales.LEVEL_OF_BEAM_SD * signal,
+        level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
+        f"tilt x of {item.name}": scales.TILT_SD * x * signal,
+        f"tilt y of {item.name}": scales.TILT_SD * y * signal,
+    }
+
+
+def level_of(item: SessionSeries) -> str:
+    """Name of the nuisance that is the level of one series, LEVEL_OF_SERIES_SD of it."""
+    return f"level of {item.name}"
+
+
+def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool) -> _Images:
+    """Where a scene lies and how its outline is drawn; dy, dx: slopes of the signal (row, column), DN a pixel."""
+    place = _place(item)
+    rows, columns = dy.shape
+    registered_px = CELL_SD_PX if sharp else scales.REGISTERED_SD_PX
+    row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
+    across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
+    slope = np.hypot(dy, dx)
+    images: _Images = {
+        f"column of {place}": registered_px * dx,
+        f"row of {place}": registered_px * dy,
+        f"outline of {place}": scales.OUTLINE_SD_PX * np.asarray(slope),
+        f"magnification of {place}": scales.MAGNIFICATION_SD * (row * dy + across * dx),
+        f"rotation of {place}": scales.MAGNIFICATION_SD * (across * dy - row * dx),
+    }
+    for number, field in enumerate(_rough_fields(dy.shape, place)):
+        images[f"rough edge {number} of {place}"] = slope * field
+    return images
+
+
+def _of_edges(probes: SeriesProbes, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> Columns:
+    """Profiles of edges, as pixels that an edge cuts are rendered."""
+    item = probes.series.session
+    columns: Columns = {}
+    for label, column in _projected(probes, _edge_profiles(dy, dx)).items():
+        columns[f"edges, {label}, of {_place(item)}"] = column
+        # the pixels that an edge cuts are not rendered quite alike for different beams
+        columns[f"edges, {label}, of {item.name}"] = scales.EDGE_OF_SERIES * column
+        # nor quite truly anywhere, and not the same where a pixel is another size in the object
+        columns[f"edges, {label}"] = scales.EDGE_OF_ALL * column
+        columns[f"edges, {label}, at {item.series.source_object_mm or 0:g}"] = scales.EDGE_OF_ALL * column
+    return columns
+
+
+def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> _Images:
+    """Derivatives across edges of second to fourth order, times what rendering leaves open of each."""
+    slope = np.hypot(dy, dx)
+    (yy, _), (_, xx) = gradient(dy), gradient(dx)
+    normal_y, normal_x = dy / np.maximum(slope, 1e-9), dx / np.maximum(slope, 1e-9)
+    steeper_y, steeper_x = gradient(xx + yy)
+    third = normal_y * steeper_y + normal_x * steeper_x
+    fourth = gradient(steeper_y)[0] + gradient(steeper_x)[1]
+    half = 0.5 * scales.EDGE_SD_PX2
+    return {
+        "columns": half * xx,
+        "rows": half * yy,
+        "third order": scales.EDGE_SD_PX3 * third,
+        "fourth order": scales.EDGE_SD_PX4 * fourth,
+    }
+
+
+@lru_cache(maxsize=2)
+def _rough_fields(shape: tuple[int, ...], place: str) -> NDArray[np.float32]:
+    """Fields (number, row, column) over the local slope, the same for every series of a place: rendering from pixel to pixel."""
+    from zlib import crc32
+
+    from scipy.ndimage import gaussian_filter
+
+    # fixed fields, not draws: the same scene always has the same ones
+    rng = np.random.default_rng(crc32(place.encode()))
+    result = np.empty((scales.ROUGH_FIELDS, *shape), np.float32)
+    for number in range(scales.ROUGH_FIELDS):
+        field = gaussian_filter(rng.standard_normal(shape), (0.7, 2.0, 5.0)[number % 3])
+        result[number] = scales.ROUGH_SHARE / math.sqrt(scales.ROUGH_FIELDS) / float(np.std(field)) * field
+    return result
+
+
+def _of_thickness(probes: SeriesProbes, thicker: Mapping[str, Moved]) -> Columns:
+    """Thickness and attenuation of the scene's materials."""
+    item, expected = probes.series.session, probes.series.scalars
+    columns: Columns = {}
+    for material, (moved, values) in thicker.items():
+        # less light is less noise, too
+        quieter = [
+            (values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd for probe in probes.scalars
+        ]
+        response = np.concatenate([probes.projection.apply(moved), quieter])
+        columns[f"thickness of {material} in {item.series.scene}"] = response
+        columns[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
+        columns[f"attenuation of {material} at {_voltage(item)}"] = response * (
+            scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
+        )
+    return columns
+
+
+def gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
+    """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
+
+    Empty where the series has no part in it: without calibrating flats, before the beam, for those that calibrate, and where the
+    gain map was applied before. signal: expected (row, column), DN.
+    """
+    item, maps = probes.series.session, session.maps
+    if not maps.shares or not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
+        return {}
+    # relative, of one pixel's gain in sums over many pixels
+    lasting = maps.gain_white + maps.gain_quantum * correlation_sum(probes.series.expected, BLOCK_PX, BLOCK_PX)
+    pixel_sd = math.sqrt(lasting)
+    waves = _waves(signal.shape, _GAIN_MAP_MODES)  # the level has nuisances of its own
+    amounts = [pixel_sd / math.sqrt(float(np.sum(wave**2))) * wave for wave in waves.values()]
+    found = probes.of_maps(np.stack(amounts) * signal)
+    return {f"gain map {i},{j}": column for (i, j), column in zip(waves, found, strict=True)}
+
+
+def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
+    """What one DN more in every pixel of a later series does (probe,)."""
+    if probes.series.session.calibrates:
+        return np.zeros(len(probes))
+    previous_DN = probes.series.context.previous_signal_DN
+    scalars = [
+        1.0 / previous_DN / probe.sd if previous_DN and probe.name.startswith("afterglow") else 0.0
+        for probe in probes.scalars
+    ]
+    return np.concatenate([probes.projection.of_level, scalars])
+
+
+def changed_gain_pattern(
+    probes: SeriesProbes, signal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest.
+
+    signal: expected (row, column), DN.
+    """
+    waves, item, maps = _pattern_waves(signal.shape), probes.series.session, len(probes.projection)
+    smooth, rest = np.zeros((len(probes), len(waves))), np.zeros(len(probes))
+    if item.calibrates or not item.request.beam_on:
+        return smooth, rest
+    smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
+    rest[:maps] = probes.projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
+    return smooth, rest
+
+
+@lru_cache(maxsize=1)
+def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The smooth part of 1 % of a changed gain map: waves (wave, row, column) that it holds by chance."""
+    waves = _waves(shape, scales.PATTERN_WAVES + 1)
+    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
+    result = np.empty((len(waves), *shape), np.float32)
+    for image, (numbers, wave) in zip(result, waves.items(), strict=True):
+        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
+        image[...] = 0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave
+    return result
+
+
+@lru_cache(maxsize=8)
+def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Products of `count` cosines along each side (row, column), by their numbers; the even field is left out."""
+    y, x = (np.cos(np.pi * np.outer(np.arange(count), (np.arange(length) + 0.5) / length)) for length in shape)
+    return {(i, k): np.outer(y[i], x[k]) for i in range(count) for k in range(count) if i or k}
+
+
+def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, NDArray[np.float64]]:
+    """Responses (2, probe), not shrunk, to more of a change on one side of the panel, along rows and along columns, by key.
+
+    A panel seldom warms evenly, and no anode's heel is a straight line. images: what changes do to the mean frame (row, column
+    or 1, 1), DN; shape: of the panel, rows and columns.
+    """
+    if not images:
+        return {}
+    rows, columns = shape
+    ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
+    alike = probes.projection.apply(np.stack([np.broadcast_to(ramp, shape) for ramp in ramps]))
+    result = {}
+    for key, image in images.items():
+        if image.size == 1:
+            found = float(image.flat[0]) * alike
+        else:
+            found = probes.projection.apply(np.stack([image * ramp for ramp in ramps]))
+        result[key] = probes.without_scalars(found)
+    return result

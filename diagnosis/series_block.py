@@ -1,0 +1,159 @@
+"""One series in numbers: its standardised residual, and what nuisances, changes and chance do to it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import changes as scales
+from .changes import Variant
+from .nuisance_columns import (
+    Columns,
+    changed_gain_pattern,
+    gain_map_noise,
+    level_of,
+    local_nuisances,
+    offset_of_later,
+    uneven,
+)
+from .output_course import OutputCourse
+from .probes import ProbeName, time_templates
+from .responses import Asked, Moved, SessionModel
+from .series_probes import MeanFrame, SeriesProbes
+from .session import SessionSeries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesBlock:
+    """The part of a problem that one series makes; its probes are standardised.
+
+    Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
+    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
+    pattern_jitter (probe,): what 1 % of a changed gain map does by chance; uneven (2, probe), by number of change: more of it on one
+    side of the panel.
+    """
+
+    session: SessionSeries
+    names: list[ProbeName]
+    residual: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    nuisances: Columns
+    responses: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    pattern: NDArray[np.float64]
+    pattern_jitter: NDArray[np.float64]
+    uneven: dict[int, NDArray[np.float64]]
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+def series_block(
+    session: SessionModel,
+    probes: SeriesProbes,
+    frame: MeanFrame,
+    asked: Sequence[Asked],
+    moved: Sequence[Moved | None],
+    thicker: dict[str, Moved],
+) -> SeriesBlock:
+    """One series in numbers.
+
+    Args:
+        session: all series as the base twin expects them.
+        probes: of this series.
+        frame: its mean frame against the model.
+        asked: changes.
+        moved: what each does to this series.
+        thicker: what its scene with one material thicker by THICKNESS_SD would show, by material.
+    """
+    signal, shrink = frame.signal_DN, probes.shrink
+    nuisances = local_nuisances(probes, signal, thicker, sharp=session.model.sharp) | gain_map_noise(
+        session, probes, signal
+    )
+    responses = np.zeros((len(asked), len(probes)))
+    known = [(number, found) for number, found in enumerate(moved) if found is not None]
+    if known:
+        responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
+    pattern, jitter = changed_gain_pattern(probes, signal)
+    by_side = uneven(
+        probes,
+        {number: found[0] for number, found in known if asked[number].change.label in scales.UNEVEN},
+        signal.shape,
+    )
+    return SeriesBlock(
+        session=probes.series.session,
+        names=probes.names,
+        residual=probes.residual(frame.residual_DN),
+        sd=probes.sd,
+        noise=probes.noise,
+        nuisances={name: column * shrink for name, column in nuisances.items()},
+        responses=responses,
+        offset=offset_of_later(probes) * shrink,
+        pattern=pattern * shrink[:, None],
+        pattern_jitter=jitter * shrink**2,
+        uneven={number: columns * shrink for number, columns in by_side.items()},
+    )
+
+
+def _places(blocks: Sequence[SeriesBlock]) -> list[slice]:
+    """Where each series' probes lie among those of all."""
+    stops = np.cumsum([len(block) for block in blocks])
+    return [slice(int(stop) - len(block), int(stop)) for block, stop in zip(blocks, stops, strict=True)]
+
+
+def by_chance(
+    variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None
+) -> NDArray[np.float64] | None:
+    """Random responses (probe, factor) a unit of strength; None: the effect does nothing by chance.
+
+    A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
+    a part of a gain map's change is smooth; bits that are cut off lower every level. row: number of the variant's first change.
+    """
+    if variant.effect in scales.UNEVEN:
+        sides = np.zeros((sum(map(len, blocks)), 2))
+        for block, place in zip(blocks, _places(blocks), strict=True):
+            if row in block.uneven:
+                sides[place] = block.uneven[row].T
+        return sides * (scales.UNEVEN_SHARE / variant.strengths[0])
+    if variant.effect == "quantisation" and variant.since == "calibration":
+        # lost bits may be cut off or rounded away: half a step between the two
+        return np.concatenate([block.offset for block in blocks])[:, None] * scales.CUT_OFF_SHARE
+    if variant.effect == "gain_map_error":
+        return np.concatenate([block.pattern for block in blocks])
+    return _of_output(variant, blocks, readout_ms) if variant.effect == "output_drift" else None
+
+
+def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:
+    """What a wandering output does by chance (probe, factor): levels of lit series together, trend and common factor of each."""
+    size = sum(map(len, blocks))
+    lit = [
+        (block, place) for block, place in zip(blocks, _places(blocks), strict=True) if block.session.request.beam_on
+    ]
+    if not lit:
+        return None
+    wanders = OutputCourse(variant.parameters["correlation_s"], variant.parameters["jitter_share"])
+    columns = []
+    means = wanders.means([block.session.request for block, _ in lit], readout_ms)
+    for shares in means.T:
+        level = np.zeros(size)
+        for (block, place), share in zip(lit, shares, strict=True):
+            level[place] = block.nuisances[level_of(block.session)] * (0.01 * share / scales.LEVEL_OF_SERIES_SD)
+        columns.append(level)
+    for block, place in lit:
+        request = block.session.request
+        profiles = dict(time_templates(request.frames))
+        for index, name in enumerate(block.names):
+            if name.statistic.startswith("trend"):
+                along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
+                amount = 0.01 * along / math.sqrt(request.frames)
+            elif name.statistic == "frame_factor":
+                amount = 0.5
+            else:
+                continue
+            column = np.zeros(size)
+            column[place.start + index] = amount / block.sd[index]
+            columns.append(column)
+    return np.stack(columns, axis=1)

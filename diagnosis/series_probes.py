@@ -1,0 +1,271 @@
+"""How one series is turned into standardised numbers: what its mean frame is projected on, and its scalar probes."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import changes as scales
+from .calibrated_maps import CalibratedMaps
+from .changes import Variant
+from .even_maps import Map, full_size, signal_map
+from .fixed_pattern import count_outliers, pattern_statistics
+from .forward_model import strength_rows
+from .placing import SHARP_SCENES, displacement_probes, inside
+from .probes import (
+    MapProjection,
+    ProbeName,
+    Scalar,
+    Template,
+    edge_templates,
+    measured_scalars,
+    smooth_templates,
+    transmission_templates,
+)
+from .registration import render_variance
+from .responses import Moved, SeriesModel, SessionModel
+from .summaries import SeriesSummary
+
+_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+_AXIS_OF_EFFECT = {
+    "object_scatter": "level",
+    "veiling_glare": "sharpness",
+    "focal_spot": "sharpness",
+    "mtf_tail": "sharpness",
+    "k_fluorescence": "sharpness",
+    "motion_blur": "sharpness",
+    "misregistration": "sharpness",
+    "image_lag": "time",
+    "dark_drift": "level",
+    "nonlinearity": "level",
+    "kv_error": "energy",
+    "filtration_error": "energy",
+    "composition_error": "energy",
+    "heel": "position",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeanFrame:
+    """A series' corrected mean frame against the model; maps (row, column).
+
+    Fields: signal_DN: expected; residual_DN: measured less expected; mask: pixels that are compared; quantum_DN2, white_DN2: variance
+    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white.
+    """
+
+    signal_DN: NDArray[np.float64]
+    residual_DN: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    quantum_DN2: NDArray[np.float64]
+    white_DN2: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesProbes:
+    """The probes of one series: projections of its mean frame, then scalars.
+
+    Fields: series; projection; scalars: measured; shrink (probe,): what each number is multiplied with to have unit noise again once
+    the floor of what edges show is added.
+    """
+
+    series: SeriesModel
+    projection: MapProjection
+    scalars: tuple[Scalar, ...]
+    shrink: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.shrink)
+
+    @property
+    def names(self) -> list[ProbeName]:
+        """One name a probe."""
+        return self.projection.names() + [_named(probe) for probe in self.scalars]
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """Standard deviation (probe,) of scalar probes in their unit; 1 for map probes."""
+        return np.concatenate([np.ones(len(self.projection)), [probe.sd for probe in self.scalars]])
+
+    @property
+    def noise(self) -> NDArray[np.float64]:
+        """Counting noise's share (probe,) of each probe's standard deviation."""
+        shares = [probe.sampling_sd / probe.sd for probe in self.scalars]
+        return np.concatenate([np.ones(len(self.projection)), shares]) * self.shrink
+
+    def residual(self, residual_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Measured less expected (probe,), standardised; residual_DN: of the mean frame (row, column)."""
+        expected = self.series.scalars
+        scalars = np.array([(probe.value - expected[probe.name]) / probe.sd for probe in self.scalars])
+        return np.concatenate([self.projection.apply(residual_DN), scalars]) * self.shrink
+
+    def responses(self, moved: Sequence[Moved]) -> NDArray[np.float64]:
+        """Responses (change, probe), standardised, to changes of the mean frame and of the scalars."""
+        expected = self.series.scalars
+        maps = self.projection.apply_each([image for image, _ in moved])
+        scalars = np.array(
+            [
+                [
+                    (values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd
+                    for _, values in moved
+                ]
+                for probe in self.scalars
+            ]
+        ).reshape(-1, len(moved))
+        return np.asarray(np.concatenate([maps, scalars.T], axis=1) * self.shrink)
+
+    def of_maps(self, images_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Responses (image, probe), not shrunk, to changes of the mean frame alone (image, row, column)."""
+        return self.without_scalars(self.projection.apply(images_DN))
+
+    def without_scalars(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses (image, probe) of which the map probes' are given (image, map probe) and the scalars' are 0."""
+        return np.pad(projected, ((0, 0), (0, len(self.scalars))))
+
+    def of_scalars(self, change: Callable[[Scalar], float]) -> NDArray[np.float64]:
+        """Response (probe,), not shrunk, to changes of the scalars alone, each in its unit."""
+        return np.concatenate([np.zeros(len(self.projection)), [change(probe) / probe.sd for probe in self.scalars]])
+
+
+def _named(probe: Scalar) -> ProbeName:
+    return ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit)
+
+
+def mean_frame(
+    one: SeriesModel,
+    corrected_DN: NDArray[np.float64],
+    maps: CalibratedMaps,
+    *,
+    clean: NDArray[np.bool_],
+    side: int,
+) -> MeanFrame:
+    """A series' corrected mean frame (row, column) against the model.
+
+    clean: pixels in use that do not stand out (row, column); side: of the squares of the panel's pixels that stand for pixels.
+    """
+    shape, frames, expected = clean.shape, one.session.series.n_frames, one.expected
+    signal = signal_map(expected, shape)
+    mask = clean if one.placement is None else inside(clean, one.placement)
+    quantum = full_size(expected.quantum_variance_DN2, shape) / frames + signal**2 * maps.gain_quantum
+    white = full_size(expected.white_variance_DN2, shape) / frames + signal**2 * maps.gain_white
+    white = white + maps.dark_noise(one.session)
+    if one.session.series.kind == "object":
+        white = white + render_variance(signal, side=side)
+        if one.session.request.scene_kind not in SHARP_SCENES:
+            # steps of wedges and outlines of products are rendered no better than their maps' pixels
+            mask = mask & ~_near_steps(signal)
+    return MeanFrame(
+        signal_DN=signal, residual_DN=corrected_DN - signal, mask=mask, quantum_DN2=quantum, white_DN2=white
+    )
+
+
+def _near_steps(signal: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels within two of a step in the signal."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
+    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
+    return steps
+
+
+def series_probes(
+    session: SessionModel,
+    one: SeriesModel,
+    frame: MeanFrame,
+    *,
+    summary: SeriesSummary,
+    moved: Sequence[Moved | None],
+    variants: Sequence[Variant],
+    clean: NDArray[np.bool_],
+    all_outliers: int,
+    memory: tuple[float, int] | None,
+) -> SeriesProbes:
+    """The probes of one series.
+
+    Args:
+        session: all series as the base twin expects them.
+        one: this series.
+        frame: its mean frame against the model.
+        summary: what its frames' noise says.
+        moved: what the changes do to it, those of variants' strengths first.
+        variants: effects to try; the mean frame is projected on what each does at its first strength.
+        clean: pixels in use that do not stand out (row, column).
+        all_outliers: pixels that stand out in any series.
+        memory: of outlying pixels in this series, see `memory_of`.
+    """
+    first = [(variant, moved[rows[0]]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
+    projection = MapProjection(
+        _templates(session, one, frame, [(variant, found[0]) for variant, found in first if found is not None]),
+        mask=frame.mask,
+        quantum_DN2=frame.quantum_DN2,
+        white_DN2=frame.white_DN2,
+        autocovariance_table=one.expected.noise_autocovariance,
+    )
+    kind, good = one.session.series.kind, session.maps.good
+    pattern, outliers = None, None
+    if kind in ("flat", "dark"):
+        lit = frame.signal_DN if kind == "flat" else None
+        pattern = pattern_statistics(frame.residual_DN, lit, clean=clean, good=good)
+        noise = frame.quantum_DN2 + frame.white_DN2
+        outliers = count_outliers(frame.residual_DN, noise, pattern.pixel_DN2, clean=clean, good=good)
+    scalars = measured_scalars(
+        summary,
+        one.expected,
+        one.context,
+        dark_mean_DN=float(np.mean(session.maps.darks.under(one.session)[clean])),
+        pattern=pattern,
+        outliers=outliers,
+        all_outliers=all_outliers,
+        memory=memory,
+    )
+    scalars = [probe for probe in scalars if probe.name in one.scalars]
+    if one.placement is not None and one.tells_displacement:
+        scalars += displacement_probes(one.placement)
+    floored = 1.0 / math.hypot(1.0, scales.SHARPNESS_FLOOR)
+    at_edges = [
+        kind == "object" and name.axis == "sharpness" and name.statistic == "mean frame" for name in projection.names()
+    ]
+    return SeriesProbes(
+        series=one,
+        projection=projection,
+        scalars=tuple(scalars),
+        shrink=np.array([floored if edge else 1.0 for edge in at_edges] + [1.0] * len(scalars)),
+    )
+
+
+def _templates(
+    session: SessionModel, one: SeriesModel, frame: MeanFrame, likenesses: Sequence[tuple[Variant, Map]]
+) -> list[Template]:
+    """What a mean frame is projected on, the plain shapes first; likenesses: what effects do to it."""
+    kind, signal = one.session.series.kind, frame.signal_DN
+    templates = smooth_templates(signal, frame.mask, kind=kind)
+    if kind == "object":
+        open_map = np.full(signal.shape, float(np.max(signal)))
+        templates += transmission_templates(signal, open_map, frame.mask)
+        templates += edge_templates(signal)
+    if kind == "afterglow":
+        templates += _ghost_templates(one, session.series, signal.shape)
+    templates += [
+        Template(
+            axis=_AXIS_OF_EFFECT.get(variant.effect, "position"),
+            name=f"like {variant.effect} {variant.name}".strip(),
+            unit="1",
+            image=image,
+        )
+        for variant, image in likenesses
+        if image.shape == signal.shape
+    ]
+    return templates
+
+
+def _ghost_templates(one: SeriesModel, series: Sequence[SeriesModel], shape: tuple[int, ...]) -> list[Template]:
+    """The picture exposed last before an afterglow."""
+    lit = [
+        other
+        for other in series
+        if other.session.request.beam_on and other.session.series.index < one.session.series.index
+    ]
+    if not lit:
+        return []
+    return [Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=signal_map(lit[-1].expected, shape))]

@@ -1,0 +1,103 @@
+"""The diagnosis in words: what each verdict must say."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from raytwin.diagnosis.diagnose import Cause, Gap, Place
+from raytwin.diagnosis.explanation import paragraph
+
+
+def place(axis, series, z, *, statistic="mean frame", location=""):
+    return Place(axis=axis, series=series, statistic=statistic, location=location, unit="1", z=z)
+
+
+def cause(effect, probability, strength, *, unit="%", sign=1.0):
+    return Cause(
+        effect=effect,
+        probability=probability,
+        strength=strength,
+        unit=unit,
+        parameters={},
+        sign=sign,
+        since="always",
+        shrinks_by=(0.8, 0.7, 0.9),
+    )
+
+
+def diagnosis(verdict, **more):
+    views = [
+        SimpleNamespace(session=SimpleNamespace(name=name, series=SimpleNamespace(kind=kind)))
+        for name, kind in (("flat_1", "flat"), ("dark_1", "dark"), ("slab_near", "object"))
+    ]
+    fields = {
+        "verdict": verdict,
+        "gap": Gap(before=3.0, after=1.2, floor=0.8, shrinks_by=(0.82, 0.75, 0.9)),
+        "where": (
+            place("level", "slab_near", -44.0, location="like object_scatter width_mm 40, energy_exponent -0.8"),
+            place("position", "flat_1", 26.0, location="halves along rows"),
+            place("position", "flat_1", -12.0, statistic="fixed_pattern rows"),
+            place("texture", "dark_1", 23.0, statistic="block_ratio"),
+        ),
+        "causes": (),
+        "named": (),
+        "mislabelled": (),
+        "not_tested": {},
+        "warnings": (),
+        "strained": (),
+        "notes": (),
+        "next_measurement": None,
+        "probability_no_gap": 0.0,
+        "probability_unknown": 0.91,
+        "unknown_location": "position of flat",
+        "problem": SimpleNamespace(views=views),
+    }
+    return SimpleNamespace(**fields | more)
+
+
+def test_an_unknown_effect_has_its_place_and_signature_in_words():
+    text = paragraph(diagnosis("unknown_effect"))
+    assert "No effect of the catalogue, and no pair of them, explains it (probability 0.91" in text
+    assert "It is seen most in the pattern across the field of flats." in text
+    # the largest of each kind of series and axis, largest first
+    families = (
+        "brightness of objects (z -44); pattern across the field of flats (z +26); noise texture of darks (z +23)"
+    )
+    assert f"Its signature: {families}." in text
+    # a probe that looks for an effect says so in words, not by the parameters of its template
+    assert "in the shape of: radiation scattered by the object" in text
+    assert "width_mm" not in text
+
+
+@pytest.mark.parametrize(
+    ("location", "words"),
+    [
+        ("sharpness of object edge_far_x", "sharpness at edges of edge_far_x"),
+        ("time of afterglow", "change with time of frames after the beam"),
+    ],
+)
+def test_the_place_of_an_unknown_effect_names_scenes_and_kinds(location, words):
+    assert f"It is seen most in the {words}." in paragraph(diagnosis("unknown_effect", unknown_location=location))
+
+
+def test_an_explanation_states_strength_interval_probability_and_what_is_left():
+    found = cause("object_scatter", 0.94, (12.3, 9.9, 14.8))
+    text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",)))
+    assert "12.3 % (9.9 to 14.8), probability 0.94" in text
+    assert "falls to 1.20 once that is added, by 82 % (75 to 90) of what is above noise" in text
+    lower = cause("kv_error", 0.9, (2.0, 1.5, 2.5), sign=-1.0)
+    assert "-2.00 % (-2.50 to -1.50)" in paragraph(diagnosis("explained", causes=(lower,), named=("kv_error",)))
+
+
+def test_a_tie_names_its_members_and_the_measurement_that_would_break_it():
+    tied = (cause("image_lag", 0.5, (1.0, 0.5, 2.0)), cause("dark_drift", 0.4, (5.0, 2.0, 9.0), unit="DN"))
+    text = paragraph(diagnosis("ambiguous", causes=tied, next_measurement={"text": "take beam-off frames"}))
+    assert "(0.50)" in text and "(0.40)" in text
+    assert text.rstrip(".").endswith("To tell them apart: take beam-off frames")
+
+
+def test_no_gap_says_how_sure_it_is_and_wrong_labels_come_before_everything():
+    assert "probability 0.87 that nothing is missing" in paragraph(diagnosis("no_gap", probability_no_gap=0.87))
+    doubt = SimpleNamespace(text="flat_1 looks like 60 kV, not 90 kV")
+    text = paragraph(diagnosis("unknown_effect", mislabelled=(doubt,), warnings=("flat_1",)))
+    assert text.startswith("Labels look wrong: flat_1 looks like 60 kV, not 90 kV. No effect is named")

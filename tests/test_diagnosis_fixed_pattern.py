@@ -1,0 +1,150 @@
+"""Fixed patterns of mean frames: what noise leaves, grain, lines and pixels that stand out."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from raytwin.diagnosis.calibrated_maps import CalibratedMaps
+from raytwin.diagnosis.defects import new_outliers
+from raytwin.diagnosis.fixed_pattern import count_outliers, lines_of, pattern_noise, pattern_statistics
+from raytwin.diagnosis.noise_correlation import correlation_sum
+
+SHAPE = (96, 128)
+ALL = np.ones(SHAPE, dtype=bool)
+BLUR_PX = 0.9
+QUANTUM_DN2, WHITE_DN2, FRAMES = 900.0, 100.0, 25
+SIGNAL = np.full(SHAPE, 5000.0)
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """Noise of one frame: quanta blurred by a Gaussian, and white noise."""
+    impulse = np.zeros((65, 65))
+    impulse[32, 32] = 1.0
+    kernel = gaussian_filter(impulse, BLUR_PX)
+    spectrum = np.abs(np.fft.fft2(kernel)) ** 2
+    table = np.real(np.fft.ifft2(spectrum))[:9, :9]
+    return SimpleNamespace(
+        quantum_variance_DN2=np.full(SHAPE, QUANTUM_DN2),
+        white_variance_DN2=np.full(SHAPE, WHITE_DN2),
+        noise_autocovariance=np.ascontiguousarray(table / table[0, 0]),
+    )
+
+
+def mean_frame(rng):
+    quanta = gaussian_filter(rng.standard_normal(SHAPE), BLUR_PX, mode="wrap")
+    quanta *= np.sqrt(QUANTUM_DN2) * 2.0 * np.sqrt(np.pi) * BLUR_PX
+    return (quanta + np.sqrt(WHITE_DN2) * rng.standard_normal(SHAPE)) / np.sqrt(FRAMES)
+
+
+def found_in(residual, clean=ALL, good=ALL, signal=SIGNAL):
+    return pattern_statistics(residual, signal, clean=clean, good=good)
+
+
+def test_noise_alone_leaves_what_its_correlation_says(expected):
+    rng = np.random.default_rng(1)
+    seen = [found_in(mean_frame(rng)) for _ in range(40)]
+    wanted = pattern_noise(expected, ALL, FRAMES, 0.0, 0.0, lines=True)
+    # forty frames of 96 and 128 lines: 4 % for lines, less for the rest
+    for name, tolerance in (("pixel_DN2", 0.02), ("blocks_DN2", 0.1), ("rows_DN2", 0.09), ("columns_DN2", 0.09)):
+        mean = np.mean([getattr(one, name) for one in seen])
+        assert mean == pytest.approx(getattr(wanted, name), rel=tolerance), name
+    # neighbouring lines share quanta: second differences hold far less than twice what lines without them would
+    assert wanted.rows_DN2 < 0.6 * QUANTUM_DN2 / FRAMES * correlation_sum(expected, 1, SHAPE[1]) / SHAPE[1]
+
+
+def test_noise_of_the_maps_is_added_and_lines_are_left_out_where_nothing_is_known_of_them(expected):
+    alone = pattern_noise(expected, ALL, FRAMES, 0.0, 0.0, lines=True)
+    doubled = pattern_noise(expected, ALL, FRAMES, QUANTUM_DN2 / FRAMES, WHITE_DN2 / FRAMES, lines=True)
+    assert doubled.rows_DN2 == pytest.approx(2.0 * alone.rows_DN2)
+    assert doubled.blocks_DN2 == pytest.approx(2.0 * alone.blocks_DN2)
+    without = pattern_noise(expected, ALL, FRAMES, 0.0, 0.0, lines=False)
+    assert without.rows_DN2 is None and without.columns_DN2 is None
+    assert found_in(mean_frame(np.random.default_rng(2)), signal=None).rows_DN2 is None
+
+
+def test_grain_shows_in_lines_as_its_pixels_say_and_smooth_shapes_do_not():
+    rng = np.random.default_rng(3)
+    grain = 25.0 * rng.standard_normal(SHAPE)
+    y, x = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
+    seen = found_in(grain + 200.0 * x + 150.0 * y**2)
+    assert seen.pixel_DN2 == pytest.approx(625.0, rel=0.03)
+    assert seen.rows_DN2 == pytest.approx(625.0 / SHAPE[1], rel=0.4)
+    assert seen.columns_DN2 == pytest.approx(625.0 / SHAPE[0], rel=0.4)
+
+
+def test_a_seam_of_two_narrow_columns_shows_in_columns_alone():
+    seam = np.zeros(SHAPE)
+    seam[:, 63:65] = -40.0
+    seen = found_in(seam)
+    # second differences -40, 40, 40, -40 among 126
+    assert seen.columns_DN2 == pytest.approx(4.0 * 1600.0 / 6.0 / 126.0, rel=0.02)
+    assert seen.rows_DN2 < 1e-6
+    rows, columns = lines_of(seam.astype(np.float32))
+    assert columns == pytest.approx(seen.columns_DN2, rel=0.02)
+    assert rows == pytest.approx(0.0, abs=1e-9)
+    assert lines_of(np.zeros((1, 1), np.float32)) == (0.0, 0.0)
+
+
+def test_a_line_whose_pixels_all_stand_out_is_a_line_and_a_dead_one_a_defect():
+    narrow = np.zeros(SHAPE)
+    narrow[:, 40] = -0.04 * 5000.0
+    flagged = ALL.copy()
+    flagged[:, 40] = False
+    counted = found_in(narrow, clean=flagged)
+    assert counted.columns_DN2 == pytest.approx(6.0 * 200.0**2 / 6.0 / 126.0, rel=0.02)
+    dead = np.zeros(SHAPE)
+    dead[:, 40] = -5000.0
+    assert found_in(dead, clean=flagged).columns_DN2 < 1e-6
+    # pixels that stand out here and there do not make a line
+    scattered = np.zeros(SHAPE)
+    scattered[::7, 40] = 400.0
+    assert found_in(scattered, clean=scattered == 0).columns_DN2 < 1e-6
+
+
+def test_pixels_that_stand_out_of_noise_and_pattern_are_counted():
+    rng = np.random.default_rng(4)
+    variance = np.full(SHAPE, 36.0)
+    residual = 6.0 * rng.standard_normal(SHAPE)
+    places = rng.choice(residual.size, 12, replace=False)
+    residual.flat[places] += 120.0
+    clean = ALL.copy()
+    clean.flat[places] = False
+    assert count_outliers(residual, variance, 36.0, clean=clean, good=ALL) == 12
+    assert count_outliers(residual, variance, 36.0, clean=clean, good=clean) == 0
+    # among grain ten times as strong as noise they do not stand out
+    assert count_outliers(residual, variance, 3600.0, clean=clean, good=ALL) == 0
+
+
+def test_pixels_that_stand_out_before_every_object_are_the_panels_own():
+    rng = np.random.default_rng(5)
+    signal = np.full(SHAPE, 3000.0)
+    dead, hot = (20, 30), (50, 90)
+    kept, looks, expected = [], {}, {}
+    for number in range(5):
+        scene = signal.copy()
+        scene[:, 10 + 20 * number :] *= 0.4  # each product's outline lies elsewhere, and is drawn a pixel off
+        drawn = np.roll(scene, 1, axis=1)
+        for exposure_ms in (25.0, 100.0):
+            picture = scene + 30.0 * rng.standard_normal(SHAPE)
+            picture[dead] = 0.0
+            picture[hot] += 5.0 * exposure_ms  # stands out of the longer exposure alone
+            name = f"product{number}_{exposure_ms:g}ms"
+            series = SimpleNamespace(kind="object", scene=f"product{number}", kV=60.0, exposure_ms=exposure_ms)
+            kept.append(SimpleNamespace(name=name, series=series, calibrates=False))
+            looks[name] = SimpleNamespace(mean_DN=picture)
+            expected[name] = SimpleNamespace(signal_DN=drawn)
+    maps = CalibratedMaps(
+        darks=SimpleNamespace(under=lambda item: np.zeros(SHAPE)),
+        gain=np.ones(SHAPE),
+        shares={},
+        gain_quantum=0.0,
+        gain_white=0.0,
+        good=ALL,
+        frames={},
+    )
+    assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps))] == [dead, hot]
+    # three products are too few to tell a defect from what they have in common
+    assert not new_outliers(kept[:6], expected, looks, maps).any()

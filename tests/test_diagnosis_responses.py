@@ -1,0 +1,182 @@
+"""Dark and gain map of calibrating series, and what changes of the forward model can move."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from raytwin.acquisition.setting import setting_from_text
+from raytwin.diagnosis.calibrated_maps import calibrated_maps
+from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.even_maps import compact, full_size
+from raytwin.diagnosis.forward_model import Change, strength_rows
+from raytwin.diagnosis.placing import inside
+from raytwin.diagnosis.registration import Placement
+from raytwin.generator.effects import AppliedEffect
+from raytwin.generator.series import SeriesRequest
+
+SHAPE = (12, 16)
+GOOD = np.ones(SHAPE, dtype=bool)
+
+
+def series(name, kind, *, exposure_ms, frames=20, calibrates=True, corrected=frozenset()):
+    stated = SimpleNamespace(name=name, kind=kind, exposure_ms=exposure_ms, n_frames=frames, corrected=corrected)
+    return SimpleNamespace(
+        name=name, series=stated, request=SimpleNamespace(beam_on=kind in ("flat", "object")), calibrates=calibrates
+    )
+
+
+def expectation(signal_DN, *, quantum_DN2=0.0, white_DN2=4.0):
+    """What a model with all pixels alike expects."""
+    one = np.ones((1, 1))
+    return SimpleNamespace(
+        signal_DN=signal_DN * one, quantum_variance_DN2=quantum_DN2 * one, white_variance_DN2=white_DN2 * one
+    )
+
+
+def twin(dark_DN=7.0):
+    maps = SimpleNamespace(
+        shape=SHAPE,
+        dark_at=lambda exposure_ms: np.full(SHAPE, dark_DN, np.float32),
+        gain_relative=np.full(SHAPE, 1.1, np.float32),
+    )
+    return SimpleNamespace(maps=maps, levels=())
+
+
+def maps_of(kept, means_DN, expected):
+    looks = {
+        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames)
+        for item in kept
+        if item.name in means_DN
+    }
+    return calibrated_maps(kept, expected, looks, twin=twin(), good=GOOD)
+
+
+@given(
+    exposures_ms=st.lists(st.floats(1.0, 500.0), min_size=2, max_size=5, unique=True).filter(
+        lambda values: max(values) > 1.01 * min(values)
+    ),
+    frames=st.lists(st.integers(1, 100), min_size=5, max_size=5),
+    asked_ms=st.floats(1.0, 500.0),
+)
+def test_a_dark_that_grows_evenly_with_the_exposure_is_known_at_any(exposures_ms, frames, asked_ms):
+    offset = 100.0 + np.arange(np.prod(SHAPE), dtype=float).reshape(SHAPE)
+    darks = [
+        series(f"dark{k}", "dark", exposure_ms=ms, frames=n)
+        for k, (ms, n) in enumerate(zip(exposures_ms, frames, strict=False))
+    ]
+    scene = series("scene", "object", exposure_ms=asked_ms, calibrates=False)
+    means = {item.name: offset + 0.02 * item.series.exposure_ms for item in darks}
+    maps = maps_of([*darks, scene], means, {item.name: expectation(0.0) for item in darks})
+    assert sum(maps.darks.weights[asked_ms].values()) == pytest.approx(1.0)
+    np.testing.assert_allclose(maps.darks.under(scene), offset + 0.02 * asked_ms, rtol=1e-6)
+
+
+def test_darks_of_the_same_exposure_average_and_their_noise_falls_with_the_frames():
+    darks = [series("few", "dark", exposure_ms=50.0, frames=10), series("many", "dark", exposure_ms=50.0, frames=30)]
+    scene = series("scene", "object", exposure_ms=50.0, calibrates=False)
+    means = {"few": np.full(SHAPE, 100.0), "many": np.full(SHAPE, 104.0)}
+    maps = maps_of([*darks, scene], means, {item.name: expectation(0.0, white_DN2=4.0) for item in darks})
+    np.testing.assert_allclose(maps.darks.under(scene), 103.0)
+    assert maps.dark_noise(scene) == pytest.approx(4.0 / 40)
+
+
+def test_without_calibrating_series_dark_and_gain_are_the_twins_and_corrected_series_stay():
+    scene = series("scene", "object", exposure_ms=50.0, calibrates=False)
+    done = series("done", "object", exposure_ms=50.0, calibrates=False, corrected=frozenset(("offset", "gain")))
+    maps = maps_of([scene, done], {}, {})
+    assert maps.shares == {}
+    np.testing.assert_allclose(maps.corrected(scene, np.full(SHAPE, 1107.0)), 1000.0, rtol=1e-6)
+    np.testing.assert_array_equal(maps.corrected(done, np.full(SHAPE, 1107.0)), 1107.0)
+    assert maps.dark_noise(done) == 0.0
+
+
+def test_the_gain_map_weighs_flats_by_signal_to_noise_and_shows_what_the_model_does_not():
+    gain = np.linspace(0.8, 1.2, np.prod(SHAPE)).reshape(SHAPE)
+    gain[3, 4] = 0.0  # a dead pixel
+    dark = series("dark", "dark", exposure_ms=50.0)
+    flats = [series("weak", "flat", exposure_ms=50.0), series("strong", "flat", exposure_ms=50.0)]
+    expected = {
+        "dark": expectation(0.0, white_DN2=0.0),
+        "weak": expectation(1000.0, quantum_DN2=1000.0, white_DN2=0.0),
+        "strong": expectation(3000.0, quantum_DN2=3000.0, white_DN2=0.0),
+    }
+    means = {"dark": np.full(SHAPE, 50.0), "weak": 50.0 + 1000.0 * gain, "strong": 50.0 + 3000.0 * gain}
+    maps = maps_of([dark, *flats], means, expected)
+    assert maps.shares == pytest.approx({"weak": 0.25, "strong": 0.75})
+    np.testing.assert_allclose(maps.gain, gain, atol=1e-12)
+    # as of one flat of all the quanta: 20 frames of 4000
+    assert maps.gain_quantum == pytest.approx(1.0 / (20 * 4000.0))
+    assert maps.gain_white == 0.0
+    assert [tuple(place) for place in np.argwhere(~maps.good)] == [(3, 4)]
+
+
+def test_maps_that_are_the_same_everywhere_become_one_pixel_and_come_back():
+    even = np.full(SHAPE, 3.0)
+    assert compact(even, 1.0).shape == (1, 1)
+    np.testing.assert_array_equal(full_size(compact(even, 1.0), SHAPE), even)
+    even[2, 2] += 1e-3
+    assert compact(even, 1.0).shape == SHAPE
+
+
+def test_a_displaced_scene_is_compared_where_its_picture_covers_the_panel():
+    mask = np.ones((40, 50), dtype=bool)
+    covered = inside(mask, Placement(row_px=1.2, column_px=-3.4, row_sd_px=0.01, column_sd_px=0.01))
+    assert covered[6:-6, 6:-6].all()
+    assert covered.sum() == (40 - 12) * (50 - 12)
+
+
+def test_strengths_of_variants_lie_one_after_the_other():
+    variants = catalogue_variants()
+    rows = [row for rows in strength_rows(variants) for row in rows]
+    assert rows == list(range(sum(len(variant.strengths) for variant in variants)))
+    assert [len(rows) for rows in strength_rows(variants)] == [len(variant.strengths) for variant in variants]
+
+
+def request(kind, *, after=True, previous=()):
+    setting = None if kind == "dark" else setting_from_text("kv=80,current_ma=1,exposure_ms=50")
+    return SeriesRequest(
+        kind=kind, setting=setting, frames=10, exposure_ms=50.0, after_calibration=after, previous=previous
+    )
+
+
+def changed(effect, *, since="always", **parameters):
+    return Change(label=effect, twin=None, effects=(AppliedEffect(id=effect, parameters=parameters, since=since),))
+
+
+def test_a_change_touches_what_its_effect_can_show_and_only_after_it_began():
+    scatter = changed("object_scatter", strength=0.05)
+    assert scatter.touches(request("object"))
+    assert not scatter.touches(request("flat"))
+    late = changed("dark_drift", since="calibration", strength=2.0)
+    assert late.touches(request("dark"))
+    assert not late.touches(request("dark", after=False))
+    beam = Change(label="log_output", twin=None, spectral=True)
+    assert beam.touches(request("flat"))
+    assert not beam.touches(request("dark"))
+
+
+def test_a_shift_of_the_scene_is_its_displacement_and_a_change_of_size_is_not():
+    shift = changed("misregistration", strength=2.0, direction_deg=30.0, magnification_deg=0.0)
+    assert shift.only_displaces
+    assert not shift.touches(request("object"))
+    assert shift.displacement == pytest.approx(
+        {"displacement along rows": math.sqrt(3.0), "displacement along columns": 1.0}
+    )
+    larger = changed("misregistration", strength=2.0, direction_deg=0.0, magnification_deg=90.0)
+    assert not larger.only_displaces
+    assert larger.touches(request("object"))
+    assert larger.displacement == pytest.approx({"displacement along rows": 0.0, "displacement along columns": 0.0})
+
+
+def test_an_effect_that_began_earlier_stands_for_a_later_one_unless_what_came_before_remembers():
+    lag = {since: changed("image_lag", since=since, strength=0.01) for since in ("always", "calibration")}
+    later = request("flat", previous=(request("flat"),))
+    assert lag["always"].whenever_it_began(later) == lag["calibration"].whenever_it_began(later) is not None
+    first = request("flat", previous=(request("flat", after=False),))
+    assert lag["always"].whenever_it_began(first) is None
+    # a heel looks otherwise where calibration has seen it
+    assert changed("heel", strength=0.01).whenever_it_began(later) is None

@@ -1,0 +1,296 @@
+"""Diagnoses of sessions that another, plain simulator makes: one planted effect each, and none.
+
+The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
+the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
+NIST). A panel of Gd2O2S that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no
+pixel is cut by an edge), a Gaussian spread, 104 x 136 pixels of 0.2 mm, no times. Its effects are laws of its own: scatter and
+tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
+gain.
+
+    python validation/second_simulator.py --seed 1 --json build/second_simulator.json
+    python validation/second_simulator.py --only none kv_error tiles
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import tempfile
+import zlib
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import xraylib
+from scipy.ndimage import gaussian_filter
+
+from raytwin.acquisition import open_acquisition, write_acquisition
+from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.setting import filters_from_text
+from raytwin.diagnosis.diagnose import diagnose
+
+ROWS, COLUMNS, PIXEL_MM = 104, 136, 0.2
+SHAPE = (ROWS, COLUMNS)
+NEAR_MM, FAR_MM, DETECTOR_MM = 480.0, 360.0, 700.0
+SPREAD_PX, READ_DN, DARK_DN, HIGHEST_DN = 0.55, 6.0, 300.0, 16383
+DN_PER_KEV, SCALE, OPTICAL = 0.012, 7e-4, 1.05
+LAG_S, PAUSE_S, READOUT_MS = 0.2, 6.0, 5.0
+DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96}
+NAMES = {"Al": "Al", "Pb": "Pb", "H2O": "water"}
+CURRENT_MA = {50.0: 6.0, 100.0: 1.0}
+ALWAYS = ("object_scatter", "veiling_glare", "focal_spot", "mtf_tail", "image_lag")
+# effect: strength, and whether it has the catalogue's definition (else it is only asked whether it is named)
+CASES = {
+    "none": (0.0, True),
+    "object_scatter": (10.0, False),
+    "veiling_glare": (2.0, True),
+    "kv_error": (1.5, True),
+    "filtration_error": (0.2, True),
+    "image_lag": (0.4, True),
+    "image_lag_later": (1.0, True),
+    "focal_spot": (0.8, True),
+    "mtf_tail": (12.0, False),
+    "excess_noise": (15.0, True),
+    "nonlinearity": (1.0, True),
+    "gain_map_error": (0.5, True),
+    "row_noise": (0.4, True),
+    "quantisation": (8.0, True),
+    "output_drift": (0.6, True),
+    "dark_drift": (9.6, True),
+    "bad_pixels": (0.4, True),
+    "tiles": (0.5, False),
+    "wandering_tiles": (0.4, False),
+}
+UNKNOWN = ("tiles", "wandering_tiles")
+TILE_PX = (26, 34)
+
+
+def attenuation_per_mm(material: str, energies_keV: np.ndarray, density: float | None = None) -> np.ndarray:
+    """Linear attenuation, 1/mm."""
+    rho = DENSITY[material] if density is None else density
+    return rho / 10.0 * np.array([xraylib.CS_Total_CP(material, float(energy)) for energy in energies_keV])
+
+
+@lru_cache(maxsize=64)
+def spectrum(kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Energies, keV, and photons a pixel and mAs that the panel absorbs."""
+    import spekpy
+
+    beam = spekpy.Spek(kvp=kV, th=16.0, dk=1.0, physics="kqp", mu_data_source="nist", z=100.0)
+    beam.filter("Be", 2.5).filter("Al", aluminium_mm)
+    if copper_mm:
+        beam.filter("Cu", copper_mm)
+    energies, photons = beam.get_spectrum(edges=False)
+    stopped = 1.0 - np.exp(-0.18 * attenuation_per_mm("Gd2O2S", energies, 4.38))
+    return np.asarray(energies), np.asarray(photons) * SCALE * stopped
+
+
+class Line:
+    """A line with one effect, drawn from a generator; what charge the panel still holds goes from series to series."""
+
+    def __init__(self, effect: str, rng: np.random.Generator) -> None:
+        self.effect, self.rng = effect.removesuffix("_later"), rng
+        self.strength, self.always = CASES[effect][0], effect in ALWAYS
+        self.gain = 1.0 + 0.02 * rng.standard_normal(SHAPE) + 0.36 * gaussian_filter(rng.standard_normal(SHAPE), 12)
+        self.dark_DN = DARK_DN + 8.0 * rng.standard_normal(SHAPE)
+        self.aluminium_mm = 2.1 + 0.2 * rng.standard_normal()
+        self.kV_share = 1.0 + 0.004 * rng.standard_normal()
+        y, x = np.mgrid[:ROWS, :COLUMNS]
+        apart_mm2 = ((y - ROWS / 2) ** 2 + (x - COLUMNS / 2) ** 2) * PIXEL_MM**2
+        self.illumination = (1.0 + apart_mm2 / DETECTOR_MM**2) ** -1.5
+        self.charge_DN = np.zeros(SHAPE)
+        self.changed_gain = np.ones(SHAPE)
+        if effect == "gain_map_error":
+            self.changed_gain += self.strength / 100.0 * rng.standard_normal(SHAPE)
+        elif effect in UNKNOWN:
+            self.changed_gain += self.strength / 100.0 * np.kron(rng.standard_normal((4, 4)), np.ones(TILE_PX))
+        elif effect == "bad_pixels":
+            count = round(self.strength / 100.0 * ROWS * COLUMNS)
+            self.changed_gain.flat[rng.choice(ROWS * COLUMNS, count, replace=False)] = 0.0
+
+    def light(
+        self, kV: float, mAs: float, copper_mm: float, scene: dict[str, np.ndarray], far: bool, on: dict
+    ) -> tuple:
+        """Mean and variance of one exposure before the spread of light, DN and DN^2."""
+        voltage = kV * self.kV_share * (1.0 + on.get("kv_error", 0.0) / 100.0)
+        energies, photons = spectrum(voltage, self.aluminium_mm + on.get("filtration_error", 0.0), copper_mm)
+        depth = np.zeros((*SHAPE, 1))
+        for material, thickness_mm in scene.items():
+            depth = depth + thickness_mm[..., None] * attenuation_per_mm(material, energies)
+        arriving = photons * mAs * np.exp(-depth) * self.illumination[..., None]
+        signal = DN_PER_KEV * (arriving @ energies)
+        variance = OPTICAL * DN_PER_KEV**2 * (arriving @ energies**2)
+        if scene and "object_scatter" in on:
+            open_DN = DN_PER_KEV * mAs * float(photons @ energies) * self.illumination
+            source = np.pad(signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0)), 200)
+            wide = gaussian_filter(source, 18.0 / PIXEL_MM)[200:-200, 200:-200]
+            added = on["object_scatter"] / 100.0 * wide / 0.38 * (0.55 if far else 1.0)
+            signal, variance = signal + added, variance * (1.0 + added / signal)
+        if scene and "focal_spot" in on:
+            magnified = DETECTOR_MM / (FAR_MM if far else NEAR_MM) - 1.0
+            width_px = on["focal_spot"] * magnified / PIXEL_MM / math.sqrt(8.0 * math.log(2.0))
+            signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
+        if "veiling_glare" in on:
+            share = on["veiling_glare"] / 100.0
+            wide = [gaussian_filter(signal, length_mm / PIXEL_MM) for length_mm in (4.0, 12.0)]
+            signal = (1.0 - share) * signal + 0.5 * share * (wide[0] + wide[1])
+        return signal, variance
+
+    def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
+        """Frames (n, row, column), DN; lit: mean and variance, None without a beam."""
+        on = self.on(after)
+        if kind != "afterglow":
+            self.charge_DN = self.charge_DN * math.exp(-PAUSE_S / LAG_S)
+        released = 1.0 - math.exp(-(exposure_ms + READOUT_MS) / 1000.0 / LAG_S)
+        lag = self.strength / 100.0 if self.effect == "image_lag" else 0.0
+        shown = []
+        for _ in range(count):
+            level = np.zeros(SHAPE) if lit is None else self._exposure(*lit, on, after)
+            held = level * (1.0 - lag) + released * self.charge_DN
+            self.charge_DN = (1.0 - released) * self.charge_DN + lag * level
+            level = held if "image_lag" in on else level
+            level = level + self.dark_DN + 0.02 * exposure_ms + on.get("dark_drift", 0.0) * exposure_ms / 160.0
+            level = level + READ_DN * self.rng.standard_normal(SHAPE)
+            level = level + READ_DN * on.get("row_noise", 0.0) * self.rng.standard_normal((ROWS, 1))
+            if "wandering_tiles" in on:
+                level = level + 3.0 * np.kron(self.rng.standard_normal((4, 4)), np.ones(TILE_PX))
+            step = on.get("quantisation", 1.0)
+            shown.append(np.clip(np.floor(level / step) * step if step > 1.0 else np.round(level), 0, HIGHEST_DN))
+        return np.array(shown, dtype=np.uint16)
+
+    def on(self, after: bool) -> dict[str, float]:
+        """The effect and its strength, where it acts."""
+        return {self.effect: self.strength} if self.effect != "none" and (after or self.always) else {}
+
+    def _exposure(self, signal: np.ndarray, variance: np.ndarray, on: dict, after: bool) -> np.ndarray:
+        quanta = np.sqrt(variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)) * self.rng.standard_normal(SHAPE)
+        level = gaussian_filter(signal, SPREAD_PX) + gaussian_filter(quanta, SPREAD_PX, mode="wrap")
+        if "mtf_tail" in on:
+            share = on["mtf_tail"] / 100.0
+            level = (1.0 - share) * level + share * gaussian_filter(level, 2.5)
+        level = level * (1.0 - on.get("nonlinearity", 0.0) / 100.0 * level / (0.5 * HIGHEST_DN))
+        level = level * self.gain * (self.changed_gain if after else 1.0)
+        return level * (1.0 + on.get("output_drift", 0.0) / 100.0 * self.rng.standard_normal())
+
+
+def scenes() -> dict[str, tuple[str, dict[str, np.ndarray]]]:
+    """Kind and path lengths, mm, of what stands in the beam."""
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    wedge = np.where((y > 15) & (y < 90), np.clip((x - 8) // 16, 0, 7) * 1.5, 0.0)
+    edge = np.where(x + 0.06 * y > 70, 3.0, 0.0)
+    found = {"wedge": ("wedge", {"Al": wedge})}
+    for place in ("near", "far"):
+        found[f"slab_{place}"] = ("slab", {"H2O": np.full(SHAPE, 20.0)})
+        found[f"edge_{place}"] = ("edge", {"Pb": edge})
+    for number in range(1, 4):
+        round_px = 38.0**2 - ((y - 52) ** 2 + (x - 60 - 4 * number) ** 2) * 0.6
+        found[f"product{number}"] = ("product", {"H2O": 0.6 * np.sqrt(np.clip(round_px, 0.0, None))})
+    return found
+
+
+def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int) -> None:
+    """A session with calibrating and later series, and one effect."""
+    line = Line(effect, rng)
+    instrument = Instrument(
+        anode="W",
+        anode_angle_deg=16.0,
+        inherent_filtration=filters_from_text("Be:2.5"),
+        source_object_mm=NEAR_MM,
+        source_detector_mm=DETECTOR_MM,
+        pixel_mm=PIXEL_MM,
+        detector="area",
+        counting=False,
+        scintillator=filters_from_text("Gd2O2S:0.18"),
+        bits=14,
+        readout_ms=READOUT_MS,
+    )
+    known = scenes()
+    with write_acquisition(path, instrument) as writer:
+
+        def add(name, kind, exposure_ms, *, kV=None, copper_mm=0.0, scene="", after=False):
+            lit = None
+            current_mA = None if kV is None else CURRENT_MA[kV] * (2.0 if copper_mm else 1.0)
+            if kV is not None:
+                thickness_mm = known[scene][1] if scene else {}
+                mAs = current_mA * exposure_ms / 1000.0
+                lit = line.light(kV, mAs, copper_mm, thickness_mm, scene.endswith("far"), line.on(after))
+            writer.add_series(
+                name,
+                kind=kind,
+                frames=line.frames(frames, kind, exposure_ms, after, lit),
+                kV=kV,
+                current_mA=current_mA,
+                exposure_ms=exposure_ms,
+                filters=None if kV is None else filters_from_text(f"Cu:{copper_mm}" if copper_mm else ""),
+                frame_interval_ms=exposure_ms + READOUT_MS,
+                source_object_mm=FAR_MM if scene.endswith("far") else NEAR_MM if scene else None,
+                scene=scene,
+                role="evaluation" if after else "calibration",
+            )
+
+        for scene, (kind, thickness_mm) in known.items():
+            writer.add_scene(scene, kind=kind, thickness_mm={NAMES[key]: map_ for key, map_ in thickness_mm.items()})
+        for exposure_ms in (40.0, 160.0):
+            add(f"dark_{exposure_ms:g}", "dark", exposure_ms)
+        for kV in CURRENT_MA:
+            for exposure_ms in (20.0, 40.0, 80.0, 160.0):
+                add(f"flat_{kV:g}_{exposure_ms:g}", "flat", exposure_ms, kV=kV)
+            add(f"flat_{kV:g}_copper", "flat", 160.0, kV=kV, copper_mm=0.1)
+        add("afterglow", "afterglow", 160.0, after=True)
+        add("dark_later", "dark", 160.0, after=True)
+        for kV in CURRENT_MA:
+            for exposure_ms in (160.0, 40.0):
+                add(f"flat_{kV:g}_{exposure_ms:g}_later", "flat", exposure_ms, kV=kV, after=True)
+            add(f"flat_{kV:g}_copper_later", "flat", 160.0, kV=kV, copper_mm=0.1, after=True)
+            for scene in known:
+                add(f"{scene}_{kV:g}", "object", 160.0, kV=kV, scene=scene, after=True)
+        for scene in ("product1", "edge_near"):
+            add(f"{scene}_100_40", "object", 40.0, kV=100.0, scene=scene, after=True)
+        add("dark_last", "dark", 160.0, after=True)
+
+
+def judged(effect: str, seed: int, frames: int) -> dict:
+    """What the diagnosis says of one session."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.h5"
+        make_session(path, effect, np.random.default_rng([seed, zlib.crc32(effect.encode())]), frames)
+        with open_acquisition(path) as acquisition:
+            found = diagnose(acquisition, rng=np.random.default_rng(seed))
+    wanted = () if effect in ("none", *UNKNOWN) else (effect.removesuffix("_later"),)
+    verdict = {"none": "no_gap", **dict.fromkeys(UNKNOWN, "unknown_effect")}.get(effect, "explained")
+    strength, alike = CASES[effect]
+    cause = next((item for item in found.causes if (item.effect,) == wanted), None)
+    return {
+        "effect": effect,
+        "planted": strength,
+        "verdict": found.verdict,
+        "named": list(found.named),
+        "right": found.verdict == verdict and tuple(found.named) == wanted,
+        "strength": None if cause is None or not alike else list(cause.strength),
+    }
+
+
+def run() -> None:
+    """The table on the terminal, and the rows as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=20, help="of a series (default 20)")
+    parser.add_argument("--only", nargs="+", choices=sorted(CASES), default=list(CASES), metavar="EFFECT")
+    parser.add_argument("--json", type=Path, help="file for the rows")
+    options = parser.parse_args()
+    rows = []
+    for effect in options.only:
+        row = judged(effect, options.seed, options.frames)
+        rows.append(row)
+        told = "" if row["strength"] is None else "{:.3g} ({:.3g} to {:.3g})".format(*row["strength"])
+        named = ", ".join(row["named"]) or row["verdict"]
+        print(f"{effect:20s} {row['planted']:6g}  {'right' if row['right'] else 'WRONG'}  {named}  {told}", flush=True)
+    print(f"{sum(row['right'] for row in rows)} of {len(rows)} named rightly and alone")
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError):
+        run()

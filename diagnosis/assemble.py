@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
-from ..generator.series import ExpectedSeries, expected_series, session_conditions
+from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
@@ -144,8 +144,11 @@ def build_problem(
     """
     tell = progress or (lambda stage: None)
     session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere)
-    conditions = session_conditions([item.request for item in session], readout_ms=twin.instrument.readout_ms)
-    model = ForwardModel(base=smooth_twin(twin), conditions=conditions)
+    requests = [item.request for item in session]
+    base, cache = smooth_twin(twin), draft_cache()
+    conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
+    conditions |= beam_conditions(base, requests, cache=cache)
+    model = ForwardModel(base=base, conditions=conditions, cache=cache)
     measured = _measured(session, acquisition, twin, model, tell=tell)
     expected = measured.expected
     tell("responses")

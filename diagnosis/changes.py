@@ -56,6 +56,7 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
         {"width_mm": 25.0},
         {"width_mm": 70.0},
         {"width_mm": 200.0},
+        {"width_mm": 400.0, "own_directions": 1.0, "energy_exponent": -0.25},
         {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
     ],
 }
@@ -67,7 +68,12 @@ DEFINED_BY: Mapping[str, str] = {
     "bad_pixels": "outliers in any series",
 }
 # relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
-DEFINED_SD: Mapping[str, float] = {"gain_map_error": 0.12, "image_lag": 0.08, "quantisation": 0.06}
+DEFINED_SD: Mapping[str, float] = {
+    "gain_map_error": 0.12,
+    "image_lag": 0.08,
+    "quantisation": 0.06,
+    "output_drift": 0.12,  # of frames' levels, which calibration has taken in by beam
+}
 # what these do by chance hangs on their inner parameters: they stay those of the grid
 KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
-from ..generator.series import with_conditions
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
-from .changes import DEFINED_SD, catalogue_variants
+from .changes import catalogue_variants
 from .coarse import UNSEEN, in_pixels
 from .forward_model import can_show
-from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, fit_curve, law_terms, weigh_hypotheses
+from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, law_terms, weigh_hypotheses
 from .next_series import best_measurement, proposal_text
 from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .refine import refine
 from .registration import SHARP_PX
+from .strengths import applied_at_best, strength_of, strengths_on
 from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
@@ -31,8 +31,6 @@ EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from whic
 POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
-_STRENGTH_LAW_SD = 0.12  # relative, of a strength as real effects have it
-_OUTRIGHT_NODES = 800
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 _MOST_LEFT_TYPICALLY = 0.45  # of a probe that shows the gap
 _SHOWN = 5.0  # standard deviations from which a probe shows it
@@ -373,7 +371,7 @@ def judge(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
-                strength=_strength_of(problem, best, effect),
+                strength=strength_of(problem, best, effect),
                 unit=EFFECTS[effect].strength.unit,
                 parameters=dict(curve.parameters),
                 sign=variant.sign,
@@ -396,7 +394,7 @@ def judge(
         for index in np.argsort(-np.abs(z))[:_WORST_PLACES]
         if abs(z[index]) > threshold
     ]
-    added = tuple(_applied(problem, leading.variants[effect], leading.strengths[effect][0]) for effect in named)
+    added = tuple(applied_at_best(problem, leading, effect) for effect in named)
     improved = replace(twin, effects=(*twin.effects, *added))
     pairs = sorted(
         {
@@ -429,43 +427,6 @@ def judge(
         not_tested=_out_of_reach(problem, whitened, shared),
         strained=_strained(problem, leading, nuisances),
     )
-
-
-def _applied(problem: Problem, curve: Curve, strength: float) -> AppliedEffect:
-    variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
-    return with_conditions(variant.applied(strength), problem.conditions)
-
-
-def _strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
-    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength.
-
-    Where a probe of the session measures what the strength means, it is read from there, whatever the rest of the law asks for.
-    """
-    curve = hypothesis.variants[effect]
-    defined = effect in DEFINED_SD and curve.exact is not None and bool(curve.exact.any())
-    found = _outright(problem, hypothesis, effect) if defined else None
-    value, low, high = hypothesis.strengths[effect] if found is None else found
-    sd = _STRENGTH_LAW_SD if found is None else DEFINED_SD[effect]
-    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
-    return value, value * math.exp(-below), value * math.exp(above)
-
-
-def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
-    """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
-    curve = hypothesis.variants[effect]
-    exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
-    left = problem.residual[exact].copy()
-    for other in hypothesis.effects:
-        if other != effect:
-            left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
-    strengths = np.geomspace(curve.low / 3.0, 1.5 * curve.high, _OUTRIGHT_NODES)
-    responses = curve.weights(strengths) @ curve.responses[:, exact]
-    distance = np.sum((left - responses) ** 2, axis=1)
-    at = int(np.argmin(distance))
-    near = distance < distance[at] + 1.96**2
-    if at in (0, len(strengths) - 1):
-        return None
-    return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
 
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: Nuisances) -> tuple[tuple[str, float], ...]:
@@ -720,7 +681,7 @@ def _held_out(
         inner = Nuisances(problem.factors[fit])
         before[held] = left_over(problem, fit)
         sds[held] = inner.predicted_sd(problem.factors[held])
-        strengths = _strengths_on(problem, leading, effects, fit, inner)
+        strengths = strengths_on(problem, leading, effects, fit, inner)
         added = [(leading.variants[effect], strengths[effect]) for effect in effects]
         after[held] = left_over(problem, fit, added) if effects else before[held]
         for one, effect in zip(added, effects, strict=True):
@@ -787,34 +748,6 @@ def _contradicted(before: NDArray[np.float64], after: NDArray[np.float64], place
     unseen = _UNSEEN**2 * np.bincount(places)
     added = now > _CONTRADICTS * np.maximum(was, unseen)
     return float(now[added].sum() / max(float(was.sum()), 1e-12))
-
-
-def _strengths_on(
-    problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_], inner: Nuisances
-) -> dict[str, float]:
-    """Strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
-    strengths = {effect: leading.strengths[effect][0] for effect in effects}
-    for _ in range(3 if len(effects) > 1 else 1):
-        for effect in effects:
-            curve = leading.variants[effect]
-            if curve.by_chance_alone:
-                continue  # the strength is that of all probes
-            others = sum(
-                (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
-                np.zeros(len(problem.residual)),
-            )
-            part = replace(
-                curve,
-                responses=curve.responses[:, fit],
-                spread=None,
-                jitter=None if curve.jitter is None else curve.jitter[fit],
-                exact=None if curve.exact is None else curve.exact[fit],
-            )
-            result = fit_curve(
-                (problem.residual - others)[fit], part, inner, problem.groups[fit], places=problem.places[fit]
-            )
-            strengths[effect] = result.best
-    return strengths
 
 
 def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict[str, Any]:

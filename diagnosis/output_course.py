@@ -47,3 +47,20 @@ class OutputCourse:
         lag_s = np.abs(number[:, None] - number[None, :]) * step_s
         jitter = self.jitter_share / request.exposures_per_frame * np.eye(request.frames)
         return np.asarray((1.0 - self.jitter_share) * np.exp(-lag_s / self.correlation_s) + jitter)
+
+
+def rms_about_mean(levels: Sequence[float], courses: Sequence[NDArray[np.float64]], noise: Sequence[float]) -> float:
+    """Root mean square of all frames' relative output about its mean over them, noise taken off; 0 where noise is all.
+
+    Args:
+        levels: of each series over what is expected, less 1.
+        courses: of each series, frame by frame (frame,), relative, about any level.
+        noise: variance of one frame's level in each series that is no output.
+    """
+    frames = np.array([len(course) for course in courses], dtype=np.float64)
+    middle = float(frames @ np.asarray(levels)) / float(frames.sum())
+    squares = sum(
+        len(course) * (level - middle) ** 2 + float(np.sum((course - course.mean()) ** 2)) - len(course) * variance
+        for level, course, variance in zip(levels, courses, noise, strict=True)
+    )
+    return math.sqrt(max(squares, 0.0) / float(frames.sum()))

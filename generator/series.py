@@ -23,6 +23,7 @@ from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
 from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, Effect, effect_of, in_order
+from .effects.scatter import mean_signal_energy_keV
 from .line_state import FloatArray, LagLaw, LineContext, LineState
 from .twin import Twin
 
@@ -31,6 +32,7 @@ __all__ = [
     "LineMemory",
     "ModelCache",
     "SeriesRequest",
+    "beam_conditions",
     "expected_series",
     "final_state",
     "sample_series",
@@ -152,6 +154,36 @@ def session_conditions(requests: Sequence[SeriesRequest], *, readout_ms: float |
             found["after_s"] = max(ends[number - 1] - requests[number - 1].start_s, 1e-3)
             break
     return found
+
+
+def beam_conditions(
+    twin: Twin, requests: Sequence[SeriesRequest], *, cache: "ModelCache | None" = None
+) -> dict[str, float]:
+    """What a session's beams say of the effects' parameters that are not fitted.
+
+    reference_keV: geometric mean, over the beams that objects were measured with, of the mean energy of the open beam's signal;
+    left out where no such beam is known.
+
+    Args:
+        twin: with a spectral part, or nothing is known.
+        requests: the series of the session.
+        cache: as in `expected_series`.
+    """
+    cache = ModelCache() if cache is None else cache
+    found: dict[tuple[object, ...], float] = {}
+    for item in requests:
+        if item.kind != "object" or item.setting is None or (item.setting.kV, item.setting.filters) in found:
+            continue
+        beam = replace(item, kind="flat", thickness_mm=None, displacement_px=(0.0, 0.0), previous=())
+        try:
+            light = _lit(twin, beam, _Choice((), None, False), cache)[0].projection
+        except InputError:
+            continue
+        if light is not None and light.weights is not None and light.energies_keV is not None:
+            found[item.setting.kV, item.setting.filters] = mean_signal_energy_keV(light.weights[0], light.energies_keV)
+    if not found:
+        return {}
+    return {"reference_keV": math.exp(sum(map(math.log, found.values())) / len(found))}
 
 
 def with_conditions(effect: AppliedEffect, conditions: Mapping[str, float]) -> AppliedEffect:

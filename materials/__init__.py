@@ -16,6 +16,7 @@ from .attenuation import (
 )
 from .library import Library, library_from_files, material_from_name, nist_identifier, read_library
 from .material import Material, atomic_number_from_symbol, mass_fractions_from_formula, mixture_by_mass
+from .scattering import scattering_per_sr
 
 __all__ = [
     "MAXIMUM_ENERGY_KEV",
@@ -38,5 +39,6 @@ __all__ = [
     "nist_identifier",
     "optical_depth",
     "read_library",
+    "scattering_per_sr",
     "transmission",
 ]

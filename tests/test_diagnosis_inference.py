@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.diagnose import DOUBT, _outright, _strained, _with_doubt
+from raytwin.diagnosis.diagnose import DOUBT, _strained, _with_doubt
 from raytwin.diagnosis.inference import (
     UNKNOWN,
     Curve,
@@ -17,6 +17,7 @@ from raytwin.diagnosis.inference import (
     interval_of,
     weigh_hypotheses,
 )
+from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.whitening import Whitening
 
 PROBES = 600

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.diagnosis.output_course import OutputCourse
+from raytwin.diagnosis.output_course import OutputCourse, rms_about_mean
 from raytwin.generator.series import SeriesRequest
 
 READOUT_MS = 10.0
@@ -46,3 +46,28 @@ def test_series_means_and_courses_scatter_as_a_process_drawn_exposure_by_exposur
     assert course.along(profile, requests[0], READOUT_MS) == pytest.approx(
         float(np.std(frames[:, 0] @ profile)), rel=0.03
     )
+
+
+def split(output, frames):
+    """Levels and courses of series that follow one another."""
+    parts = np.split(output, np.cumsum(frames)[:-1])
+    return [float(part.mean()) for part in parts], [1000.0 * (1.0 + part - part.mean()) / 1000.0 for part in parts]
+
+
+def test_the_rms_of_an_output_is_that_of_its_frames_about_their_mean_whatever_its_periods():
+    frames = np.array([30, 6, 30, 12, 3])
+    clock = np.arange(frames.sum())
+    for period in (3.0, 20.0, 400.0):
+        output = 0.02 + 0.007 * np.sin(2.0 * np.pi * clock / period + 0.4)
+        levels, courses = split(output, frames)
+        assert rms_about_mean(levels, courses, [0.0] * 5) == pytest.approx(float(output.std()), rel=1e-9)
+
+
+def test_noise_of_the_frames_is_no_output():
+    rng = np.random.default_rng(5)
+    frames = np.full(40, 50)
+    output = 0.004 * rng.standard_normal(frames.sum())
+    noisy = output + 0.01 * rng.standard_normal(frames.sum())
+    levels, courses = split(noisy, frames)
+    assert rms_about_mean(levels, courses, [1e-4] * 40) == pytest.approx(0.004, rel=0.15)
+    assert rms_about_mean(levels, courses, [1e-3] * 40) == 0.0

@@ -22,6 +22,7 @@ from raytwin.generator.series import (
     LineMemory,
     ModelCache,
     SeriesRequest,
+    beam_conditions,
     expected_series,
     sample_series,
     session_conditions,
@@ -286,6 +287,46 @@ def test_scatter_of_a_harder_beam_follows_the_exponent(series_line):
     )
     assert soft * hard == pytest.approx(reference**2, rel=1e-6)
     assert abs(soft / hard - 1.0) > 0.01
+
+
+@pytest.mark.parametrize("width", [20.0, 300.0])
+def test_scatter_into_water_s_own_directions_has_its_strength_too_and_gathers_in_the_middle(series_line, width):
+    alike, own = (
+        water_slab(series_line, 20.0, width=width, energy_exponent=0.0, own_directions=share) for share in (0.0, 1.0)
+    )
+    assert own[19:21, 19:21].mean() == pytest.approx(0.20, rel=0.005)
+    assert own[0, 0] < alike[0, 0]
+
+
+def test_harder_beams_scatter_more_forward_over_an_air_gap(series_line):
+    def falls_off(setting, **parameters):
+        asked = request("object", setting=setting, thickness_mm={"water_liquid": np.full(SHAPE, 20.0)})
+        primary = expect(series_line, asked).signal_DN
+        ratio = expect(series_line, asked, applied("object_scatter", 20.0, **parameters)).signal_DN / primary - 1.0
+        return ratio[0, 0] / ratio[19, 19]
+
+    assert falls_off(SOFT) == pytest.approx(falls_off(MEASURED), rel=1e-3)
+    assert falls_off(SOFT, own_directions=1.0) > 1.002 * falls_off(MEASURED, own_directions=1.0)
+
+
+def test_a_session_s_strength_is_that_at_the_middle_of_its_beams(series_line):
+    slab = {"water_liquid": np.full(SHAPE, 20.0)}
+    usual_mm = series_line.instrument.source_object_mm
+    beams = [
+        request("object", setting=setting, thickness_mm=slab, source_object_mm=usual_mm) for setting in (SOFT, MEASURED)
+    ]
+    found = beam_conditions(series_line, [*beams, beams[0], request("dark", setting=None)])
+    (effect,) = applied("object_scatter", 20.0, energy_exponent=-0.6)
+    scatter = (with_conditions(effect, found),)
+    ratios = [
+        (expect(series_line, asked, scatter).signal_DN / expect(series_line, asked).signal_DN - 1.0)[
+            19:21, 19:21
+        ].mean()
+        for asked in beams
+    ]
+    assert math.sqrt(ratios[0] * ratios[1]) == pytest.approx(0.20, rel=0.005)
+    assert 20.0 < found["reference_keV"] < 60.0
+    assert beam_conditions(series_line, [request("dark", setting=None)]) == {}
 
 
 def test_scatter_of_the_same_width_at_any_gap_is_as_strong_there(series_line):

@@ -1,39 +1,45 @@
 """Radiation scattered by the object: a broad floor in its shadow, wider the further the detector stands behind it.
 
-    S = c (E / 45 keV)^e [a P (-ln T)] * K,    sum K = 1
+    S = c (E / E0)^e [a P (-ln T)] * K
 
 P is the primary signal and T = P / P_open; photons that the object takes out of the primary beam reappear elsewhere.
 a is the share of its materials' attenuation that is scattering, over that of water, at the beam's mean energy E: metal
 absorbs (`own_albedo` 0: every material scatters as water does). e says how scatter behind 20 mm of water changes from
-beam to beam: coherent scatter goes forward and fades with energy. A pixel that a sharp border cuts scatters as its two
-sides do.
-K is the picture of a point that scatters into all directions alike, seen on a plane at distance h:
-K(R) = h / (2 pi (h^2 + R^2)^(3/2)), half as high at R = 0.77 h. One law for the air gap: h grows as a power
-(`gap_exponent`, 1: in proportion) of the gap plus 10 mm (half of a product), and the scattered light in all stays, so
-that what a field of finite size catches falls by itself. Only the field that the detector covers is irradiated.
+beam to beam: coherent scatter goes forward and fades with energy. c is the strength at the energy E0, for a session's
+diagnosis the middle one of its own beams. A pixel that a sharp border cuts scatters as its two sides do.
+K is the picture of a scattering point, seen on a plane at distance h:
+
+    K(R) = h / (2 pi (h^2 + R^2)^(3/2)) [1 - w + w 4 pi p(theta)],    tan theta = R / g
+
+p is water's share of scattered photons into a direction, per sr, of the beam behind 20 mm of water; g is the air gap plus 10 mm
+(half of a product); `own_directions` w = 0 has all directions alike (then K is half as high at R = 0.77 h), w = 1 those of
+free atoms, with h = g for what stands nowhere else than in the air gap. One law for the gap: h grows as a power
+(`gap_exponent`, 1: in proportion) of g, and what all directions get stays, so that what a field of finite size catches
+falls by itself. Only the field that the detector covers is irradiated. Photons that scatter more than once are not counted
+apart: behind 20 mm of water they are 3-7 % of all, spread more evenly.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...materials import mass_attenuation_cm2_g, mass_photoelectric_cm2_g, material_from_name
+from ...materials import mass_attenuation_cm2_g, mass_photoelectric_cm2_g, material_from_name, scattering_per_sr
 from .._fine_picture import find_borders
-from ..line_state import LineContext, LineState, needed
+from ..line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Parameter
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0
-_REFERENCE_KEV = 45.0
 _BORDER_DEPTH = 1.0  # range of optical depth across 3 x 3 pixels from which a pixel cannot be told by its mean
+_ENERGIES = 6  # that stand for a beam where directions depend on them
 _COARSE = 48  # cells a side: the kernel is broad, so the convolution is done on block means
 
 
 @lru_cache(maxsize=8)
-def _block_means(length: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _block_means(length: int) -> tuple[FloatArray, FloatArray, float]:
     """(block mean (cell, pixel), linear interpolation back (pixel, cell), pixels a cell) along one axis."""
     cells = min(_COARSE, length)
     edges = np.linspace(0.0, length, cells + 1)
@@ -51,57 +57,79 @@ def _block_means(length: int) -> tuple[NDArray[np.float64], NDArray[np.float64],
     return mean, back, length / cells
 
 
+@dataclass(frozen=True, slots=True)
+class _Kernel:
+    """The picture of a scattering point: height h, mm; share w of water's own directions, at energies alike, over a gap g, mm."""
+
+    height_mm: float
+    own_directions: float
+    energies_keV: tuple[float, ...]
+    gap_mm: float
+
+    def cell(self, y_mm: FloatArray, x_mm: FloatArray, up_mm: float, left_mm: float) -> FloatArray:
+        """Its integral over cells of half sides `up_mm` and `left_mm` about (y, x)."""
+        alike = sum(
+            sign_y * sign_x * _corner(y_mm + sign_y * up_mm, x_mm + sign_x * left_mm, self.height_mm)
+            for sign_y in (1.0, -1.0)
+            for sign_x in (1.0, -1.0)
+        )
+        if self.own_directions == 0.0:
+            return np.asarray(alike)
+        angle = np.arctan2(np.hypot(y_mm, x_mm), self.gap_mm)
+        water = material_from_name("water_liquid")
+        own = np.mean([4.0 * np.pi * scattering_per_sr(water, one, angle) for one in self.energies_keV], axis=0)
+        return np.asarray(alike * (1.0 + self.own_directions * (own - 1.0)))
+
+
 @lru_cache(maxsize=64)
-def _kernel_transform(
-    shape: tuple[int, int], cell_mm: tuple[float, float], half_height_mm: float
-) -> NDArray[np.complex128]:
+def _kernel_transform(shape: tuple[int, int], cell_mm: tuple[float, float], kernel: _Kernel) -> NDArray[np.complex128]:
     """FFT of the kernel on the doubled coarse grid, half of it (even in both directions)."""
     rows, columns = 2 * shape[0], 2 * shape[1]
     y = np.asarray(np.fft.fftfreq(rows, 1.0 / rows) * cell_mm[0], dtype=np.float64)[:, None]
     x = np.asarray(np.fft.fftfreq(columns, 1.0 / columns) * cell_mm[1], dtype=np.float64)[None, :]
-    up, left = cell_mm[0] / 2, cell_mm[1] / 2
-    kernel = sum(
-        sign_y * sign_x * _corner(y + sign_y * up, x + sign_x * left, half_height_mm)
-        for sign_y in (1.0, -1.0)
-        for sign_x in (1.0, -1.0)
-    )
-    return np.fft.rfft2(kernel)
+    return np.fft.rfft2(kernel.cell(y, x, cell_mm[0] / 2, cell_mm[1] / 2))
 
 
-def _spread(field: NDArray[np.float64], pitch_mm: float, half_height_mm: float) -> NDArray[np.float64]:
+def _spread(field: FloatArray, pitch_mm: float, kernel: _Kernel) -> FloatArray:
     """Maps (k, row, column) spread by the kernel."""
     row_mean, row_back, row_step = _block_means(field.shape[-2])
     column_mean, column_back, column_step = _block_means(field.shape[-1])
     coarse = row_mean @ field @ column_mean.T
     shape = (coarse.shape[-2], coarse.shape[-1])
-    transform = _kernel_transform(shape, (row_step * pitch_mm, column_step * pitch_mm), half_height_mm)
+    transform = _kernel_transform(shape, (row_step * pitch_mm, column_step * pitch_mm), kernel)
     doubled = (2 * shape[0], 2 * shape[1])
     wide = np.fft.rfft2(coarse, s=doubled, axes=(-2, -1)) * transform
     spread = np.fft.irfft2(wide, s=doubled, axes=(-2, -1))[..., : shape[0], : shape[1]]
     return np.asarray(row_back @ spread @ column_back.T)
 
 
-def _corner(y_mm: NDArray[np.float64], x_mm: NDArray[np.float64], half_height_mm: float) -> NDArray[np.float64]:
-    """Integral of the kernel over a rectangle from its centre to (y, x): the solid angle, over 2 pi."""
-    h = half_height_mm
+def _corner(y_mm: FloatArray, x_mm: FloatArray, height_mm: float) -> FloatArray:
+    """Integral of the kernel that has all directions alike, from its centre to (y, x): the solid angle, over 2 pi."""
+    h = height_mm
     return np.asarray(np.arctan2(y_mm * x_mm, h * np.sqrt(h**2 + y_mm**2 + x_mm**2)) / (2.0 * np.pi))
 
 
-def _share_at_centre(shape: tuple[int, ...], pitch_mm: float, half_height_mm: float) -> float:
+@lru_cache(maxsize=64)
+def _share_at_centre(shape: tuple[int, ...], pitch_mm: float, kernel: _Kernel) -> float:
     """What the centre of an evenly scattering field gets."""
-    y, x = (np.array(0.5 * length * pitch_mm) for length in shape)
-    return 4.0 * float(_corner(y, x, half_height_mm))
+    up, left = (0.5 * length * pitch_mm / _COARSE for length in shape)
+    places = 2.0 * np.arange(_COARSE) + 1.0 - _COARSE
+    return float(kernel.cell(up * places[:, None], left * places[None, :], up, left).sum())
 
 
-def _mean_energy_keV(context: LineContext) -> float:
-    """Mean energy of the open beam's signal, keV."""
-    if context.weights is None or context.energies_keV is None:
-        return _REFERENCE_KEV
-    weights = context.weights[0]
-    return float(weights @ context.energies_keV[: weights.size] / weights.sum())
+def mean_signal_energy_keV(weights: FloatArray, energies_keV: FloatArray) -> float:
+    """Mean energy of a beam's signal, keV; weights (energy,) of the signal."""
+    return float(weights @ energies_keV[: weights.size] / weights.sum())
 
 
-def _scattering_share(context: LineContext, energy_keV: float) -> NDArray[np.float64]:
+def _energies_keV(weights: FloatArray, energies_keV: FloatArray) -> tuple[float, ...]:
+    """Energies that stand for equal shares of a signal (energy,); to 0.1 keV: a step of the spectrum asks for no other kernel."""
+    cumulated = np.cumsum(weights) / weights.sum()
+    shares = (np.arange(_ENERGIES) + 0.5) / _ENERGIES
+    return tuple(round(float(one), 1) for one in np.interp(shares, cumulated, energies_keV[: weights.size]))
+
+
+def _scattering_share(context: LineContext, energy_keV: float) -> FloatArray:
     """Scattering's share of attenuation (row, column), or (1, 1), over that of water, at an energy."""
     thickness = context.request.thickness_mm
     if not thickness or context.energies_keV is None or context.model is None:
@@ -124,9 +152,7 @@ def _albedo(name: str, energy_keV: float) -> float:
     return 1.0 - float(mass_photoelectric_cm2_g(material, energy_keV)) / total
 
 
-def _shared_at_borders(
-    field: NDArray[np.float64], signal: NDArray[np.float64], depth: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _shared_at_borders(field: FloatArray, signal: FloatArray, depth: FloatArray) -> FloatArray:
     """The field (k, row, column) with pixels that a sharp border cuts shared between the values on either side."""
     borders = find_borders(depth, least_depth=_BORDER_DEPTH)
     if not borders.pixel.size:
@@ -139,7 +165,9 @@ def _shared_at_borders(
 
 
 def _add_scatter(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    if not context.has_scene or parameters["strength"] == 0 or context.weights is None or context.model is None:
+    if not context.has_scene or parameters["strength"] == 0 or context.weights is None:
+        return state
+    if context.model is None or context.energies_keV is None:
         return state
     name = "object_scatter"
     pitch = needed(context.twin.instrument.pixel_mm, "pixel_mm", name)
@@ -149,26 +177,35 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     usual = gap
     if instrument.source_detector_mm is not None and instrument.source_object_mm is not None:
         usual = instrument.source_detector_mm - instrument.source_object_mm
-    half_height = parameters["width_mm"] / 1.533  # the kernel's full width at half maximum is 1.533 h
-    at_usual_gap = half_height
+    height = parameters["width_mm"] / 1.533  # the kernel's full width at half maximum is 1.533 h
     wider = (max(gap, 0.0) + _HALF_PRODUCT_MM) / (max(usual, 0.0) + _HALF_PRODUCT_MM)
-    half_height *= wider ** parameters["gap_exponent"]
+    energy_keV = mean_signal_energy_keV(context.weights[0], context.energies_keV)
+    weights = context.weights[0]
+    water = context.model.mu("water_liquid")[: weights.size]
+    behind = weights * np.exp(-_WATER_MM * water)
+    at_usual_gap = _Kernel(
+        height,
+        parameters["own_directions"],
+        _energies_keV(behind, context.energies_keV) if parameters["own_directions"] else (),
+        max(usual, 0.0) + _HALF_PRODUCT_MM,
+    )
+    here = replace(
+        at_usual_gap,
+        height_mm=height * wider ** parameters["gap_exponent"],
+        gap_mm=max(gap, 0.0) + _HALF_PRODUCT_MM,
+    )
     shape = np.broadcast_shapes(state.signal_DN.shape, context.shape)
     signal = np.broadcast_to(state.signal_DN, shape)
     depth = -np.log(np.maximum(signal / context.open_signal_DN, 1e-12))
-    energy_keV = _mean_energy_keV(context)
     own = parameters["own_albedo"]
     source = depth if own == 0 else depth * (1.0 + own * (_scattering_share(context, energy_keV) - 1.0))
     field = np.stack([signal * source, np.broadcast_to(state.variance_DN2, shape) * source])
     field = _shared_at_borders(field, signal, depth)
-    scattered = _spread(field, pitch, half_height)
+    scattered = _spread(field, pitch, here)
     centre = _share_at_centre(context.shape, pitch, at_usual_gap)
-    weights = context.weights[0]
-    top = weights.size
-    water = context.model.mu("water_liquid")[:top]
-    behind_water = -np.log(float(weights @ np.exp(-_WATER_MM * water)) / float(weights.sum()))
+    behind_water = -np.log(float(behind.sum()) / float(weights.sum()))
     factor = parameters["strength"] / 100.0 / (behind_water * centre)
-    factor *= (energy_keV / _REFERENCE_KEV) ** parameters["energy_exponent"]
+    factor *= (energy_keV / parameters["reference_keV"]) ** parameters["energy_exponent"]
     return replace(
         state,
         signal_DN=state.signal_DN + factor * scattered[0],
@@ -186,7 +223,7 @@ OBJECT_SCATTER = Effect(
             low=1.0,
             high=50.0,
             default=10.0,
-            source="scatter over primary at the centre of this field behind 20 mm of water, usual gap, beam of 45 keV",
+            source="scatter over primary at the centre of this field behind 20 mm of water, usual gap, at the reference energy",
             log=False,
         ),
         Parameter(
@@ -224,6 +261,25 @@ OBJECT_SCATTER = Effect(
             default=1.0,
             source="1 for a point that scatters; 0: the same width at any gap",
             log=False,
+        ),
+        Parameter(
+            name="own_directions",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="0: all directions alike, 1: as free atoms of water scatter, more of it forward",
+            log=False,
+        ),
+        Parameter(
+            name="reference_keV",
+            unit="keV",
+            low=5.0,
+            high=500.0,
+            default=45.0,
+            source="of the session: geometric mean of its beams' mean energies",
+            log=True,
+            fitted=False,
         ),
     ),
     stage="arrivals",

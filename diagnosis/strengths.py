@@ -1,0 +1,139 @@
+"""How strong an effect is: from the fit, or from where a session shows outright what its strength means."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..generator.effects import AppliedEffect
+from ..generator.series import with_conditions
+from .assemble import Problem, SeriesView, map_changes
+from .changes import DEFINED_SD
+from .even_maps import mean_over
+from .inference import Hypothesis, Nuisances, fit_curve
+from .output_course import rms_about_mean
+
+_LAW_SD = 0.12  # relative, of a strength as real effects have it
+_NODES = 800
+_MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
+_LEAST_SERIES = 5
+
+
+def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
+    """The effect as a hypothesis has it, in this session."""
+    if effect == "output_drift":
+        return _applied(problem, hypothesis, effect, strength_of(problem, hypothesis, effect)[0])
+    return _applied(problem, hypothesis, effect, hypothesis.strengths[effect][0])
+
+
+def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
+    curve = hypothesis.variants[effect]
+    variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+    return with_conditions(variant.applied(strength), problem.conditions)
+
+
+def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
+    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength.
+
+    Where the session shows what the strength means, it is read from there, whatever the rest of the law asks for.
+    """
+    curve = hypothesis.variants[effect]
+    found = None
+    if effect == "output_drift":
+        found = _output_rms(problem, hypothesis)
+    elif effect in DEFINED_SD and curve.exact is not None and bool(curve.exact.any()):
+        found = _outright(problem, hypothesis, effect)
+    value, low, high = hypothesis.strengths[effect] if found is None else found
+    sd = _LAW_SD if found is None else DEFINED_SD[effect]
+    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
+    return value, value * math.exp(-below), value * math.exp(above)
+
+
+def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
+    """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
+    curve = hypothesis.variants[effect]
+    exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
+    left = problem.residual[exact].copy()
+    for other in hypothesis.effects:
+        if other != effect:
+            left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
+    strengths = np.geomspace(curve.low / 3.0, 1.5 * curve.high, _NODES)
+    responses = curve.weights(strengths) @ curve.responses[:, exact]
+    distance = np.sum((left - responses) ** 2, axis=1)
+    at = int(np.argmin(distance))
+    near = distance < distance[at] + 1.96**2
+    if at in (0, len(strengths) - 1):
+        return None
+    return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
+
+
+def _output_rms(problem: Problem, hypothesis: Hypothesis) -> tuple[float, float, float] | None:
+    """Rms of the output over the lit frames, %, about their mean; None: beside another effect hardly any level is known.
+
+    Slow and fast parts of an output that wanders are no one law, but every frame tells its own level. Levels of the calibrating
+    series went into the twin, so the mean over the session says nothing of the output.
+    """
+    others = [effect for effect in hypothesis.effects if effect != "output_drift"]
+    since = hypothesis.variants["output_drift"].since == "calibration"
+    lit = [
+        number
+        for number, view in enumerate(problem.views)
+        if view.session.request.beam_on and not (since and view.session.calibrates)
+    ]
+    moved = np.zeros(len(problem.views))
+    if others:
+        applied = [_applied(problem, hypothesis, effect, hypothesis.strengths[effect][0]) for effect in others]
+        changes = map_changes(problem, applied)
+        for number in lit:
+            view = problem.views[number]
+            moved[number] = mean_over(changes[number], view.mask) / mean_over(view.signal_DN, view.mask)
+        lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
+    if len(lit) < _LEAST_SERIES:
+        return None
+    views = [problem.views[number] for number in lit]
+    signals_DN = [mean_over(view.signal_DN, view.mask) for view in views]
+    rms = rms_about_mean(
+        [
+            mean_over(view.residual_DN, view.mask) / signal - moved[number]
+            for number, view, signal in zip(lit, views, signals_DN, strict=True)
+        ],
+        [view.summary.frame_mean_DN / signal for view, signal in zip(views, signals_DN, strict=True)],
+        [_noise_of_a_frame(view) / signal**2 for view, signal in zip(views, signals_DN, strict=True)],
+    )
+    return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
+
+
+def _noise_of_a_frame(view: SeriesView) -> float:
+    """Variance of a frame's mean over the pixels, DN^2, that is no common factor."""
+    pixels = int(np.count_nonzero(view.mask))
+    return mean_over(view.noise_DN**2, view.mask) * view.summary.frames / max(pixels, 1)
+
+
+def strengths_on(
+    problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_], inner: Nuisances
+) -> dict[str, float]:
+    """Strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
+    strengths = {effect: leading.strengths[effect][0] for effect in effects}
+    for _ in range(3 if len(effects) > 1 else 1):
+        for effect in effects:
+            curve = leading.variants[effect]
+            if curve.by_chance_alone:
+                continue  # the strength is that of all probes
+            others = sum(
+                (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
+                np.zeros(len(problem.residual)),
+            )
+            part = replace(
+                curve,
+                responses=curve.responses[:, fit],
+                spread=None,
+                jitter=None if curve.jitter is None else curve.jitter[fit],
+                exact=None if curve.exact is None else curve.exact[fit],
+            )
+            result = fit_curve(
+                (problem.residual - others)[fit], part, inner, problem.groups[fit], places=problem.places[fit]
+            )
+            strengths[effect] = result.best
+    return strengths

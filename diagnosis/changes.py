@@ -21,22 +21,22 @@ from .inference import Curve
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 # where the mean is linear in the strength one is enough, where it nearly is two
+ONE_STRENGTH = frozenset(
+    (
+        "object_scatter",
+        "veiling_glare",
+        "mtf_tail",
+        "k_fluorescence",
+        "image_lag",
+        "dark_drift",
+        "nonlinearity",
+        "heel",
+    )
+)
 _ONE_SHARE = (0.8,)
 _TWO_SHARES = (0.6, 1.0)
 _SHARES_OF = {
-    **dict.fromkeys(
-        (
-            "object_scatter",
-            "veiling_glare",
-            "mtf_tail",
-            "k_fluorescence",
-            "image_lag",
-            "dark_drift",
-            "nonlinearity",
-            "heel",
-        ),
-        _ONE_SHARE,
-    ),
+    **dict.fromkeys(ONE_STRENGTH, _ONE_SHARE),
     "focal_spot": (0.25, 0.5, 0.75, 1.0),
     "motion_blur": (0.0, 0.25, 0.5, 0.75, 1.0),
     **dict.fromkeys(("composition_error", "kv_error", "filtration_error"), _TWO_SHARES),
@@ -52,6 +52,10 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
     "veiling_glare": [{"length_mm": 2.1}, {"length_mm": 9.5}],
     "mtf_tail": [{"reach_px": 0.84}, {"reach_px": 2.4}],
     "k_fluorescence": [{"range_mm": 0.15}, {"range_mm": 0.33}],
+    "image_lag": [
+        *({"release_s": time_s, "pause_share": share} for time_s in (0.316, 3.16) for share in (0.0, 1.0)),
+        {"release_s": 0.3, "pause_share": 0.0, "spread": 1.3},  # one kind of traps
+    ],
     "object_scatter": [
         {"width_mm": 25.0},
         {"width_mm": 70.0},

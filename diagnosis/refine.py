@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.effects.effect import Parameter
-from .changes import KEPT_AS_THEY_ARE, Variant
+from .changes import KEPT_AS_THEY_ARE, ONE_STRENGTH, Variant
 from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Widened, fit_curve, widened_for
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
@@ -210,7 +210,9 @@ def _refined(
     inner = [
         item for item in variant.fitted if item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
     ]
-    here = tried(near(best.parameters, (1.0,)))
+    # one strength tells the others where the response grows in proportion
+    trial = (1.0,) if variant.effect in ONE_STRENGTH else _NEAR
+    here = tried(near(best.parameters, trial))
     if here is None:
         return None
     strength = here.best
@@ -221,7 +223,7 @@ def _refined(
             parameters = dict(best.parameters)
             for item in inner:
                 parameters[item.name] = _moved(item, parameters[item.name], share * steps[item.name])
-            candidate = tried(near(parameters, (1.0,)))
+            candidate = tried(near(parameters, trial))
             if candidate is not None and candidate.log_evidence > here.log_evidence:
                 here, strength = candidate, candidate.best
                 best = replace(best, parameters=parameters)

@@ -92,38 +92,20 @@ def test_nodes_are_joined_by_cubics():
     assert node_weights(nodes, at) @ (nodes**3 - nodes) == pytest.approx(at**3 - at)
 
 
-def test_refinement_finds_an_inner_parameter_between_the_grid_s():
-    x = np.linspace(0.0, 3.0, PROBES)
-
-    def law(length_mm, strength):
-        return 40.0 * strength * np.exp(-((x - np.log(length_mm)) ** 2))
+def refined(variants, law, residual):
+    """What refinement makes of variants whose responses (probe,) are `law(parameters, strength)`."""
 
     def answer(asked):
         return {
-            number: np.stack([law(item.parameters["length_mm"], strength) for strength in item.strengths])
+            number: np.stack([law(item.parameters, strength) for strength in item.strengths])
             for number, item in enumerate(asked)
         }
 
-    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
-    lengths = [item.parameters["length_mm"] for item in variants]
-    true = float(np.sqrt(lengths[0] * lengths[-1]))
-    residual = law(true, 2.0) + np.random.default_rng(1).standard_normal(PROBES)
-    curves = [
-        Curve(
-            effect=item.effect,
-            variant=item.name,
-            parameters=item.parameters,
-            low=item.low,
-            high=item.high,
-            strengths=np.array(item.strengths),
-            responses=answer([item])[0],
-        )
-        for item in variants
-    ]
+    curves = [item.curve(answer([item])[0]) for item in variants]
     nuisances = Nuisances(np.zeros((PROBES, 1)))
     groups = np.zeros(PROBES, dtype=np.intp)
     hypotheses = weigh_hypotheses(residual, curves=curves, nuisances=nuisances, groups=groups, group_names=("all",))
-    found = refine(
+    return refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in variants},
         curves=curves,
@@ -133,11 +115,39 @@ def test_refinement_finds_an_inner_parameter_between_the_grid_s():
         respond=answer,
         whitener=SimpleNamespace(apply=lambda vectors: vectors),
     )
+
+
+def test_refinement_finds_an_inner_parameter_between_the_grid_s():
+    x = np.linspace(0.0, 3.0, PROBES)
+
+    def law(parameters, strength):
+        return 40.0 * strength * np.exp(-((x - np.log(parameters["length_mm"])) ** 2))
+
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    lengths = [item.parameters["length_mm"] for item in variants]
+    true = float(np.sqrt(lengths[0] * lengths[-1]))
+    found = refined(variants, law, law({"length_mm": true}, 2.0) + np.random.default_rng(1).standard_normal(PROBES))
     assert len(found) == 2  # from the two best starts
     closer, responses = found[0]
     assert abs(np.log(closer.parameters["length_mm"] / true)) < 0.5 * abs(np.log(lengths[0] / true))
     assert responses.shape == (3, PROBES)
     assert closer.strengths[1] == pytest.approx(2.0, rel=0.15)
+
+
+def test_refinement_follows_a_response_that_is_not_in_proportion_to_the_strength():
+    x = np.linspace(0.0, 3.0, PROBES)
+
+    def law(parameters, strength):
+        wide = strength**2 * np.array([parameters["aspect"], 1.0 / parameters["aspect"]])
+        rows, columns = (60.0 * (one * (0.4 + x)) ** 2 for one in wide)
+        return np.where(np.arange(PROBES) % 2 == 0, rows, columns)
+
+    variants = [item for item in catalogue_variants() if item.effect == "focal_spot"]
+    noise = np.random.default_rng(1).standard_normal(PROBES)
+    found = refined(variants, law, law({"aspect": 1.0}, 0.92) + noise)
+    for closer, _ in found:
+        assert closer.strengths[1] == pytest.approx(0.92, rel=0.03)
+        assert closer.parameters["aspect"] == pytest.approx(1.0, rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,9 @@
 
 Charge is conserved: a steady exposure reads x in the end. After an exposure of length T the first beam-off frame reads
 x sum_i phi_i (1 - exp(-T / tau_i)), which is the strength. Four traps, each s times as slow as the one before and with
-half of its charge, have tau as their middle. What is released while nothing is exposed is thrown away by a panel that
-keeps being read, and found in the next frame by one that is not.
+a share q (`charge_ratio`) of its charge, have tau as their middle: release as a power of time over the decades. What is
+released while nothing is exposed is thrown away by a panel that keeps being read, and found in the next frame by one
+that is not.
 """
 
 import math
@@ -15,7 +16,6 @@ from dataclasses import replace
 from ..line_state import LagLaw, LineContext, LineState
 from .effect import Effect, Parameter
 
-_PARTS = (8.0 / 15.0, 4.0 / 15.0, 2.0 / 15.0, 1.0 / 15.0)
 _STEPS = (-1.5, -0.5, 0.5, 1.5)
 
 
@@ -24,10 +24,12 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
         return state
     middle, spread = parameters["release_s"], parameters["spread"]
     times = tuple(middle * spread**step for step in _STEPS)
-    filled = sum(part * -math.expm1(-parameters["after_s"] / time) for part, time in zip(_PARTS, times, strict=True))
+    charges = [parameters["charge_ratio"] ** number for number in range(len(times))]
+    parts = [charge / sum(charges) for charge in charges]
+    filled = sum(part * -math.expm1(-parameters["after_s"] / time) for part, time in zip(parts, times, strict=True))
     trapped = parameters["strength"] / 100.0 / filled
     law = LagLaw(
-        trapped=tuple(part * trapped for part in _PARTS),
+        trapped=tuple(part * trapped for part in parts),
         time_s=times,
         pause_share=parameters["pause_share"],
     )
@@ -66,12 +68,21 @@ IMAGE_LAG = Effect(
             log=False,
         ),
         Parameter(
+            name="charge_ratio",
+            unit="",
+            low=0.1,
+            high=1.0,
+            default=0.5,
+            source="charge of a trap over that of the next quicker one; 1/2: Starman et al. (2012)",
+            log=True,
+        ),
+        Parameter(
             name="spread",
             unit="",
             low=1.0,
             high=10.0,
             default=7.6,
-            source="ratio of neighbouring release times; Starman et al. (2012) find four of ratio 7.6, half the charge each",
+            source="ratio of neighbouring release times, 1: all alike; Starman et al. (2012) find four of ratio 7.6",
             log=True,
             fitted=False,
         ),

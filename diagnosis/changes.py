@@ -39,13 +39,17 @@ _SHARES_OF = {
     **dict.fromkeys(ONE_STRENGTH, _ONE_SHARE),
     "focal_spot": (0.25, 0.5, 0.75, 1.0),
     "motion_blur": (0.0, 0.25, 0.5, 0.75, 1.0),
-    **dict.fromkeys(("composition_error", "kv_error", "filtration_error"), _TWO_SHARES),
+    **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "misregistration"), _TWO_SHARES),
 }
 _MOST_VARIANTS = 4
 _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
     "misregistration": [
         *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
-        *({"direction_deg": 0.0, "magnification_deg": sign * 90.0} for sign in (1, -1)),
+        *(
+            {"direction_deg": 0.0, name: sign * 90.0}
+            for name in ("magnification_deg", "rotation_deg")
+            for sign in (1, -1)
+        ),
     ],
     "output_drift": [{"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)],
     "focal_spot": [{"aspect": aspect, "flatness": 0.3} for aspect in (0.707, 1.414)],

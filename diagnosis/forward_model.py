@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.effects.registration import parts_px
 from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
 from ..generator.twin import Twin
 from .changes import TwinChange, Variant
@@ -24,7 +25,7 @@ _ON_OBJECTS_ALONE = frozenset(
     {item.id for item in EFFECTS.values() if item.stage == "object_blur"}
     | {"misregistration", "object_scatter", "composition_error"}
 )
-_ALL_THE_SAME_DEG = 1.0  # angle of a misregistration below which it changes no size
+_ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 
 def draft_cache() -> ModelCache:
@@ -72,22 +73,42 @@ class Change:
     @property
     def only_displaces(self) -> bool:
         """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
-        return any(
-            effect.id == "misregistration" and abs(effect.parameters.get("magnification_deg", 0.0)) < _ALL_THE_SAME_DEG
-            for effect in self.effects
-        )
+        misplaced = self._misplaced
+        return misplaced is not None and math.hypot(misplaced.radial, misplaced.turn) < _ALL_SHIFT * misplaced.size
 
     @property
     def displacement(self) -> dict[str, float]:
         """Displacement (px) that the change brings to a scene's picture, by probe; empty: none."""
+        misplaced = self._misplaced
+        if misplaced is None:
+            return {}
+        angle = math.radians(misplaced.effect.parameters.get("direction_deg", 0.0))
+        return {ALONG_ROWS: misplaced.shift * math.cos(angle), ALONG_COLUMNS: misplaced.shift * math.sin(angle)}
+
+    def found_in_place(self) -> "Change":
+        """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
+        misplaced = self._misplaced
+        if misplaced is None or misplaced.shift == 0.0 or self.only_displaces:
+            return self
+        size = math.hypot(misplaced.radial, misplaced.turn)
+        rest = {
+            "strength": size,
+            "direction_deg": 0.0,
+            "magnification_deg": math.copysign(90.0, misplaced.radial),
+            "rotation_deg": math.degrees(math.asin(misplaced.turn / size)),
+        }
+        effect = misplaced.effect
+        others = (item for item in self.effects if item is not effect)
+        return replace(self, effects=(*others, replace(effect, parameters={**effect.parameters, **rest})))
+
+    @property
+    def _misplaced(self) -> "_Misplaced | None":
         for effect in self.effects:
             if effect.id == "misregistration":
-                size = effect.parameters["strength"] * math.cos(
-                    math.radians(effect.parameters.get("magnification_deg", 0.0))
-                )
-                angle = math.radians(effect.parameters.get("direction_deg", 0.0))
-                return {ALONG_ROWS: size * math.cos(angle), ALONG_COLUMNS: size * math.sin(angle)}
-        return {}
+                size = effect.parameters["strength"]
+                angles = {name: effect.parameters.get(name, 0.0) for name in ("magnification_deg", "rotation_deg")}
+                return _Misplaced(effect, abs(size), *parts_px(size, **angles))
+        return None
 
     def whenever_it_began(self, request: SeriesRequest) -> object | None:
         """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
@@ -97,6 +118,17 @@ class Change:
         if effect.since == "always" and any(not item.after_calibration for item in request.previous):
             return None  # what was exposed before calibration ended remembers when it began
         return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Misplaced:
+    """A misregistration in px: its rms size, and the parts of it that shift, enlarge and turn."""
+
+    effect: AppliedEffect
+    size: float
+    shift: float
+    radial: float
+    turn: float
 
 
 def can_show(effect: str, request: SeriesRequest) -> bool:

@@ -24,10 +24,11 @@ _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
-_ROUNDS = 5
-_ENOUGH = 1.0  # gain of log evidence below which the search ends
+_ROUNDS = 10
+_ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges
+_FURTHER = 3.0  # times a step that explained more, tried as well
 _LAW_ERROR = 0.1
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
 
@@ -218,17 +219,20 @@ def _refined(
     strength = here.best
     for _ in range(_ROUNDS if inner else 0):
         steps = _newton(here, best, inner, seen, respond)
-        before = here.log_evidence
-        for share in (1.0, 0.3, 0.1):
-            parameters = dict(best.parameters)
+        before, start = here.log_evidence, best.parameters
+        # laws that may be off hold a fit back along what two parameters explain alike: a step that helps may go further
+        for share in (1.0, _FURTHER, 0.3, 0.1):
+            helped = here.log_evidence > before
+            if share != 1.0 and helped == (share < 1.0):
+                continue
+            parameters = dict(start)
             for item in inner:
-                parameters[item.name] = _moved(item, parameters[item.name], share * steps[item.name])
+                parameters[item.name] = _moved(item, start[item.name], share * steps[item.name])
             candidate = tried(near(parameters, trial))
             if candidate is not None and candidate.log_evidence > here.log_evidence:
                 here, strength = candidate, candidate.best
                 best = replace(best, parameters=parameters)
-                break
-        if here.log_evidence - before < _ENOUGH:
+        if here.log_evidence - before < max(_ENOUGH, _ENOUGH_SHARE * before):
             break
     final = near(best.parameters, _NEAR)
     answer = respond([final])

@@ -153,8 +153,9 @@ class SessionModel:
         if item.calibrates:
             moved, values = absorbed.mean_DN[one.name], absorbed.scalars[one.name]
         else:
+            shown = change if one.placement is None else change.found_in_place()
             try:
-                changed, moved, values = self._alone(one, change, known)
+                changed, moved, values = self._alone(one, shown, known)
             except InputError as error:
                 asked.failed = str(error)
                 return None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._distortion import distorted
 from ._fine_picture import averaging, cosines_at_pixels, fine_frequencies, kept_cosines, sampled_picture
 from .line_state import FloatArray, LineState
 from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
@@ -246,26 +247,36 @@ def spread_maps(
         if rest is not None:
             pictures.append((dctn(rest, type=2), transfer(shape)))
         blurred = sampled_picture(pictures, shape, state.shift_px)
+    radial_px, turn_px = state.distortion_px
+    blurred = distorted(np.asarray(blurred, dtype=np.float64), radial_px=radial_px, turn_px=turn_px)
     if draft:
-        return np.asarray(blurred, dtype=np.float64), pattern.share * variance_DN2
+        return blurred, pattern.share * variance_DN2
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
     power = pattern.squared_transfer(f_row, f_column)
     blur = _object_transfer(state, f_row, f_column)
     spread = sampled_picture(
         [(dctn(variance_DN2, type=2), power if blur is None else power * blur)], shape, state.shift_px
     )
-    return np.asarray(blurred, dtype=np.float64), np.maximum(spread, 0.0)
+    spread = distorted(spread, radial_px=radial_px, turn_px=turn_px)
+    return blurred, np.maximum(spread, 0.0)
 
 
 def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     """Signal and variance before the spread of light, with the blur of the object in them, 0 or more."""
     signal, variance = state.signal_DN, state.variance_DN2
-    if signal.shape == (1, 1) or not (state.object_transfers or state.shift_px != (0.0, 0.0)):
+    still = state.shift_px == state.distortion_px == (0.0, 0.0)
+    if signal.shape == (1, 1) or (still and not state.object_transfers):
         return signal, variance
     from scipy.fft import dctn
 
     shape = (signal.shape[0], signal.shape[1])
     blur = _object_transfer(state, _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
-    spread = [sampled_picture([(dctn(one, type=2), blur)], shape, state.shift_px) for one in (signal, variance)]
+    radial_px, turn_px = state.distortion_px
+    spread = [
+        distorted(
+            sampled_picture([(dctn(one, type=2), blur)], shape, state.shift_px), radial_px=radial_px, turn_px=turn_px
+        )
+        for one in (signal, variance)
+    ]
     floor = 1e-12 * max(float(signal.max()), 1e-300)
     return np.maximum(spread[0], floor), np.maximum(spread[1], 0.0)

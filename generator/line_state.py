@@ -91,6 +91,7 @@ class LineState:
         picture: the signal as it was projected, finer than pixels, where it has sharp borders; what effects have made of
             `signal_DN` since is their difference.
         shift_px: of the object against its thickness maps, along rows and columns.
+        distortion_px: rms displacement of an enlargement and of a counter-clockwise turn of the picture.
         object_transfers: blur of what stands in the beam.
         optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
         tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
@@ -117,6 +118,7 @@ class LineState:
     secondary_DN: float = 0.0
     picture: FinePicture | None = None
     shift_px: tuple[float, float] = (0.0, 0.0)
+    distortion_px: tuple[float, float] = (0.0, 0.0)
     object_transfers: tuple[Transfer, ...] = ()
     optical_transfers: tuple[Transfer, ...] = ()
     tails: tuple[tuple[float, Transfer], ...] = ()

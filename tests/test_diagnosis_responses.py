@@ -16,6 +16,7 @@ from raytwin.diagnosis.forward_model import Change, strength_rows
 from raytwin.diagnosis.placing import inside
 from raytwin.diagnosis.registration import Placement
 from raytwin.generator.effects import AppliedEffect
+from raytwin.generator.effects.registration import parts_px
 from raytwin.generator.series import SeriesRequest
 
 SHAPE = (12, 16)
@@ -170,6 +171,23 @@ def test_a_shift_of_the_scene_is_its_displacement_and_a_change_of_size_is_not():
     assert not larger.only_displaces
     assert larger.touches(request("object"))
     assert larger.displacement == pytest.approx({"displacement along rows": 0.0, "displacement along columns": 0.0})
+
+
+def test_once_a_scene_is_found_its_size_and_turn_are_left_of_a_misregistration():
+    mixed = changed("misregistration", strength=2.0, direction_deg=90.0, magnification_deg=-30.0, rotation_deg=40.0)
+    straight = 2.0 * math.cos(math.radians(40.0))
+    assert mixed.displacement == pytest.approx(
+        {"displacement along rows": 0.0, "displacement along columns": straight * math.cos(math.radians(30.0))},
+        abs=1e-12,
+    )
+    (rest,) = mixed.found_in_place().effects
+    angles = {name: rest.parameters[name] for name in ("magnification_deg", "rotation_deg")}
+    shift, radial, turn = parts_px(rest.parameters["strength"], **angles)
+    assert shift == pytest.approx(0.0, abs=1e-12)
+    assert radial == pytest.approx(-straight * math.sin(math.radians(30.0)))
+    assert turn == pytest.approx(2.0 * math.sin(math.radians(40.0)))
+    shift = changed("misregistration", strength=2.0, direction_deg=10.0)
+    assert shift.found_in_place() is shift  # nothing of it shows
 
 
 def test_an_effect_that_began_earlier_stands_for_a_later_one_unless_what_came_before_remembers():

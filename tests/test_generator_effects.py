@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
 from raytwin.errors import InputError
+from raytwin.generator._distortion import displacement_px, distorted
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter, effect_of, in_order
 from raytwin.generator.effects.effect import spread_transfer
 from raytwin.generator.effects.fluorescence import line_energy_keV
-from raytwin.generator.effects.registration import displacement_px
+from raytwin.generator.effects.registration import parts_px
 from raytwin.generator.effects.sharpness import _transfer_of_spot
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
@@ -836,16 +837,37 @@ def test_a_whole_pixel_of_misregistration_is_the_object_one_pixel_on(series_line
 
 @given(
     strength=st.floats(0.01, 5.0),
-    direction=st.floats(0.0, 360.0),
     magnification=st.floats(-90.0, 90.0),
+    rotation=st.floats(-90.0, 90.0),
     rows=st.integers(2, 60),
     columns=st.integers(2, 60),
 )
-def test_the_rms_displacement_is_the_strength_for_any_mix(strength, direction, magnification, rows, columns):
-    down, right = displacement_px(
-        (rows, columns), strength_px=strength, direction_deg=direction, magnification_deg=magnification
-    )
-    assert math.sqrt(np.mean(down**2 + right**2)) == pytest.approx(strength, rel=1e-9)
+def test_the_rms_displacement_is_the_strength_for_any_mix(strength, magnification, rotation, rows, columns):
+    shift, radial, turn = parts_px(strength, magnification_deg=magnification, rotation_deg=rotation)
+    down, right = displacement_px((rows, columns), radial_px=radial, turn_px=turn)
+    assert math.sqrt(shift**2 + np.mean(down**2 + right**2)) == pytest.approx(strength, rel=1e-9)
+
+
+def test_a_turn_is_counter_clockwise_about_the_middle_and_leaves_the_middle_where_it_is():
+    row, column = np.indices((41, 41)) - 20.0
+    bar = np.exp(-0.5 * (row / 3.0) ** 2) * np.ones_like(column)  # lies along the columns' axis
+    rms = math.sqrt(float(np.mean(row**2 + column**2)))
+    angle = 0.05
+    turned = distorted(bar, radial_px=0.0, turn_px=angle * rms)
+    # counter-clockwise, the right end goes up: to smaller rows
+    middle = [float(turned[:, at] @ np.arange(41) / turned[:, at].sum()) - 20.0 for at in (5, 20, 35)]
+    assert middle == pytest.approx([15.0 * angle, 0.0, -15.0 * angle], abs=0.02)
+    larger = distorted(bar, radial_px=angle * rms, turn_px=0.0)
+    assert larger[:, 20] == pytest.approx(np.exp(-0.5 * ((np.arange(41) - 20.0) * (1.0 - angle) / 3.0) ** 2), abs=1e-3)
+
+
+def test_a_turned_scene_is_the_turned_picture_of_it(series_line):
+    behind = request(**BEHIND)
+    beam = expect(series_line, request()).signal_DN
+    still = expect(series_line, behind).signal_DN / beam
+    turned = expect(series_line, behind, applied("misregistration", 0.8, rotation_deg=90.0)).signal_DN / beam
+    np.testing.assert_allclose(turned, distorted(still, radial_px=0.0, turn_px=0.8), rtol=1e-6)
+    assert np.abs(turned - still).max() > 0.01 * still.max()
 
 
 # ------------------------------------------------------------------------------------------------ refusals

@@ -1,63 +1,41 @@
-"""The object does not lie where the thickness maps say: shift and magnification.
+"""The object does not lie where the thickness maps say: shift, magnification and a turn about the field's middle.
 
-d(r) = s [cos(b) (cos(a), sin(a)) + sin(b) (r - centre) / rms(r - centre)],  so that the rms of d is s
+    d(r) = s {cos(c) [cos(b) (cos(a), sin(a)) + sin(b) q] + sin(c) turned(q)},    q = (r - centre) / rms(r - centre)
+
+so that the rms of d is s; turned(q) is q a quarter turn counter-clockwise on.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 
-import numpy as np
-
-from ..line_state import FloatArray, LineContext, LineState
+from ..line_state import LineContext, LineState
 from .effect import Effect, Parameter
 
 
-def displacement_px(
-    shape: tuple[int, int], *, strength_px: float, direction_deg: float, magnification_deg: float
-) -> tuple[FloatArray, FloatArray]:
-    """Displacement (row, column) of the picture along rows and along columns, px."""
-    row = np.arange(shape[0]) - 0.5 * (shape[0] - 1)
-    column = np.arange(shape[1]) - 0.5 * (shape[1] - 1)
-    rms = math.sqrt(float(np.mean(row**2) + np.mean(column**2))) or 1.0
-    shift = strength_px * math.cos(math.radians(magnification_deg))
-    radial = strength_px * math.sin(math.radians(magnification_deg)) / rms
-    along_rows = shift * math.cos(math.radians(direction_deg)) + radial * row[:, None] + 0.0 * column[None, :]
-    along_columns = shift * math.sin(math.radians(direction_deg)) + radial * column[None, :] + 0.0 * row[:, None]
-    return along_rows, along_columns
+def parts_px(strength_px: float, *, magnification_deg: float, rotation_deg: float) -> tuple[float, float, float]:
+    """How much of a misregistration is shift, magnification and turn; their squares add up to that of the strength."""
+    straight, turn = (share(math.radians(rotation_deg)) for share in (math.cos, math.sin))
+    shift, radial = (share(math.radians(magnification_deg)) for share in (math.cos, math.sin))
+    return strength_px * straight * shift, strength_px * straight * radial, strength_px * turn
 
 
 def _displace(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if parameters["strength"] == 0 or not context.has_scene or state.signal_DN.shape != context.shape:
         return state
-    direction, mix = math.radians(parameters["direction_deg"]), math.radians(parameters["magnification_deg"])
-    shift = parameters["strength"] * math.cos(mix)
-    before = state.shift_px
-    state = replace(state, shift_px=(before[0] + shift * math.cos(direction), before[1] + shift * math.sin(direction)))
-    if mix == 0:
-        return state
-    down, right = displacement_px(
-        context.shape,
-        strength_px=parameters["strength"] * math.sin(mix),
-        direction_deg=0.0,
-        magnification_deg=90.0,
+    direction = math.radians(parameters["direction_deg"])
+    shift, radial, turn = parts_px(
+        parameters["strength"],
+        magnification_deg=parameters["magnification_deg"],
+        rotation_deg=parameters["rotation_deg"],
     )
-    # a magnification moves rows alike in all columns, and columns alike in all rows
-    rows, columns = (_resampling(line.tobytes()) for line in (np.ascontiguousarray(down[:, 0]), right[0]))
-    moved = [np.maximum(rows @ values @ columns.T, 0.0) for values in (state.signal_DN, state.variance_DN2)]
-    return replace(state, signal_DN=moved[0], variance_DN2=moved[1])
-
-
-@lru_cache(maxsize=32)
-def _resampling(displacement_px: bytes) -> FloatArray:
-    """Cubic splines through the pixels of a line (pixel,), taken where each pixel comes from: (pixel, pixel)."""
-    from scipy.ndimage import map_coordinates
-
-    moved = np.frombuffer(displacement_px)
-    line, pixel = np.indices((moved.size, moved.size), dtype=np.float64)
-    places = np.stack([line - moved[:, None], pixel])
-    return np.asarray(map_coordinates(np.eye(moved.size), places, order=3, mode="nearest"), dtype=np.float64)
+    down, right = state.shift_px
+    larger, turned = state.distortion_px
+    return replace(
+        state,
+        shift_px=(down + shift * math.cos(direction), right + shift * math.sin(direction)),
+        distortion_px=(larger + radial, turned + turn),
+    )
 
 
 MISREGISTRATION = Effect(
@@ -88,12 +66,21 @@ MISREGISTRATION = Effect(
             low=-90.0,
             high=90.0,
             default=0.0,
-            source="0: all shift; 90: all magnification; -90: all reduction",
+            source="of what is no turn, 0: all shift; 90: all magnification; -90: all reduction",
+            log=False,
+        ),
+        Parameter(
+            name="rotation_deg",
+            unit="deg",
+            low=-90.0,
+            high=90.0,
+            default=0.0,
+            source="0: no turn; 90: all of the displacement a turn counter-clockwise; -90: clockwise",
             log=False,
         ),
     ),
     stage="arrivals",
-    reference="rigid shift and uniform scale",
+    reference="rigid shift, uniform scale and turn",
     after_calibration=False,
     change=_displace,
     needs=("scene",),

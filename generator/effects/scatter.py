@@ -113,8 +113,9 @@ def _corner(y_mm: FloatArray, x_mm: FloatArray, height_mm: float) -> FloatArray:
 def _share_at_centre(shape: tuple[int, ...], pitch_mm: float, kernel: _Kernel) -> float:
     """What the centre of an evenly scattering field gets."""
     up, left = (0.5 * length * pitch_mm / _COARSE for length in shape)
-    places = 2.0 * np.arange(_COARSE) + 1.0 - _COARSE
-    return float(kernel.cell(up * places[:, None], left * places[None, :], up, left).sum())
+    places: FloatArray = np.arange(_COARSE, dtype=np.float64) * 2.0 + (1.0 - _COARSE)
+    y_mm, x_mm = (np.asarray(half * places, dtype=np.float64) for half in (up, left))
+    return float(kernel.cell(y_mm[:, None], x_mm[None, :], up, left).sum())
 
 
 def mean_signal_energy_keV(weights: FloatArray, energies_keV: FloatArray) -> float:

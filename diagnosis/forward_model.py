@@ -74,7 +74,7 @@ class Change:
     def only_displaces(self) -> bool:
         """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
         misplaced = self._misplaced
-        return misplaced is not None and math.hypot(misplaced.radial, misplaced.turn) < _ALL_SHIFT * misplaced.size
+        return misplaced is not None and math.hypot(misplaced.radial, misplaced.turn) <= _ALL_SHIFT * misplaced.size
 
     @property
     def displacement(self) -> dict[str, float]:

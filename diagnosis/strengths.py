@@ -17,6 +17,7 @@ from .output_course import rms_about_mean
 
 _LAW_SD = 0.12  # relative, of a strength as real effects have it
 _NODES = 800
+_BEYOND_NODES = 2.0  # times the outermost strengths asked
 _MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
 _LEAST_SERIES = 5
 
@@ -59,7 +60,12 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     for other in hypothesis.effects:
         if other != effect:
             left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
-    strengths = np.geomspace(curve.low / 3.0, 1.5 * curve.high, _NODES)
+    lowest, highest = curve.low / 3.0, 1.5 * curve.high
+    if len(curve.strengths) > 1:
+        # a refined curve is known about its nodes: far from them its cubics may come back to what was measured
+        lowest = max(lowest, float(curve.strengths.min()) / _BEYOND_NODES)
+        highest = min(highest, float(curve.strengths.max()) * _BEYOND_NODES)
+    strengths = np.geomspace(lowest, highest, _NODES)
     responses = curve.weights(strengths) @ curve.responses[:, exact]
     distance = np.sum((left - responses) ** 2, axis=1)
     at = int(np.argmin(distance))

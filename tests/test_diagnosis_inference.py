@@ -283,6 +283,28 @@ def test_a_strength_is_read_from_the_probes_that_define_it_whatever_the_rest_of_
     assert found[1] > found[0]
 
 
+def test_a_refined_curve_is_not_believed_far_from_the_strengths_that_were_asked():
+    nodes = np.array([4.5, 6.0, 8.0])
+    # the same at 6 and, if the parabola went on, at 20, where noise happens to fit better
+    responses = np.stack([30.0 * (nodes - nodes**2 / 26.0), 0.01 * nodes], axis=1)
+    curve = Curve(
+        effect="a",
+        variant="",
+        parameters={},
+        low=1.0,
+        high=64.0,
+        strengths=nodes,
+        responses=responses,
+        exact=np.ones(2, dtype=bool),
+    )
+    named = Hypothesis(
+        effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (6.0, 5.9, 6.1)}, variants={"a": curve}
+    )
+    value, low, high = _outright(SimpleNamespace(residual=np.array([30.0 * (6.0 - 36.0 / 26.0), 0.2])), named, "a")
+    assert value == pytest.approx(6.0, rel=0.01)
+    assert 5.5 < low < high < 6.5
+
+
 def test_an_interval_covers_the_variants_that_are_as_likely():
     rng = np.random.default_rng(4)
     response = rng.standard_normal(PROBES) * 0.3

@@ -88,7 +88,7 @@ class Change:
     def found_in_place(self) -> "Change":
         """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
         misplaced = self._misplaced
-        if misplaced is None or misplaced.shift == 0.0 or self.only_displaces:
+        if misplaced is None or self.only_displaces:
             return self
         size = math.hypot(misplaced.radial, misplaced.turn)
         rest = {

@@ -19,11 +19,17 @@ _LAW_SD = 0.12  # relative, of a strength as real effects have it
 _NODES = 800
 _BEYOND_NODES = 2.0  # times the outermost strengths asked
 _MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
+_NOISIEST = (
+    0.01  # of its level: noise of a frame's mean, beyond which (behind opaque objects) it tells nothing of the output
+)
 _LEAST_SERIES = 5
 
 
 def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
-    """The effect as a hypothesis has it, in this session."""
+    """The effect as a hypothesis has it, in this session, with the strength that fits all probes best.
+
+    A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
+    """
     if effect == "output_drift":
         return _applied(problem, hypothesis, effect, strength_of(problem, hypothesis, effect)[0])
     return _applied(problem, hypothesis, effect, hypothesis.strengths[effect][0])
@@ -83,31 +89,31 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis) -> tuple[float, float,
     """
     others = [effect for effect in hypothesis.effects if effect != "output_drift"]
     since = hypothesis.variants["output_drift"].since == "calibration"
+    signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
+    noises = [_noise_of_a_frame(view) for view in problem.views]
     lit = [
         number
         for number, view in enumerate(problem.views)
-        if view.session.request.beam_on and not (since and view.session.calibrates)
+        if view.session.request.beam_on
+        and not (since and view.session.calibrates)
+        and noises[number] < (_NOISIEST * signals_DN[number]) ** 2
     ]
     moved = np.zeros(len(problem.views))
     if others:
         applied = [_applied(problem, hypothesis, effect, hypothesis.strengths[effect][0]) for effect in others]
         changes = map_changes(problem, applied)
         for number in lit:
-            view = problem.views[number]
-            moved[number] = mean_over(changes[number], view.mask) / mean_over(view.signal_DN, view.mask)
+            moved[number] = mean_over(changes[number], problem.views[number].mask) / signals_DN[number]
         lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
     if len(lit) < _LEAST_SERIES:
         return None
-    views = [problem.views[number] for number in lit]
-    signals_DN = [mean_over(view.signal_DN, view.mask) for view in views]
-    rms = rms_about_mean(
-        [
-            mean_over(view.residual_DN, view.mask) / signal - moved[number]
-            for number, view, signal in zip(lit, views, signals_DN, strict=True)
-        ],
-        [view.summary.frame_mean_DN / signal for view, signal in zip(views, signals_DN, strict=True)],
-        [_noise_of_a_frame(view) / signal**2 for view, signal in zip(views, signals_DN, strict=True)],
-    )
+    levels, courses, noise = [], [], []
+    for number in lit:
+        view, signal_DN = problem.views[number], signals_DN[number]
+        levels.append(mean_over(view.residual_DN, view.mask) / signal_DN - moved[number])
+        courses.append(view.summary.frame_mean_DN / signal_DN)
+        noise.append(noises[number] / signal_DN**2)
+    rms = rms_about_mean(levels, courses, noise)
     return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
 
 

@@ -16,7 +16,7 @@ p is water's share of scattered photons into a direction, per sr, of the beam be
 free atoms, with h = g for what stands nowhere else than in the air gap. One law for the gap: h grows as a power
 (`gap_exponent`, 1: in proportion) of g, and what all directions get stays, so that what a field of finite size catches
 falls by itself. Only the field that the detector covers is irradiated. Photons that scatter more than once are not counted
-apart: behind 20 mm of water they are 3-7 % of all, spread more evenly.
+apart: behind 20 mm of water the virtual lab has 3-7 % of them (40 and 90 kV, 100 and 350 mm of air), spread more evenly.
 """
 
 from collections.abc import Mapping

@@ -1,0 +1,73 @@
+"""An output drift's strength as the frames' levels tell it, whatever stands in the beam or acts beside it."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from raytwin.diagnosis import strengths
+
+SHAPE, FRAMES, SIGNAL_DN = (8, 8), 20, 5000.0
+OUTPUT = 0.006 * np.sin(0.05 * np.arange(8 * FRAMES))
+
+
+def view(output, *, signal_DN=SIGNAL_DN, noise_DN=5.0, lit=True, calibrates=False, more=0.0):
+    """A series whose frames have this relative output (frame,); more: of its level, by something else."""
+    frames = 100.0 + signal_DN * (1.0 + output)
+    return SimpleNamespace(
+        session=SimpleNamespace(request=SimpleNamespace(beam_on=lit), calibrates=calibrates),
+        mask=np.ones(SHAPE, dtype=bool),
+        signal_DN=np.full((1, 1), signal_DN),
+        residual_DN=np.full(SHAPE, signal_DN * (float(output.mean()) + more)),
+        noise_DN=np.full(SHAPE, noise_DN / math.sqrt(len(output))),
+        summary=SimpleNamespace(frames=len(output), frame_mean_DN=frames),
+    )
+
+
+def found(views, *, effects=("output_drift",), since="always"):
+    problem = SimpleNamespace(views=views)
+    hypothesis = SimpleNamespace(
+        effects=effects,
+        variants={name: SimpleNamespace(since=since) for name in effects},
+        strengths=dict.fromkeys(effects, (1.0, 0.9, 1.1)),
+    )
+    return strengths._output_rms(problem, hypothesis)
+
+
+def lit_series(**more):
+    return [view(part, **more) for part in np.split(OUTPUT, 8)]
+
+
+def test_the_strength_is_the_rms_of_the_output_and_opaque_series_and_darks_say_nothing_of_it():
+    value, low, high = found(lit_series())
+    assert low == value == high
+    assert value == pytest.approx(100.0 * float(OUTPUT.std()), rel=0.005)
+    opaque = view(np.zeros(FRAMES), signal_DN=1e-6, more=4e5)
+    black = view(np.zeros(FRAMES), signal_DN=0.0)
+    dark = view(np.zeros(FRAMES), lit=False, more=0.3)
+    assert found([*lit_series(), opaque, black, dark])[0] == pytest.approx(value)
+
+
+def test_a_drift_since_the_calibration_is_read_from_later_series():
+    steady = [view(np.zeros(FRAMES), calibrates=True) for _ in range(30)]
+    assert found([*steady, *lit_series()], since="calibration")[0] == pytest.approx(
+        100.0 * float(OUTPUT.std()), rel=0.005
+    )
+    assert found([*steady, *lit_series()])[0] < 70.0 * float(OUTPUT.std())
+
+
+def test_what_another_effect_does_to_levels_is_taken_off_and_much_of_it_left_out(monkeypatch):
+    monkeypatch.setattr(strengths, "_applied", lambda problem, hypothesis, effect, strength: effect)
+    shares = [0.004, -0.006, 0.0, 0.5, 0.0, 0.003, 0.0, -0.3]
+    views = [view(part, more=share) for part, share in zip(np.split(OUTPUT, 8), shares, strict=True)]
+    changes = [np.full((1, 1), share * SIGNAL_DN) for share in shares]
+    monkeypatch.setattr(strengths, "map_changes", lambda problem, effects: changes)
+    kept = np.concatenate([part for part, share in zip(np.split(OUTPUT, 8), shares, strict=True) if abs(share) < 0.01])
+    value, _, _ = found(views, effects=("object_scatter", "output_drift"))
+    assert value == pytest.approx(100.0 * float(kept.std()), rel=0.005)
+
+
+def test_too_few_series_or_nothing_but_noise_leave_the_fit_its_strength():
+    assert found(lit_series()[:3]) is None
+    assert found([view(np.zeros(FRAMES), noise_DN=40.0) for _ in range(8)]) is None

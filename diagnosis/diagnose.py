@@ -15,9 +15,10 @@ from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .coarse import UNSEEN, in_pixels
-from .forward_model import can_show
+from .forward_model import can_displace, can_show
 from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, Priors, law_terms, weigh_hypotheses
 from .next_series import best_measurement, proposal_text
+from .placing import ALONG_COLUMNS, ALONG_ROWS
 from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
@@ -257,10 +258,12 @@ def judge(
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
 
+    of_places = np.array([name.statistic in (ALONG_ROWS, ALONG_COLUMNS) for name in problem.names])
     elsewhere = {
         effect: np.array([not can_show(effect, view.session.request) for view in problem.views], dtype=bool)[
             problem.series_of
         ]
+        | (of_places & (not can_displace(effect)))
         for effect in {variant.effect for variant in problem.variants}
     }
 

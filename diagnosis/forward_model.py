@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
-from ..generator.effects.registration import parts_px
+from ..generator.effects.registration import angles_of, parts_px
 from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
 from ..generator.twin import Twin
 from .changes import TwinChange, Variant
@@ -25,6 +25,8 @@ _ON_OBJECTS_ALONE = frozenset(
     {item.id for item in EFFECTS.values() if item.stage == "object_blur"}
     | {"misregistration", "object_scatter", "composition_error"}
 )
+# beside blurs: effects that make edges look as if they lay elsewhere
+_RESHAPES = frozenset(("misregistration", "object_scatter", "composition_error"))
 _ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 
@@ -90,13 +92,7 @@ class Change:
         misplaced = self._misplaced
         if misplaced is None or self.only_displaces:
             return self
-        size = math.hypot(misplaced.radial, misplaced.turn)
-        rest = {
-            "strength": size,
-            "direction_deg": 0.0,
-            "magnification_deg": math.copysign(90.0, misplaced.radial),
-            "rotation_deg": math.degrees(math.asin(misplaced.turn / size)),
-        }
+        rest = {**angles_of(0.0, misplaced.radial, misplaced.turn), "direction_deg": 0.0}
         effect = misplaced.effect
         others = (item for item in self.effects if item is not effect)
         return replace(self, effects=(*others, replace(effect, parameters={**effect.parameters, **rest})))
@@ -138,6 +134,11 @@ def can_show(effect: str, request: SeriesRequest) -> bool:
     if EFFECTS[effect].stage in ("beam", "arrivals", "quanta", "optics", "exposure"):
         return request.beam_on
     return True
+
+
+def can_displace(effect: str) -> bool:
+    """Whether an effect of the catalogue, or what is wrong with its law, can seem to move a scene's picture."""
+    return effect in _RESHAPES or EFFECTS[effect].stage in ("object_blur", "optics")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

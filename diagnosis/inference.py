@@ -37,9 +37,14 @@ UNKNOWN_CHANCE = 3.0  # log evidence that sessions without any effect show by ch
 PAIR_DOUBT = 3e-3  # share of the stronger effect's log evidence that a second effect must bring
 PAIR_DOUBT_ROOT = 0.6  # and so often its square root: what a slightly wrong law leaves by chance
 PAIR_DOUBT_ELSEWHERE = 0.36  # share of both that is left of them where the two effects move no probe in common
+# no more than this, and this times the power 3/2 of the evidence: of 56 sealed effects alone, those with evidences up to 1e6 left
+# another one 5 at most (a wandering output 15, lag a dark drift 31), stronger lags and glares 40 to 7000
+PAIR_DOUBT_LEAST = 12.0
+PAIR_DOUBT_STRONG = 5e-7
+PAIR_DOUBT_SHARED = 4.0  # and so much more of the latter where both effects move the same probes
 APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
-_PAIRS_IN_FULL = 10  # pairs, the likeliest, for which both laws are taken as inexact
+_PAIRS_IN_FULL = 14  # pairs, the likeliest, either order, for which both laws are taken as inexact
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
 )
@@ -626,7 +631,6 @@ def weigh_hypotheses(
         )
     ranked = sorted(singles, key=lambda effect: -evidence_of[effect])
     n_pairs = max(n_effects * (n_effects - 1) // 2, 1)
-    done: set[tuple[str, str]] = set()
     table = _NodeTable(curves)
     starts: list[tuple[float, str, str, _PairStart]] = []
     for first in ranked[:pairs_from]:
@@ -634,10 +638,9 @@ def weigh_hypotheses(
         leading = singles[first]
         states = _states_of(leading, residual, nuisances, groups, places, law_errors, table)
         for second, second_fits in by_effect.items():
-            key = (min(first, second), max(first, second))
-            if second == first or key in done:
+            if second == first:
                 continue
-            done.add(key)
+            # of two that lead both orders are tried: what one alone is best with need not be so beside the other
             start = _start_pair(leading, second_fits, states=states, table=table)
             # the first's own variants were averaged above; its best stands for them
             starts.append((evidence_of[first] - leading.log_evidence, first, second, start))
@@ -652,6 +655,8 @@ def weigh_hypotheses(
         doubt = PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
         if strong not in loose:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
+            shared = 1.0 + PAIR_DOUBT_SHARED * overlaps[number]
+            doubt = min(doubt, PAIR_DOUBT_LEAST + PAIR_DOUBT_STRONG * shared * stronger**1.5)
         gain = evidence - evidence_of[strong]
         if strong in elsewhere and gain > 0.0:
             clean = elsewhere[strong] & ~np.any(np.abs(singles[strong].curve.responses) > _MOVES, axis=0)
@@ -659,12 +664,17 @@ def weigh_hypotheses(
         return evidence - doubt - chance.get(first, 0.0) - chance.get(second, 0.0)
 
     ahead = [doubted(number, more + start.log_evidence) for number, (more, _, _, start) in enumerate(starts)]
+    pairs: dict[tuple[str, ...], tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]] = {}
     for rank, number in enumerate(sorted(range(len(starts)), key=lambda number: -ahead[number])):
         more, first, second, start = starts[number]
         errors = law_errors if rank < _PAIRS_IN_FULL else ()
-        evidence, strengths, chosen = _finish_pair(residual, start, nuisances, groups, places, errors, table=table)
+        found, strengths, chosen = _finish_pair(residual, start, nuisances, groups, places, errors, table=table)
         key = (min(first, second), max(first, second))
-        raw.append((key, doubted(number, evidence + more), math.log(priors.pair / n_pairs), strengths, chosen, ""))
+        evidence = doubted(number, found + more)
+        if key not in pairs or evidence > pairs[key][0]:
+            pairs[key] = (evidence, strengths, chosen)
+    prior = math.log(priors.pair / n_pairs)
+    raw += [(key, evidence, prior, strengths, chosen, "") for key, (evidence, strengths, chosen) in pairs.items()]
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names
     unknown, place = unknown_evidence(residual, nuisances, parts, names)

@@ -16,8 +16,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.rounding import variance_before_rounding
 from ..generator.series import ExpectedSeries
 from .fixed_pattern import Pattern
+from .lost_bits import rounded_kurtosis
 from .noise_correlation import autocovariance, correlation_sum
 from .registration import gradient
 from .summaries import BLOCK_PX, LAGS, SeriesSummary
@@ -263,7 +265,7 @@ def expected_scalars(
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
             values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
-        values["kurtosis"] = 0.0
+        values["kurtosis"] = _kurtosis(expected, context, full)
         if context.kind in ("flat", "object"):
             signal = context.reference_signal_DN
             quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / n_good
@@ -318,6 +320,15 @@ def expected_scalars(
     if context.counts_all_outliers:
         values["outliers in any series"] = math.sqrt(expected.bad_pixel_share * n_good + 0.375)
     return values
+
+
+def _kurtosis(expected: ExpectedSeries, context: ScalarContext, variance_DN2: float) -> float:
+    """Excess kurtosis that the ADC's steps leave in noise of a variance, rounding included."""
+    step = expected.quantisation_step_DN
+    if step <= 0.0 or variance_DN2 > step**2:
+        return 0.0
+    before = float(variance_before_rounding(variance_DN2, step))
+    return rounded_kurtosis(math.sqrt(before) / step, context.frames)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.effects.effect import Parameter
+from ..generator.effects.registration import angles_of, parts_px
 from .changes import KEPT_AS_THEY_ARE, ONE_STRENGTH, Variant
 from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Widened, fit_curve, widened_for
 
@@ -87,7 +88,39 @@ def refine(
                 found = _refined(variant, fit, seen, respond)
                 if found is not None:
                     result.append(found)
+            together = _displaced_and_distorted(fits, variants) if effect == "misregistration" else None
+            found = None if together is None else _refined(*together, seen, respond)
+            if found is not None:
+                result.append(found)
     return result
+
+
+def _displaced_and_distorted(
+    fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant]
+) -> tuple[Variant, CurveFit] | None:
+    """A misregistration that shifts as the best mere shift does, and enlarges or turns as the best that does so.
+
+    From either alone no small step of the angles leads to the other. None: one of them is not seen.
+    """
+    best: dict[bool, CurveFit] = {}
+    for fit in sorted(fits, key=lambda item: item.log_evidence):
+        shift, *_ = _parts_of(variants[fit.curve.effect, fit.curve.variant], fit.best)
+        best[abs(shift) > 0.5 * fit.best] = fit
+    if len(best) < 2 or min(fit.separation for fit in best.values()) < REFINED_FROM:
+        return None
+    variant = variants[best[True].curve.effect, best[True].curve.variant]
+    shift, *_ = _parts_of(variant, best[True].best)
+    _, radial, turn = _parts_of(variants[best[False].curve.effect, best[False].curve.variant], best[False].best)
+    angles = angles_of(abs(shift), radial, turn)
+    strength = min(max(angles.pop("strength"), variant.low), variant.high)
+    found = replace(best[True], strengths=np.array([strength]), log_likelihood=np.zeros(1))
+    return replace(variant, parameters={**variant.parameters, **angles}, name=f"{variant.name}, distorted"), found
+
+
+def _parts_of(variant: Variant, strength: float) -> tuple[float, float, float]:
+    """Shift, enlargement and turn (px) of a misregistration."""
+    angles = {name: variant.parameters.get(name, 0.0) for name in ("magnification_deg", "rotation_deg")}
+    return parts_px(strength, **angles)
 
 
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -279,9 +312,10 @@ def _newton(
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12
     solved = np.linalg.solve(normal, wide.inner(slopes, left[None, :])[:, 0])
-    return {item.name: 0.0 for item in inner} | {
-        name: float(np.clip(solved[1 + number], -_FARTHEST, _FARTHEST)) for number, name in enumerate(kept)
-    }
+    # shortened as a whole: what parameters explain alike must keep its direction
+    farthest = float(np.max(np.abs(solved[1:]), initial=0.0))
+    solved *= min(1.0, _FARTHEST / max(farthest, 1e-12))
+    return {item.name: 0.0 for item in inner} | {name: float(solved[1 + number]) for number, name in enumerate(kept)}
 
 
 def _moved(item: Parameter, value: float, step: float) -> float:

@@ -18,6 +18,7 @@ LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
 TIME_TILES = 4  # tiles a side whose means are kept frame by frame
 _PIECE_FRAMES = 64
+_QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
 _CODES_FRAMES = 16
 
 
@@ -241,6 +242,7 @@ def summarise_series(
         if len(d):
             if len(d) > 3:
                 inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
+                inside[:, _standing_still(raw, d2, good)] = 0.0
                 pair_fourth += float(np.sum(inside * inside))
                 pair_second += inside.size * (1.0 + 0.0)
             for index, (first, second, selected) in enumerate(pairs_of_lag):
@@ -284,7 +286,7 @@ def summarise_series(
         column_variance_DN2=column_sum / one,
         block_variance_DN2=block_sum / one,
         temporal_covariance_DN2=temporal / np.maximum(temporal_pairs, 1),
-        kurtosis_excess=_kurtosis_excess(pair_fourth, pair_second, min(n_pairs, _PIECE_FRAMES)),
+        kurtosis_excess=kurtosis_excess(pair_fourth, pair_second, min(n_pairs, _PIECE_FRAMES)),
         frame_mean_DN=np.concatenate(frame_means),
         tile_mean_DN=np.concatenate(tiles),
         distinct_codes=distinct,
@@ -310,7 +312,15 @@ def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
     return there.size, int(there[-1] - there[0]) + 1
 
 
-def _kurtosis_excess(fourth: float, count: float, pairs: int) -> float:
+def _standing_still(raw: NDArray[Any], d2: NDArray[np.float32], good: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Good pixels (numbers among them) whose code never changes: the common factor that was taken out is no noise of theirs."""
+    squares = d2[good]
+    quiet = np.flatnonzero(squares < _QUIET * float(squares.mean()))
+    codes = raw.reshape(len(raw), -1)[:, np.flatnonzero(good)[quiet]]
+    return np.asarray(quiet[np.all(codes == codes[:1], axis=0)])
+
+
+def kurtosis_excess(fourth: float, count: float, pairs: int) -> float:
     """Excess kurtosis of standardised differences; each pixel was scaled by its own variance of `pairs` differences."""
     if count == 0:
         return 0.0

@@ -144,7 +144,6 @@ class ImageEffects:
         state = self._through(self._open_state(), always, None)
         held = state.read_variance_taken_DN2
         rounding = 1.0 / 12.0 if self.twin.noise.quantised else 0.0
-        held += max(state.step_DN**2 / 12.0 - rounding, 0.0)
         if held <= 0:
             return read_variance_DN2
         return np.asarray(np.maximum(read_variance_DN2 - np.float32(held), np.float32(rounding)))

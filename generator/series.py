@@ -25,6 +25,7 @@ from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, Effect, effect_of, in_order
 from .effects.scatter import mean_signal_energy_keV
 from .line_state import FloatArray, LagLaw, LineContext, LineState
+from .rounding import rounded_variance
 from .twin import Twin
 
 __all__ = [
@@ -773,8 +774,13 @@ def expected_series(
     least = electronic + state.row_variance_DN2 + state.column_variance_DN2
     rounding: FloatArray | float = state.step_DN**2 / 12.0
     if float(np.min(least)) < _ROUNDED_SD**2 * state.step_DN**2:
-        shift, rounding = _staircase(mean, averaged * (quantum + white) + least, state.step_DN)
-        mean = mean + shift
+        noise = averaged * (quantum + white) + least
+        if cache.draft:
+            # pixels that stand for others with means of their own: what rounding does on average
+            rounding = rounded_variance(noise, state.step_DN) - noise
+        else:
+            shift, rounding = _staircase(mean, noise, state.step_DN)
+            mean = mean + shift
     white = white + (electronic + rounding) / averaged
     saturated = 0.0
     if twin.instrument.bits is not None:

@@ -10,6 +10,7 @@ from scipy.special import ndtr
 
 from raytwin.diagnosis.defects import memory_of
 from raytwin.diagnosis.fixed_pattern import Pattern
+from raytwin.diagnosis.lost_bits import rounded_kurtosis
 from raytwin.diagnosis.probes import (
     Areas,
     MapProjection,
@@ -54,6 +55,20 @@ def test_variance_of_white_frames_is_that_of_the_noise():
     assert found.block_variance_DN2 * BLOCK_PX**2 == pytest.approx(100.0, rel=0.2)
     assert abs(found.temporal_covariance_DN2[0]) < 100 * 5 / np.sqrt(FRAMES * 48 * 64)
     assert abs(found.kurtosis_excess) < 0.1
+
+
+@pytest.mark.parametrize(("sd_steps", "frames"), [(0.12, 40), (0.18, 30), (0.28, 40), (0.35, 25), (0.6, 40)])
+def test_kurtosis_of_rounded_frames_is_foretold(sd_steps, frames):
+    rng, step = np.random.default_rng(6), 30.0
+    mean = 1000.0 + step * rng.random((96, 96))
+    rounded = step * np.rint((mean + sd_steps * step * rng.standard_normal((frames, 96, 96))) / step)
+    good = np.ones((96, 96), dtype=bool)
+    found = summarise_series([rounded.astype(np.float32)], good=good, labels=np.zeros(good.shape, dtype=np.int64))
+    assert rounded_kurtosis(sd_steps, frames) == pytest.approx(found.kurtosis_excess, rel=0.1, abs=0.06)
+
+
+def test_fine_steps_leave_a_gaussian():
+    assert rounded_kurtosis(0.8, 30) == rounded_kurtosis(0.0, 30) == rounded_kurtosis(0.2, 2) == 0.0
 
 
 def test_common_factor_of_each_frame_stays_out_of_the_pixels_noise():

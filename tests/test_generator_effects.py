@@ -19,6 +19,7 @@ from raytwin.generator.effects.sharpness import _transfer_of_spot
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
+from raytwin.generator.rounding import rounded_variance, variance_before_rounding
 from raytwin.generator.series import (
     LineMemory,
     ModelCache,
@@ -98,8 +99,8 @@ def applied(name, strength=None, since=None, options=None, **parameters):
     )
 
 
-def expect(line, asked, effects=()):
-    return expected_series(line, asked, effects=effects, cache=CACHE)
+def expect(line, asked, effects=(), cache=CACHE):
+    return expected_series(line, asked, effects=effects, cache=cache)
 
 
 # ------------------------------------------------------------------------------------------------ the catalogue
@@ -790,7 +791,8 @@ def test_rounding_to_coarse_steps_has_the_moments_of_a_rounded_gaussian(series_l
 
     for level in np.linspace(1200.0, 1264.0, 7):
         maps = replace(series_line.maps, dark_DN=np.full(SHAPE, level, dtype=np.float32))
-        found = expect(replace(series_line, maps=maps), request("dark", setting=None), applied("quantisation", step))
+        lost = applied("quantisation", step, since="calibration")
+        found = expect(replace(series_line, maps=maps), request("dark", setting=None), lost)
         grid = step * np.arange(0, 3000 // step)
         sigma = math.sqrt(12.0**2)
         weight = norm.cdf(grid + step / 2, level, sigma) - norm.cdf(grid - step / 2, level, sigma)
@@ -798,6 +800,34 @@ def test_rounding_to_coarse_steps_has_the_moments_of_a_rounded_gaussian(series_l
         assert found.mean_DN[0, 0] == pytest.approx(mean, abs=2e-3)
         assert found.white_variance_DN2[0, 0] == pytest.approx(float(weight @ (grid - mean) ** 2), rel=1e-3)
         assert found.quantisation_step_DN == step
+
+
+@pytest.mark.parametrize("sd_steps", [0.05, 0.15, 0.3, 0.6, 2.0])
+def test_rounding_averaged_over_means_has_the_variance_of_rounded_numbers(sd_steps):
+    """Against numbers that were rounded, their means anywhere between codes; and back."""
+    rng, step = np.random.default_rng(4), 12.0
+    sd = sd_steps * step
+    mean = step * rng.random(40000)
+    rounded = step * np.rint((mean + sd * rng.standard_normal((100, 40000))) / step)
+    expected = float(np.mean(np.var(rounded, axis=0, ddof=1)))
+    found = rounded_variance([sd**2], step)
+    assert found[0] == pytest.approx(expected, rel=0.02)
+    assert variance_before_rounding(found, step)[0] == pytest.approx(sd**2, rel=1e-3)
+
+
+def test_bits_lost_before_the_calibration_leave_its_dark_noise_as_it_was(series_line):
+    """The calibrated variance is that of rounded numbers, and is rounded numbers' again, whatever the step."""
+    dark, cache = request("dark", setting=None), ModelCache(draft=True)
+    pixels = np.full(SHAPE, 150.0, dtype=np.float32)
+    line = replace(series_line, maps=replace(series_line.maps, read_variance_DN2=pixels))
+    for step in (4.0, 20.0, 50.0):
+        found = expect(line, dark, applied("quantisation", step, since="always"), cache=cache)
+        assert float(np.mean(found.white_variance_DN2)) == pytest.approx(150.0, rel=1e-3)
+        later = expect(line, dark, applied("quantisation", step, since="calibration"), cache=cache)
+        before = 150.0 - 1.0 / 12.0
+        assert float(np.mean(later.white_variance_DN2)) == pytest.approx(
+            float(rounded_variance(before, step)), rel=1e-3
+        )
 
 
 def test_patterns_are_fixed_by_their_seed(series_line):

@@ -8,7 +8,10 @@ bad pixels     dead, hot, in clusters and in lines
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from ..line_state import LineContext, LineState
+from ..rounding import variance_before_rounding
 from .effect import Effect, Parameter
 
 
@@ -57,7 +60,16 @@ ROW_NOISE = Effect(
 
 
 def _lose_bits(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    return replace(state, step_DN=max(state.step_DN, parameters["strength"]))
+    step = max(state.step_DN, parameters["strength"])
+    taken = 0.0
+    if context.since == "always" and step > 0.0:
+        # the calibrated variance is that of rounded numbers
+        twin = context.twin
+        good = twin.maps.bad_pixels == 0
+        calibrated = float(np.mean(np.asarray(twin.maps.read_variance_DN2, dtype=np.float64)[good]))
+        finest = 1.0 / 12.0 if twin.noise.quantised else 0.0
+        taken = max(calibrated - finest - float(variance_before_rounding(calibrated, step)), 0.0)
+    return replace(state, step_DN=step, read_variance_taken_DN2=state.read_variance_taken_DN2 + taken)
 
 
 QUANTISATION = Effect(

@@ -20,6 +20,16 @@ def parts_px(strength_px: float, *, magnification_deg: float, rotation_deg: floa
     return strength_px * straight * shift, strength_px * straight * radial, strength_px * turn
 
 
+def angles_of(shift_px: float, radial_px: float, turn_px: float) -> dict[str, float]:
+    """Strength (px) and angles (deg) of a misregistration with these parts, the shift 0 or more; what `parts_px` takes apart."""
+    straight = math.hypot(shift_px, radial_px)
+    return {
+        "strength": math.hypot(straight, turn_px),
+        "magnification_deg": math.degrees(math.atan2(radial_px, shift_px)),
+        "rotation_deg": math.degrees(math.atan2(turn_px, straight)),
+    }
+
+
 def _displace(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
     if parameters["strength"] == 0 or not context.has_scene or state.signal_DN.shape != context.shape:
         return state

@@ -80,41 +80,41 @@ def refine(
                 if other != effect:
                     seen = seen.beside(hypothesis.variants[other], hypothesis.strengths[other][0])
             fits = [seen.fit(curve) for curve in curves if curve.effect == effect]
-            for fit in _starts_of(fits):
-                response = fit.curve.response(fit.best)
-                if float(response @ seen.nuisances.solve(response)) < REFINED_FROM**2:
-                    continue
-                variant = variants[effect, fit.curve.variant]
-                found = _refined(variant, fit, seen, respond)
-                if found is not None:
-                    result.append(found)
-            together = _displaced_and_distorted(fits, variants) if effect == "misregistration" else None
-            found = None if together is None else _refined(*together, seen, respond)
-            if found is not None:
-                result.append(found)
+            clear = [fit for fit in fits if _separation(fit, seen) >= REFINED_FROM]
+            starts = [(variants[effect, fit.curve.variant], fit) for fit in _starts_of(clear)] if clear else []
+            if effect == "misregistration":
+                starts += _displaced_and_distorted(clear, variants)
+            refined = (_refined(variant, fit, seen, respond) for variant, fit in starts)
+            result += [found for found in refined if found is not None]
     return result
+
+
+def _separation(fit: CurveFit, seen: "_Seen") -> float:
+    """Of a fit from none, its law taken as exact."""
+    response = fit.curve.response(fit.best)
+    return math.sqrt(max(float(response @ seen.nuisances.solve(response)), 0.0))
 
 
 def _displaced_and_distorted(
     fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant]
-) -> tuple[Variant, CurveFit] | None:
+) -> list[tuple[Variant, CurveFit]]:
     """A misregistration that shifts as the best mere shift does, and enlarges or turns as the best that does so.
 
-    From either alone no small step of the angles leads to the other. None: one of them is not seen.
+    From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
     """
     best: dict[bool, CurveFit] = {}
     for fit in sorted(fits, key=lambda item: item.log_evidence):
         shift, *_ = _parts_of(variants[fit.curve.effect, fit.curve.variant], fit.best)
         best[abs(shift) > 0.5 * fit.best] = fit
-    if len(best) < 2 or min(fit.separation for fit in best.values()) < REFINED_FROM:
-        return None
+    if len(best) < 2:
+        return []
     variant = variants[best[True].curve.effect, best[True].curve.variant]
     shift, *_ = _parts_of(variant, best[True].best)
     _, radial, turn = _parts_of(variants[best[False].curve.effect, best[False].curve.variant], best[False].best)
     angles = angles_of(abs(shift), radial, turn)
     strength = min(max(angles.pop("strength"), variant.low), variant.high)
     found = replace(best[True], strengths=np.array([strength]), log_likelihood=np.zeros(1))
-    return replace(variant, parameters={**variant.parameters, **angles}, name=f"{variant.name}, distorted"), found
+    return [(replace(variant, parameters={**variant.parameters, **angles}, name=f"{variant.name}, distorted"), found)]
 
 
 def _parts_of(variant: Variant, strength: float) -> tuple[float, float, float]:

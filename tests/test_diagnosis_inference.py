@@ -8,6 +8,10 @@ import pytest
 
 from raytwin.diagnosis.diagnose import DOUBT, _strained, _with_doubt
 from raytwin.diagnosis.inference import (
+    PAIR_DOUBT,
+    PAIR_DOUBT_ELSEWHERE,
+    PAIR_DOUBT_LEAST,
+    PAIR_DOUBT_ROOT,
     UNKNOWN,
     Curve,
     Hypothesis,
@@ -350,6 +354,46 @@ def test_a_second_effect_elsewhere_is_named_beside_a_strong_one():
     assert found[0].effects == ("strong", "weak")
     alone = weigh(10.0 * strong + rng.standard_normal(PROBES), np.zeros((PROBES, 1)), made)
     assert alone[0].effects == ("strong",)
+
+
+def test_a_second_effect_needs_little_beside_a_first_whose_law_cannot_leave_much():
+    """Evidence of 10,000 leaves another effect a few units; three thousandths of it and its root had been asked."""
+    rng = np.random.default_rng(9)
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[:300] = rng.standard_normal(300)
+    weak[260:340] = rng.standard_normal(80)  # half of it where the first one acts
+    made = [one_node(name, direction, high=500.0) for name, direction in (("strong", strong), ("weak", weak))]
+    without = np.zeros((PROBES, 1))
+    residual = 8.0 * strong + 0.8 * weak + rng.standard_normal(PROBES)
+    found = weigh(residual, without, made)
+    pair = next(item for item in found if set(item.effects) == {"strong", "weak"})
+    alone = next(item for item in found if item.effects == ("strong",))
+    assert found[0] is pair
+    share = PAIR_DOUBT_ELSEWHERE * (PAIR_DOUBT * alone.log_evidence + PAIR_DOUBT_ROOT * alone.log_evidence**0.5)
+    assert pair.log_evidence + PAIR_DOUBT_LEAST - alone.log_evidence < share  # what had been asked at the least
+    for seed in range(5):
+        noisy = 8.0 * strong * (1.0 + 0.05 * rng.standard_normal(PROBES)) + np.random.default_rng(seed).standard_normal(
+            PROBES
+        )
+        assert weigh(noisy, without, made)[0].effects == ("strong",)
+
+
+def test_a_pair_has_the_variant_that_is_best_beside_the_other_and_not_the_one_that_is_best_alone():
+    u, w = np.zeros(PROBES), np.zeros(PROBES)
+    u[:200], w[200:400] = 1.0, 1.0
+    glare = [
+        one_node("glare", u, variant="short", high=500.0),
+        one_node("glare", u + 0.3 * w, variant="long", high=500.0),
+    ]
+    map_error = one_node("gain_map", w, high=500.0)
+    residual = 20.0 * u + 5.0 * w + np.random.default_rng(2).standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), [*glare, map_error])
+    alone = next(item for item in found if item.effects == ("glare",))
+    pair = next(item for item in found if set(item.effects) == {"glare", "gain_map"})
+    assert alone.variants["glare"].variant == "long"
+    assert pair.variants["glare"].variant == "short"
+    assert pair.strengths["glare"][0] == pytest.approx(20.0, rel=0.05)
+    assert pair.strengths["gain_map"][0] == pytest.approx(5.0, rel=0.1)
 
 
 def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength():

@@ -10,11 +10,13 @@ from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much, _misfit
-from raytwin.diagnosis.forward_model import can_show
+from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
 from raytwin.generator.effects import EFFECTS, AppliedEffect
+from raytwin.generator.effects.effect import spread_transfer
+from raytwin.generator.effects.registration import parts_px
 from raytwin.generator.series import SeriesRequest, expected_series
 
 PROBES = 60
@@ -148,6 +150,67 @@ def test_refinement_follows_a_response_that_is_not_in_proportion_to_the_strength
     for closer, _ in found:
         assert closer.strengths[1] == pytest.approx(0.92, rel=0.03)
         assert closer.parameters["aspect"] == pytest.approx(1.0, rel=0.03)
+
+
+def test_refinement_keeps_its_direction_where_two_parameters_explain_alike():
+    """A share that spreads farther in another shape: from an exponential's cusp to a Gaussian, the range hardly changed."""
+    frequency = np.linspace(0.0, 0.5, PROBES)
+
+    def law(parameters, strength):
+        spread = spread_transfer(
+            frequency,
+            0.0 * frequency,
+            reach_px=parameters["range_mm"] / 0.12,
+            order=parameters["order"],
+            usual_order=0.5,
+        )
+        return 2.0 * strength * (1.0 - spread)
+
+    variants = [item for item in catalogue_variants() if item.effect == "k_fluorescence" and item.since == "always"]
+    true = {"range_mm": 0.21, "order": 5.0}
+    found = refined(variants, law, law(true, 16.0) + np.random.default_rng(1).standard_normal(PROBES))
+    best = min((item for item, _ in found), key=lambda item: abs(item.parameters["order"] - true["order"]))
+    assert best.parameters["order"] > 2.5
+    assert best.parameters["range_mm"] == pytest.approx(true["range_mm"], rel=0.1)
+    assert best.strengths[1] == pytest.approx(16.0, rel=0.1)
+
+
+def test_a_misregistration_that_shifts_and_turns_is_found_from_its_two_parts():
+    """No small step of the angles leads from a mere turn to a shift, or from a mere shift to a turn against the slope."""
+    rng = np.random.default_rng(4)
+    shown = 20.0 * rng.standard_normal((4, PROBES))
+
+    def law(parameters, strength):
+        shift, radial, turn = parts_px(
+            strength,
+            magnification_deg=parameters["magnification_deg"],
+            rotation_deg=parameters["rotation_deg"],
+        )
+        angle = np.radians(parameters["direction_deg"])
+        return np.array([shift * np.cos(angle), shift * np.sin(angle), radial, turn]) @ shown
+
+    variants = [item for item in catalogue_variants() if item.effect == "misregistration"]
+    true = {"direction_deg": 222.0, "magnification_deg": 0.0, "rotation_deg": -38.5}
+    found = refined(variants, law, law(true, 2.13) + rng.standard_normal(PROBES))
+    together = [item for item, _ in found if "distorted" in item.name]
+    assert len(together) == 1
+    assert together[0].strengths[1] == pytest.approx(2.13, rel=0.03)
+    assert together[0].parameters["rotation_deg"] == pytest.approx(-38.5, abs=2.0)
+    assert together[0].parameters["direction_deg"] == pytest.approx(222.0, abs=2.0)
+
+
+def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_electronic_cannot():
+    displacing = {effect for effect in EFFECTS if can_displace(effect)}
+    assert displacing == {
+        "object_scatter",
+        "veiling_glare",
+        "focal_spot",
+        "mtf_tail",
+        "k_fluorescence",
+        "motion_blur",
+        "misregistration",
+        "composition_error",
+    }
 
 
 @pytest.mark.parametrize(

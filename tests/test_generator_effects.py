@@ -14,7 +14,7 @@ from raytwin.generator._distortion import displacement_px, distorted
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter, effect_of, in_order
 from raytwin.generator.effects.effect import spread_transfer
 from raytwin.generator.effects.fluorescence import line_energy_keV
-from raytwin.generator.effects.registration import parts_px
+from raytwin.generator.effects.registration import angles_of, parts_px
 from raytwin.generator.effects.sharpness import _transfer_of_spot
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
@@ -876,6 +876,17 @@ def test_the_rms_displacement_is_the_strength_for_any_mix(strength, magnificatio
     shift, radial, turn = parts_px(strength, magnification_deg=magnification, rotation_deg=rotation)
     down, right = displacement_px((rows, columns), radial_px=radial, turn_px=turn)
     assert math.sqrt(shift**2 + np.mean(down**2 + right**2)) == pytest.approx(strength, rel=1e-9)
+
+
+@given(strength=st.floats(0.01, 5.0), magnification=st.floats(-90.0, 90.0), rotation=st.floats(-89.9, 89.9))
+def test_the_angles_of_a_misregistration_are_found_from_its_parts(strength, magnification, rotation):
+    parts = parts_px(strength, magnification_deg=magnification, rotation_deg=rotation)
+    found = angles_of(*parts)
+    again = parts_px(
+        found["strength"], magnification_deg=found["magnification_deg"], rotation_deg=found["rotation_deg"]
+    )
+    assert found["strength"] == pytest.approx(strength, rel=1e-9)
+    assert again == pytest.approx(parts, abs=1e-9)
 
 
 def test_a_turn_is_counter_clockwise_about_the_middle_and_leaves_the_middle_where_it_is():

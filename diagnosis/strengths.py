@@ -11,7 +11,7 @@ from ..generator.effects import AppliedEffect
 from ..generator.series import with_conditions
 from .assemble import Problem, SeriesView, map_changes
 from .changes import DEFINED_SD
-from .even_maps import mean_over
+from .even_maps import Map, mean_over
 from .inference import Hypothesis, Nuisances, fit_curve
 from .output_course import rms_about_mean
 
@@ -23,6 +23,8 @@ _NOISIEST = (
     0.01  # of its level: noise of a frame's mean, beyond which (behind opaque objects) it tells nothing of the output
 )
 _LEAST_SERIES = 5
+_LEAST_OPEN = 0.02  # share of the field that lies open in a series whose level tells of the output
+_NEAR_PX = 6  # from an object's outline: where it may really lie, and what its edge spreads
 
 
 def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
@@ -91,30 +93,50 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis) -> tuple[float, float,
     since = hypothesis.variants["output_drift"].since == "calibration"
     signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
     noises = [_noise_of_a_frame(view) for view in problem.views]
+    fields = [_open_field(view) for view in problem.views]
     lit = [
         number
         for number, view in enumerate(problem.views)
         if view.session.request.beam_on
         and not (since and view.session.calibrates)
         and noises[number] < (_NOISIEST * signals_DN[number]) ** 2
+        and np.count_nonzero(fields[number]) > _LEAST_OPEN * fields[number].size
     ]
     moved = np.zeros(len(problem.views))
     if others:
         applied = [_applied(problem, hypothesis, effect, hypothesis.strengths[effect][0]) for effect in others]
         changes = map_changes(problem, applied)
         for number in lit:
-            moved[number] = mean_over(changes[number], problem.views[number].mask) / signals_DN[number]
+            moved[number] = _relative(problem.views[number], changes[number], fields[number])
         lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
     if len(lit) < _LEAST_SERIES:
         return None
     levels, courses, noise = [], [], []
     for number in lit:
         view, signal_DN = problem.views[number], signals_DN[number]
-        levels.append(mean_over(view.residual_DN, view.mask) / signal_DN - moved[number])
+        levels.append(_relative(view, view.residual_DN, fields[number]) - moved[number])
         courses.append(view.summary.frame_mean_DN / signal_DN)
         noise.append(noises[number] / signal_DN**2)
     rms = rms_about_mean(levels, courses, noise)
     return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
+
+
+def _open_field(view: SeriesView) -> NDArray[np.bool_]:
+    """Compared pixels (row, column) that no object covers: behind one its thickness is as uncertain as the output drifts."""
+    request = view.session.request
+    if not request.thickness_mm:
+        return view.mask
+    from scipy.ndimage import binary_dilation
+
+    covered = np.zeros(view.mask.shape, dtype=bool)
+    for thickness_mm in request.thickness_mm.values():
+        covered |= np.asarray(thickness_mm) > 0.0
+    return np.asarray(view.mask & ~binary_dilation(covered, iterations=_NEAR_PX))
+
+
+def _relative(view: SeriesView, change_DN: Map, field: NDArray[np.bool_]) -> float:
+    """Mean of a change over a part of the field (row, column), relative to the signal there."""
+    return mean_over(change_DN, field) / mean_over(view.signal_DN, field)
 
 
 def _noise_of_a_frame(view: SeriesView) -> float:

@@ -8,18 +8,20 @@ import pytest
 
 from raytwin.diagnosis import strengths
 
-SHAPE, FRAMES, SIGNAL_DN = (8, 8), 20, 5000.0
+SHAPE, FRAMES, SIGNAL_DN = (24, 24), 20, 5000.0
 OUTPUT = 0.006 * np.sin(0.05 * np.arange(8 * FRAMES))
 
 
-def view(output, *, signal_DN=SIGNAL_DN, noise_DN=5.0, lit=True, calibrates=False, more=0.0):
-    """A series whose frames have this relative output (frame,); more: of its level, by something else."""
+def view(output, *, signal_DN=SIGNAL_DN, noise_DN=5.0, lit=True, calibrates=False, more=0.0, behind=0.0, covered=None):
+    """A series whose frames have this relative output (frame,); more: of its level, by something else, behind: an object alone."""
     frames = 100.0 + signal_DN * (1.0 + output)
+    thickness_mm = None if covered is None else {"water": np.where(covered, 20.0, 0.0)}
+    hidden = np.zeros(SHAPE) if covered is None else np.where(covered, behind, 0.0)
     return SimpleNamespace(
-        session=SimpleNamespace(request=SimpleNamespace(beam_on=lit), calibrates=calibrates),
+        session=SimpleNamespace(request=SimpleNamespace(beam_on=lit, thickness_mm=thickness_mm), calibrates=calibrates),
         mask=np.ones(SHAPE, dtype=bool),
         signal_DN=np.full((1, 1), signal_DN),
-        residual_DN=np.full(SHAPE, signal_DN * (float(output.mean()) + more)),
+        residual_DN=signal_DN * (float(output.mean()) + more + hidden),
         noise_DN=np.full(SHAPE, noise_DN / math.sqrt(len(output))),
         summary=SimpleNamespace(frames=len(output), frame_mean_DN=frames),
     )
@@ -47,6 +49,16 @@ def test_the_strength_is_the_rms_of_the_output_and_opaque_series_and_darks_say_n
     black = view(np.zeros(FRAMES), signal_DN=0.0)
     dark = view(np.zeros(FRAMES), lit=False, more=0.3)
     assert found([*lit_series(), opaque, black, dark])[0] == pytest.approx(value)
+
+
+def test_behind_objects_a_level_tells_of_their_thickness_and_not_of_the_output():
+    left = np.arange(SHAPE[1])[None, :] < 8
+    covered = np.broadcast_to(left, SHAPE)
+    behind = [view(part, covered=covered, behind=0.02) for part in np.split(OUTPUT, 8)]
+    assert found(behind)[0] == pytest.approx(100.0 * float(OUTPUT.std()), rel=0.005)
+    # and a slab that covers the whole field tells nothing
+    slabs = [view(np.zeros(FRAMES), covered=np.ones(SHAPE, dtype=bool), behind=-0.015) for _ in range(4)]
+    assert found([*slabs, *behind])[0] == pytest.approx(100.0 * float(OUTPUT.std()), rel=0.005)
 
 
 def test_a_drift_since_the_calibration_is_read_from_later_series():

@@ -914,6 +914,19 @@ def test_a_turned_scene_is_the_turned_picture_of_it(series_line):
 # ------------------------------------------------------------------------------------------------ refusals
 
 
+@pytest.mark.parametrize(
+    ("effect", "parameter", "value", "told"),
+    [
+        ("object_scatter", "reference_keV", 0.0, "a number above 0"),
+        ("object_scatter", "width_mm", -3.0, "a number above 0"),
+        ("veiling_glare", "length_mm", math.inf, "a finite number"),
+    ],
+)
+def test_lengths_and_energies_of_0_are_told(effect, parameter, value, told):
+    with pytest.raises(InputError, match=f"{parameter} of effect {effect}: .*{told}"):
+        EFFECTS[effect].values({"strength": 5.0, parameter: value})
+
+
 def test_unknown_effects_and_parameters_are_named_with_the_nearest(series_line):
     with pytest.raises(InputError, match=r"effect: got objekt_scatter; .*did you mean object_scatter"):
         effect_of(AppliedEffect(id="objekt_scatter", parameters={}))

@@ -1,14 +1,15 @@
-"""Diagnoses of sessions that another, plain simulator makes: one planted effect each, and none.
+"""Diagnoses of sessions that another, plain simulator makes: one planted effect each, two, and none.
 
 The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
 the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
 NIST). A panel of Gd2O2S that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no
 pixel is cut by an edge), a Gaussian spread, 104 x 136 pixels of 0.2 mm, no times. Its effects are laws of its own: scatter and
 tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
-gain.
+gain; K photons are caught under two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced
+objects have shifted path lengths.
 
     python validation/second_simulator.py --seed 1 --json build/second_simulator.json
-    python validation/second_simulator.py --only none kv_error tiles
+    python validation/second_simulator.py --only none kv_error tiles veiling_glare+kv_error
 """
 
 import argparse
@@ -22,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import xraylib
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
@@ -35,10 +36,21 @@ NEAR_MM, FAR_MM, DETECTOR_MM = 480.0, 360.0, 700.0
 SPREAD_PX, READ_DN, DARK_DN, HIGHEST_DN = 0.55, 6.0, 300.0, 16383
 DN_PER_KEV, SCALE, OPTICAL = 0.012, 7e-4, 1.05
 LAG_S, PAUSE_S, READOUT_MS = 0.2, 6.0, 5.0
-DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96}
+DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3}
 NAMES = {"Al": "Al", "Pb": "Pb", "H2O": "water"}
 CURRENT_MA = {50.0: 6.0, 100.0: 1.0}
-ALWAYS = ("object_scatter", "veiling_glare", "focal_spot", "mtf_tail", "image_lag")
+K_EDGE_KEV, K_LINE_KEV = 50.24, 42.8  # of gadolinium
+ALWAYS = (
+    "object_scatter",
+    "veiling_glare",
+    "focal_spot",
+    "mtf_tail",
+    "image_lag",
+    "k_fluorescence",
+    "motion_blur",
+    "misregistration",
+    "composition_error",
+)
 # effect: strength, and whether it has the catalogue's definition (else it is only asked whether it is named)
 CASES = {
     "none": (0.0, True),
@@ -58,9 +70,26 @@ CASES = {
     "output_drift": (0.6, True),
     "dark_drift": (9.6, True),
     "bad_pixels": (0.4, True),
+    "k_fluorescence": (25.0, True),
+    "motion_blur": (0.8, True),
+    "misregistration": (0.6, True),
+    "heel": (5.0, True),
+    "composition_error": (5.0, True),
     "tiles": (0.5, False),
     "wandering_tiles": (0.4, False),
 }
+PAIRS = (
+    "image_lag+kv_error",
+    "veiling_glare+kv_error",
+    "veiling_glare+excess_noise",
+    "heel+misregistration",
+    "object_scatter+filtration_error",
+    "gain_map_error+veiling_glare",
+    "row_noise+focal_spot",
+    "dark_drift+mtf_tail",
+    "quantisation+misregistration",
+    "nonlinearity+motion_blur",
+)
 UNKNOWN = ("tiles", "wandering_tiles")
 TILE_PX = (26, 34)
 
@@ -86,11 +115,12 @@ def spectrum(kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarr
 
 
 class Line:
-    """A line with one effect, drawn from a generator; what charge the panel still holds goes from series to series."""
+    """A line with its effects, drawn from a generator; what charge the panel still holds goes from series to series."""
 
-    def __init__(self, effect: str, rng: np.random.Generator) -> None:
-        self.effect, self.rng = effect.removesuffix("_later"), rng
-        self.strength, self.always = CASES[effect][0], effect in ALWAYS
+    def __init__(self, effects: tuple[str, ...], rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.effects = {name.removesuffix("_later"): CASES[name][0] for name in effects if name != "none"}
+        self.always = {name.removesuffix("_later") for name in effects if name in ALWAYS}
         self.gain = 1.0 + 0.02 * rng.standard_normal(SHAPE) + 0.36 * gaussian_filter(rng.standard_normal(SHAPE), 12)
         self.dark_DN = DARK_DN + 8.0 * rng.standard_normal(SHAPE)
         self.aluminium_mm = 2.1 + 0.2 * rng.standard_normal()
@@ -100,28 +130,59 @@ class Line:
         self.illumination = (1.0 + apart_mm2 / DETECTOR_MM**2) ** -1.5
         self.charge_DN = np.zeros(SHAPE)
         self.changed_gain = np.ones(SHAPE)
-        if effect == "gain_map_error":
-            self.changed_gain += self.strength / 100.0 * rng.standard_normal(SHAPE)
-        elif effect in UNKNOWN:
-            self.changed_gain += self.strength / 100.0 * np.kron(rng.standard_normal((4, 4)), np.ones(TILE_PX))
-        elif effect == "bad_pixels":
-            count = round(self.strength / 100.0 * ROWS * COLUMNS)
+        if "gain_map_error" in self.effects:
+            self.changed_gain += self.effects["gain_map_error"] / 100.0 * rng.standard_normal(SHAPE)
+        for name in UNKNOWN:
+            if name in self.effects:
+                self.changed_gain += self.effects[name] / 100.0 * np.kron(rng.standard_normal((4, 4)), np.ones(TILE_PX))
+        if "bad_pixels" in self.effects:
+            count = round(self.effects["bad_pixels"] / 100.0 * ROWS * COLUMNS)
             self.changed_gain.flat[rng.choice(ROWS * COLUMNS, count, replace=False)] = 0.0
+        self.direction = rng.uniform(0.0, 2.0 * math.pi)
 
-    def light(
-        self, kV: float, mAs: float, copper_mm: float, scene: dict[str, np.ndarray], far: bool, on: dict
-    ) -> tuple:
-        """Mean and variance of one exposure before the spread of light, DN and DN^2."""
+    def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Energies, keV, and photons (row, column, energy) that the panel absorbs of an exposure of the open field."""
         voltage = kV * self.kV_share * (1.0 + on.get("kv_error", 0.0) / 100.0)
         energies, photons = spectrum(voltage, self.aluminium_mm + on.get("filtration_error", 0.0), copper_mm)
+        arriving = photons * mAs * self.illumination[..., None]
+        if "heel" in on:
+            tungsten = attenuation_per_mm("W", energies)
+            signal = photons * energies
+            # so much more tungsten from one side to the other as takes away that share of the beam
+            thick_mm = on["heel"] / 100.0 * float(signal.sum()) / float(signal @ tungsten)
+            along = (np.arange(COLUMNS) / (COLUMNS - 1) - 0.5)[None, :, None]
+            arriving = arriving * np.exp(-along * thick_mm * tungsten)
+        return energies, arriving
+
+    def light(
+        self,
+        kV: float,
+        mAs: float,
+        copper_mm: float,
+        scene: dict[str, np.ndarray],
+        far: bool,
+        on: dict,
+        exposure_ms: float,
+    ) -> tuple:
+        """Mean and variance of one exposure before the spread of light, DN and DN^2, and K photons and what they leave."""
+        energies, arriving = self.open_light(kV, mAs, copper_mm, on)
+        open_DN = DN_PER_KEV * (arriving @ energies)
         depth = np.zeros((*SHAPE, 1))
-        for material, thickness_mm in scene.items():
-            depth = depth + thickness_mm[..., None] * attenuation_per_mm(material, energies)
-        arriving = photons * mAs * np.exp(-depth) * self.illumination[..., None]
+        apart_px = [on.get("misregistration", 0.0) * turn(self.direction) for turn in (math.cos, math.sin)]
+        for material, stated_mm in scene.items():
+            thickness_mm = shift(stated_mm, apart_px, order=1, mode="nearest")
+            denser = 1.0 + on.get("composition_error", 0.0) / 100.0 if material == "H2O" else 1.0
+            depth = depth + denser * thickness_mm[..., None] * attenuation_per_mm(material, energies)
+        arriving = arriving * np.exp(-depth)
+        remote = None
+        if "k_fluorescence" in on:
+            share = np.where(energies > K_EDGE_KEV, on["k_fluorescence"] / 100.0, 0.0)
+            caught = arriving @ share
+            remote = caught, (arriving @ (share * (energies - K_LINE_KEV))) / np.maximum(caught, 1e-30)
+            arriving = arriving * (1.0 - share)
         signal = DN_PER_KEV * (arriving @ energies)
         variance = OPTICAL * DN_PER_KEV**2 * (arriving @ energies**2)
         if scene and "object_scatter" in on:
-            open_DN = DN_PER_KEV * mAs * float(photons @ energies) * self.illumination
             source = np.pad(signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0)), 200)
             wide = gaussian_filter(source, 18.0 / PIXEL_MM)[200:-200, 200:-200]
             added = on["object_scatter"] / 100.0 * wide / 0.38 * (0.55 if far else 1.0)
@@ -130,11 +191,14 @@ class Line:
             magnified = DETECTOR_MM / (FAR_MM if far else NEAR_MM) - 1.0
             width_px = on["focal_spot"] * magnified / PIXEL_MM / math.sqrt(8.0 * math.log(2.0))
             signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
+        if scene and "motion_blur" in on:
+            places = np.linspace(-0.5, 0.5, 9) * on["motion_blur"] * exposure_ms / 50.0
+            signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         if "veiling_glare" in on:
             share = on["veiling_glare"] / 100.0
             wide = [gaussian_filter(signal, length_mm / PIXEL_MM) for length_mm in (4.0, 12.0)]
             signal = (1.0 - share) * signal + 0.5 * share * (wide[0] + wide[1])
-        return signal, variance
+        return signal, variance, remote
 
     def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
         """Frames (n, row, column), DN; lit: mean and variance, None without a beam."""
@@ -142,7 +206,7 @@ class Line:
         if kind != "afterglow":
             self.charge_DN = self.charge_DN * math.exp(-PAUSE_S / LAG_S)
         released = 1.0 - math.exp(-(exposure_ms + READOUT_MS) / 1000.0 / LAG_S)
-        lag = self.strength / 100.0 if self.effect == "image_lag" else 0.0
+        lag = self.effects.get("image_lag", 0.0) / 100.0
         shown = []
         for _ in range(count):
             level = np.zeros(SHAPE) if lit is None else self._exposure(*lit, on, after)
@@ -159,12 +223,18 @@ class Line:
         return np.array(shown, dtype=np.uint16)
 
     def on(self, after: bool) -> dict[str, float]:
-        """The effect and its strength, where it acts."""
-        return {self.effect: self.strength} if self.effect != "none" and (after or self.always) else {}
+        """The effects and their strengths, where they act."""
+        return {name: strength for name, strength in self.effects.items() if after or name in self.always}
 
-    def _exposure(self, signal: np.ndarray, variance: np.ndarray, on: dict, after: bool) -> np.ndarray:
+    def _exposure(
+        self, signal: np.ndarray, variance: np.ndarray, remote: tuple | None, on: dict, after: bool
+    ) -> np.ndarray:
         quanta = np.sqrt(variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)) * self.rng.standard_normal(SHAPE)
         level = gaussian_filter(signal, SPREAD_PX) + gaussian_filter(quanta, SPREAD_PX, mode="wrap")
+        if remote is not None:
+            photons = remote[0] + np.sqrt(remote[0]) * self.rng.standard_normal(SHAPE)
+            away = 0.5 * sum(gaussian_filter(photons, sigma_mm / PIXEL_MM) for sigma_mm in (0.12, 0.3))
+            level = level + gaussian_filter(DN_PER_KEV * (photons * remote[1] + K_LINE_KEV * away), SPREAD_PX)
         if "mtf_tail" in on:
             share = on["mtf_tail"] / 100.0
             level = (1.0 - share) * level + share * gaussian_filter(level, 2.5)
@@ -189,8 +259,8 @@ def scenes() -> dict[str, tuple[str, dict[str, np.ndarray]]]:
 
 
 def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int) -> None:
-    """A session with calibrating and later series, and one effect."""
-    line = Line(effect, rng)
+    """A session with calibrating and later series, and its effects, joined by `+`."""
+    line = Line(tuple(effect.split("+")), rng)
     instrument = Instrument(
         anode="W",
         anode_angle_deg=16.0,
@@ -213,7 +283,7 @@ def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int)
             if kV is not None:
                 thickness_mm = known[scene][1] if scene else {}
                 mAs = current_mA * exposure_ms / 1000.0
-                lit = line.light(kV, mAs, copper_mm, thickness_mm, scene.endswith("far"), line.on(after))
+                lit = line.light(kV, mAs, copper_mm, thickness_mm, scene.endswith("far"), line.on(after), exposure_ms)
             writer.add_series(
                 name,
                 kind=kind,
@@ -256,17 +326,21 @@ def judged(effect: str, seed: int, frames: int) -> dict:
         make_session(path, effect, np.random.default_rng([seed, zlib.crc32(effect.encode())]), frames)
         with open_acquisition(path) as acquisition:
             found = diagnose(acquisition, rng=np.random.default_rng(seed))
-    wanted = () if effect in ("none", *UNKNOWN) else (effect.removesuffix("_later"),)
+    names = effect.split("+")
+    wanted = sorted(name.removesuffix("_later") for name in names if name not in ("none", *UNKNOWN))
     verdict = {"none": "no_gap", **dict.fromkeys(UNKNOWN, "unknown_effect")}.get(effect, "explained")
-    strength, alike = CASES[effect]
-    cause = next((item for item in found.causes if (item.effect,) == wanted), None)
+    strengths = {item.effect: list(item.strength) for item in found.causes}
     return {
         "effect": effect,
-        "planted": strength,
+        "planted": [CASES[name][0] for name in names],
         "verdict": found.verdict,
         "named": list(found.named),
-        "right": found.verdict == verdict and tuple(found.named) == wanted,
-        "strength": None if cause is None or not alike else list(cause.strength),
+        "right": found.verdict == verdict and sorted(found.named) == wanted,
+        "strengths": {
+            one: strengths[one]
+            for one in (name.removesuffix("_later") for name in names if CASES[name][1])
+            if one in found.named
+        },
     }
 
 
@@ -275,16 +349,19 @@ def run() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=20, help="of a series (default 20)")
-    parser.add_argument("--only", nargs="+", choices=sorted(CASES), default=list(CASES), metavar="EFFECT")
+    parser.add_argument(
+        "--only", nargs="+", choices=[*sorted(CASES), *PAIRS], default=[*CASES, *PAIRS], metavar="EFFECT"
+    )
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     rows = []
     for effect in options.only:
         row = judged(effect, options.seed, options.frames)
         rows.append(row)
-        told = "" if row["strength"] is None else "{:.3g} ({:.3g} to {:.3g})".format(*row["strength"])
+        told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())
         named = ", ".join(row["named"]) or row["verdict"]
-        print(f"{effect:20s} {row['planted']:6g}  {'right' if row['right'] else 'WRONG'}  {named}  {told}", flush=True)
+        planted = "+".join(f"{one:g}" for one in row["planted"])
+        print(f"{effect:32s} {planted:>8s}  {'right' if row['right'] else 'WRONG'}  {named}  {told}", flush=True)
     print(f"{sum(row['right'] for row in rows)} of {len(rows)} named rightly and alone")
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)

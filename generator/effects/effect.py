@@ -79,9 +79,10 @@ class Effect:
         """All parameters by name; what is not given takes its default.
 
         Raises:
-            InputError: a parameter that this effect has not, or a value that is not finite.
+            InputError: a parameter that this effect has not, or a value that is not finite, or 0 or less of a length, time or energy.
         """
         result = {item.name: item.default for item in self.parameters}
+        above_0 = {item.name for item in self.parameters[1:] if item.log}
         for name, value in parameters.items():
             if name not in result:
                 near = get_close_matches(name, result, n=1, cutoff=0.0)
@@ -93,6 +94,8 @@ class Effect:
                 )
             if not math.isfinite(value):
                 raise InputError(f"{name} of effect {self.id}", received=value, expected="a finite number")
+            if name in above_0 and value <= 0.0:
+                raise InputError(f"{name} of effect {self.id}", received=value, expected="a number above 0")
             result[name] = float(value)
         return result
 

@@ -6,6 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from .summaries import PIECE_FRAMES, kurtosis_excess
+
 _COARSEST, _FINEST = 0.04, 0.7  # noise in steps: below, hardly a pixel jumps; above, rounding leaves a Gaussian
 _NODES = 25
 _POINTS = 4096  # of the quadrature
@@ -18,7 +20,7 @@ def rounded_kurtosis(sd_steps: float, frames: int) -> float:
     """
     if not 0.0 < sd_steps < _FINEST or frames < 3:
         return 0.0
-    nodes, values = _table(frames)
+    nodes, values = _table(min(frames, PIECE_FRAMES))
     return float(np.interp(math.log(max(sd_steps, _COARSEST)), nodes, values))
 
 
@@ -28,8 +30,6 @@ def _table(frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     from scipy.special import ndtri
     from scipy.stats import qmc
 
-    from .summaries import kurtosis_excess
-
     points = qmc.Sobol(frames + 1, seed=0).random(_POINTS)
     mean, noise = points[:, 0], ndtri(np.clip(points[:, 1:], 1e-12, 1.0 - 1e-12)).T
     nodes = np.geomspace(_COARSEST, _FINEST, _NODES)
@@ -38,6 +38,5 @@ def _table(frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         steps = np.diff(np.rint(mean + sd * noise), axis=0) ** 2
         inside = steps / np.maximum(steps.mean(axis=0), 1e-12)
         values[number] = kurtosis_excess(float(np.sum(inside**2)), float(inside.size), frames - 1)
-    # no coarser than what pixels that never jump make of it; and a Gaussian at the fine end
-    values[-1] = 0.0
+    values[-1] = 0.0  # a Gaussian at the fine end
     return np.log(nodes), values

@@ -151,7 +151,7 @@ class ScalarContext:
     noise alone leaves of a pattern in the corrected mean frame; quantum_DN2: the base model's quantum variance of one frame;
     dark_DN: the base model's mean dark;
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
-    of the panel's pixels in these frames, None where all are alike; areas: the good pixels label by label; label_gain
+    of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; areas: the good pixels label by label; label_gain
     (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
@@ -169,6 +169,7 @@ class ScalarContext:
     dark_DN: float
     counts_all_outliers: bool
     gain: NDArray[np.floating] | None = None
+    averaged: int = 1
     areas: "Areas" = field(init=False)
     label_gain: NDArray[np.float64] = field(init=False)
 
@@ -324,11 +325,11 @@ def expected_scalars(
 
 def _kurtosis(expected: ExpectedSeries, context: ScalarContext, variance_DN2: float) -> float:
     """Excess kurtosis that the ADC's steps leave in noise of a variance, rounding included."""
-    step = expected.quantisation_step_DN
-    if step <= 0.0 or variance_DN2 > step**2:
+    step, of_one = expected.quantisation_step_DN, context.averaged * variance_DN2
+    if step <= 0.0 or of_one > step**2:
         return 0.0
-    before = float(variance_before_rounding(variance_DN2, step))
-    return rounded_kurtosis(math.sqrt(before) / step, context.frames)
+    before = float(variance_before_rounding(of_one, step))
+    return rounded_kurtosis(math.sqrt(before) / step, context.frames) / context.averaged
 
 
 @dataclass(frozen=True, slots=True)

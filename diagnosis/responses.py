@@ -288,6 +288,7 @@ def _context(
         dark_DN=mean_over(expected.dark_DN, clean),
         counts_all_outliers=counts_all,
         gain=maps.gain if lit and "gain" not in item.series.corrected else None,
+        averaged=item.request.exposures_per_frame,
     )
 
 

@@ -17,7 +17,7 @@ from ..errors import InputError
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
 TIME_TILES = 4  # tiles a side whose means are kept frame by frame
-_PIECE_FRAMES = 64
+PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
 _QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
 _CODES_FRAMES = 16
 
@@ -81,8 +81,8 @@ def _pieces(
     reference: NDArray[np.float32] | None = None
     last: NDArray[np.float32] | None = None
     for piece in pieces:
-        for start in range(0, len(piece), _PIECE_FRAMES):
-            raw = piece[start : start + _PIECE_FRAMES]
+        for start in range(0, len(piece), PIECE_FRAMES):
+            raw = piece[start : start + PIECE_FRAMES]
             if raw.ndim != 3 or raw.shape[1:] != good.shape:
                 raise InputError(name, received=f"frames of {raw.shape[1:]}", expected=f"frames of {good.shape}")
             if raw.dtype.kind == "f" and not np.all(np.isfinite(raw)):
@@ -286,7 +286,7 @@ def summarise_series(
         column_variance_DN2=column_sum / one,
         block_variance_DN2=block_sum / one,
         temporal_covariance_DN2=temporal / np.maximum(temporal_pairs, 1),
-        kurtosis_excess=kurtosis_excess(pair_fourth, pair_second, min(n_pairs, _PIECE_FRAMES)),
+        kurtosis_excess=kurtosis_excess(pair_fourth, pair_second, min(n_pairs, PIECE_FRAMES)),
         frame_mean_DN=np.concatenate(frame_means),
         tile_mean_DN=np.concatenate(tiles),
         distinct_codes=distinct,
@@ -317,7 +317,8 @@ def _standing_still(raw: NDArray[Any], d2: NDArray[np.float32], good: NDArray[np
     squares = d2[good]
     quiet = np.flatnonzero(squares < _QUIET * float(squares.mean()))
     codes = raw.reshape(len(raw), -1)[:, np.flatnonzero(good)[quiet]]
-    return np.asarray(quiet[np.all(codes == codes[:1], axis=0)])
+    # at the end of the range a pixel stands still because it is saturated
+    return np.asarray(quiet[np.all(codes == codes[:1], axis=0) & (codes[0] < raw.max())])
 
 
 def kurtosis_excess(fourth: float, count: float, pairs: int) -> float:

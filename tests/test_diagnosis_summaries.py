@@ -67,6 +67,16 @@ def test_kurtosis_of_rounded_frames_is_foretold(sd_steps, frames):
     assert rounded_kurtosis(sd_steps, frames) == pytest.approx(found.kurtosis_excess, rel=0.1, abs=0.06)
 
 
+def test_saturated_pixels_are_not_taken_for_pixels_between_coarse_steps():
+    rng = np.random.default_rng(7)
+    frames = np.rint(rng.normal(1000.0, 10.0, (30, *SHAPE))).astype(np.float32)
+    frames[:, :, :20] = 4095.0
+    assert abs(summary_of(frames).kurtosis_excess) < 0.3
+    still = frames.copy()
+    still[:, :, :20] = 500.0  # codes that never change
+    assert summary_of(still).kurtosis_excess < -0.8
+
+
 def test_fine_steps_leave_a_gaussian():
     assert rounded_kurtosis(0.8, 30) == rounded_kurtosis(0.0, 30) == rounded_kurtosis(0.2, 2) == 0.0
 

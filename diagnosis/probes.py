@@ -151,8 +151,8 @@ class ScalarContext:
     noise alone leaves of a pattern in the corrected mean frame; quantum_DN2: the base model's quantum variance of one frame;
     dark_DN: the base model's mean dark;
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
-    of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; areas: the good pixels label by label; label_gain
-    (label,): mean square of the gains of a label's pixels over that of all good ones.
+    of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; areas: the
+    good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
     kind: str

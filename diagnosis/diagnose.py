@@ -53,7 +53,7 @@ _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unse
 _UNSEEN = 3.0  # standard deviations of a probe
 STRAINED_FROM = 5.0  # prior standard deviations
 _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
-# share of an explanation's probability: 48 of 49 sealed cases stated as certain were exactly right, and 113 of 122 of two runs
+# share of an explanation's probability: 48 of 49 sealed cases stated as certain were exactly right, and 112 of 122 of two runs
 # before it once the faults that they showed were mended
 DOUBT = 0.07
 # log evidence: of 64 sealed sessions without effect six showed 4 to 8 of a focal spot, edges being drawn no better

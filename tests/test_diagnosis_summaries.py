@@ -57,7 +57,9 @@ def test_variance_of_white_frames_is_that_of_the_noise():
     assert abs(found.kurtosis_excess) < 0.1
 
 
-@pytest.mark.parametrize(("sd_steps", "frames"), [(0.12, 40), (0.18, 30), (0.28, 40), (0.35, 25), (0.6, 40), (0.2, 130)])
+@pytest.mark.parametrize(
+    ("sd_steps", "frames"), [(0.12, 40), (0.18, 30), (0.28, 40), (0.35, 25), (0.6, 40), (0.2, 130)]
+)
 def test_kurtosis_of_rounded_frames_is_foretold(sd_steps, frames):
     rng, step = np.random.default_rng(6), 30.0
     mean = 1000.0 + step * rng.random((96, 96))

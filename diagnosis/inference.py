@@ -582,6 +582,7 @@ def weigh_hypotheses(
     chance: Mapping[str, float] | None = None,
     elsewhere: Mapping[str, NDArray[np.bool_]] | None = None,
     places: NDArray[np.intp] | None = None,
+    fits: Sequence[CurveFit] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -601,10 +602,12 @@ def weigh_hypotheses(
             not doubted.
         places: place of each probe (probe,), within which a law is off by a share of no more than what is seen there; the
             groups where absent.
+        fits: of the curves, with the same residual, nuisances, groups, places and law errors, where they are known.
     """
     priors, chance, elsewhere = priors or Priors(), chance or {}, elsewhere or {}
     places = groups if places is None else places
-    fits = [fit_curve(residual, curve, nuisances, groups, places=places, law_errors=law_errors) for curve in curves]
+    if fits is None:
+        fits = [fit_curve(residual, curve, nuisances, groups, places=places, law_errors=law_errors) for curve in curves]
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
         by_effect.setdefault(fit.curve.effect, []).append(fit)

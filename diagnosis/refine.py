@@ -19,6 +19,7 @@ from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Widened,
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
+_LEAST_EVIDENCE = 0.0  # of the best on the grid over none: below it there is nothing to come closer to
 _REACH = 0.6  # share of the best evidence from which an effect is refined
 _REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
@@ -124,7 +125,7 @@ def _parts_of(variant: Variant, strength: float) -> tuple[float, float, float]:
 
 
 def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best known effect or pair, and those that refinement could bring past it, best first.
+    """The best known effect or pair, and those that refinement could bring past it, best first; none where no effect helps.
 
     On forty sessions refinement added up to 22 % to the evidence of a leading effect and up to 11 % where it was above 1000;
     no effect with less than nine tenths of the leading one's came near it.
@@ -133,7 +134,7 @@ def _within_reach(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         (item for item in hypotheses if item.effects and item.effects != (UNKNOWN,)),
         key=lambda item: -item.log_evidence,
     )
-    if not known:
+    if not known or known[0].log_evidence < _LEAST_EVIDENCE:
         return []
     alone = {item.effects[0]: item.log_evidence for item in known if len(item.effects) == 1}
     top = known[0].log_evidence

@@ -124,6 +124,14 @@ def test_an_effect_of_no_catalogue_that_shows_in_many_places_is_unknown_rather_t
         assert leading.probability > 0.99
 
 
+def test_fits_that_are_handed_in_are_those_that_would_be_made(setup):
+    rng, factors, chosen = setup
+    residual = noise(rng, factors) + chosen[0].response(20.0)
+    fits = [fit_curve(residual, curve, Nuisances(factors), GROUPS) for curve in chosen]
+    for made, known in zip(weigh(residual, factors, chosen), weigh(residual, factors, chosen, fits=fits), strict=True):
+        assert known == made
+
+
 def test_an_effect_whose_law_is_a_fifth_off_is_still_named(setup):
     rng, factors, chosen = setup
     for curve in chosen[:6]:

@@ -9,9 +9,9 @@ import pytest
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much, _misfit
+from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much, _misfit, _neglected
 from raytwin.diagnosis.forward_model import can_displace, can_show
-from raytwin.diagnosis.inference import Curve, Nuisances, node_weights, weigh_hypotheses
+from raytwin.diagnosis.inference import Curve, Hypothesis, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
 from raytwin.generator.effects import EFFECTS, AppliedEffect
@@ -136,6 +136,18 @@ def test_refinement_finds_an_inner_parameter_between_the_grid_s():
     assert closer.strengths[1] == pytest.approx(2.0, rel=0.15)
 
 
+def test_where_no_effect_explains_more_than_nothing_none_is_refined():
+    frequency = np.linspace(0.0, 0.5, PROBES)
+
+    def law(parameters, strength):
+        return 40.0 * strength * frequency / parameters["length_mm"]
+
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    rng = np.random.default_rng(1)
+    assert refined(variants, law, rng.standard_normal(PROBES)) == []
+    assert refined(variants, law, law({"length_mm": 5.0}, 2.0) + rng.standard_normal(PROBES)) != []
+
+
 def test_refinement_follows_a_response_that_is_not_in_proportion_to_the_strength():
     x = np.linspace(0.0, 3.0, PROBES)
 
@@ -213,19 +225,60 @@ def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_elect
     }
 
 
+def explanation(effect="veiling_glare", strength=10.0):
+    """One effect at a strength of a plausible range from 1 to 100."""
+    return Hypothesis(
+        effects=(effect,),
+        probability=0.9,
+        log_evidence=100.0,
+        strengths={effect: (strength, 0.9 * strength, 1.1 * strength)},
+        variants={effect: curve(effect, axis(0))},
+    )
+
+
 @pytest.mark.parametrize(
     ("before", "after", "vetoed"), [(30.0, 16.0, True), (30.0, 4.0, False), (1.1, 1.05, False), (2.5, 1.0, False)]
 )
 def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
-    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), True) is vetoed
+    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), explanation()) is vetoed
 
 
-@pytest.mark.parametrize(("left", "plausible", "vetoed"), [(0.1, True, False), (0.8, True, True), (0.1, False, True)])
+@pytest.mark.parametrize(
+    ("left", "strength", "vetoed"), [(0.1, 10.0, False), (0.35, 10.0, True), (0.8, 10.0, True), (0.1, 120.0, True)]
+)
 def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a_plausible_strength(
-    left, plausible, vetoed
+    left, strength, vetoed
 ):
     gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
-    assert _leaves_too_much(gap, plausible) is vetoed
+    assert _leaves_too_much(gap, explanation(strength=strength)) is vetoed
+
+
+@pytest.mark.parametrize(
+    ("effect", "after", "left", "vetoed"),
+    [
+        ("kv_error", 2.4, 0.15, True),
+        ("kv_error", 0.8, 0.25, True),
+        ("kv_error", 0.8, 0.05, False),
+        ("image_lag", 2.4, 0.15, False),
+        ("image_lag", 0.8, 0.25, False),
+    ],
+)
+def test_a_voltage_must_explain_nearly_all_of_its_gap_and_a_trap_law_need_not(effect, after, left, vetoed):
+    gap = Gap(before=5.8, after=after, floor=0.6, shrinks_by=None, left=left)
+    assert _leaves_too_much(gap, explanation(effect)) is vetoed
+
+
+def test_an_explanation_that_takes_nothing_of_an_axis_with_a_clear_gap_is_refused():
+    rng = np.random.default_rng(2)
+    axes = np.repeat(["level", "noise", "tails", "texture"], 50)
+    noise = rng.standard_normal(200)
+    before = noise + np.repeat([80.0, 12.0, 2.0, 0.0], 50)
+    after = noise + np.repeat([1.0, 12.0, 2.0, 0.0], 50)
+    assert _neglected(before, after, axes) == ("noise",)  # of the tails' 14 standard deviations none is sure
+    assert _neglected(before, np.where(axes == "noise", 0.8 * after, after), axes) == ()
+    gap = Gap(before=40.0, after=6.0, floor=0.7, shrinks_by=None, left=0.05)
+    assert not _leaves_too_much(gap, explanation())
+    assert _leaves_too_much(replace(gap, neglected=("noise",)), explanation())
 
 
 def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_much_it_explains():
@@ -239,8 +292,8 @@ def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_m
     found = _contradicted(before, elsewhere, places)
     assert found == pytest.approx(900.0 / 3200.0, rel=0.05)
     gap = Gap(before=28.0, after=15.0, floor=0.7, shrinks_by=None, left=0.1, contradicted=found)
-    assert _leaves_too_much(gap, True)
-    assert not _leaves_too_much(replace(gap, contradicted=0.0), True)
+    assert _leaves_too_much(gap, explanation())
+    assert not _leaves_too_much(replace(gap, contradicted=0.0), explanation())
 
 
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():

@@ -278,10 +278,10 @@ def judge(
         for effect in {variant.effect for variant in problem.variants}
     }
 
-    places = problem.places
+    probe_places = problem.places
 
     def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
-        return tuple(fit_curve(residual, curve, shared, problem.groups, places=places) for curve in curves)
+        return tuple(fit_curve(residual, curve, shared, problem.groups, places=probe_places) for curve in curves)
 
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
@@ -297,7 +297,7 @@ def judge(
             loose=_LOOSE,
             chance=_SHARP_CHANCE if problem.base.noise.psf_sigma_px.value < SHARP_PX else _CHANCE,
             elsewhere=elsewhere,
-            places=places,
+            places=probe_places,
             fits=fits,
         )
 
@@ -312,7 +312,7 @@ def judge(
         residual=residual,
         nuisances=shared,
         groups=problem.groups,
-        places=places,
+        places=probe_places,
         respond=problem.respond,
         whitener=whitening,
     )

@@ -41,18 +41,16 @@ class Children:
         environment: Mapping[str, str],
         folder: Path | None = None,
         timeout_s: float | None = None,
-        leash: bool = False,
     ) -> None:
         """Run a module to its end.
 
         Args:
             module: of this room.
             words: its arguments.
-            given: a line for its standard input.
+            given: a line for its standard input, which stays open while this process lives (`_leash`).
             environment: its variables, and no others.
             folder: where it runs; None: where this process does.
             timeout_s: after which it is ended; None: never.
-            leash: standard input stays open while this process lives, so that its end tells the child to end too.
 
         Raises:
             StoppedError: the run was stopped, before or meanwhile.
@@ -74,7 +72,7 @@ class Children:
                 )
                 self._running.add(process)
             try:
-                code = _wait(process, given, timeout_s=timeout_s, leash=leash)
+                code = _wait(process, given, timeout_s=timeout_s)
             finally:
                 with self._lock:
                     self._running.discard(process)
@@ -92,7 +90,7 @@ class Children:
                 process.kill()
 
 
-def _wait(process: "subprocess.Popen[str]", given: str, *, timeout_s: float | None, leash: bool) -> int:
+def _wait(process: "subprocess.Popen[str]", given: str, *, timeout_s: float | None) -> int:
     """Give a process its line and wait for its exit code."""
     try:
         # a child that is gone already says why by its exit code and last line
@@ -100,8 +98,6 @@ def _wait(process: "subprocess.Popen[str]", given: str, *, timeout_s: float | No
             if process.stdin is not None:
                 process.stdin.write(given + "\n")
                 process.stdin.flush()
-                if not leash:
-                    process.stdin.close()
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired:
         process.kill()

@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ._leash import line_from_parent
+
 _SEED = 0  # of the diagnosis' own draws; says nothing about the case
 _REFUSED = frozenset(
     (
@@ -109,6 +111,7 @@ def main() -> int:
     parser.add_argument("--features-only", action="store_true")
     parser.add_argument("--second", type=Path)
     words = parser.parse_args()
+    line_from_parent()
     refuse_to_peek()
     from ._plain import plain
 

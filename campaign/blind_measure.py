@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ._leash import line_from_parent
+
 
 def measure_case(label: Mapping[str, Any], path: Path, *, size: int, frames: int | None, session: int = 0) -> None:
     """Measure the session of a label in the virtual lab; the truth is not kept.
@@ -36,8 +38,8 @@ def measure_case(label: Mapping[str, Any], path: Path, *, size: int, frames: int
 
 
 def main() -> int:
-    """Read `{"label", "path", "size", "frames", "session"}` from standard input and measure."""
-    task = json.load(sys.stdin)
+    """Read `{"label", "path", "size", "frames", "session"}`, one line of standard input, and measure."""
+    task = json.loads(line_from_parent())
     measure_case(
         task["label"], Path(task["path"]), size=task["size"], frames=task["frames"], session=task.get("session", 0)
     )

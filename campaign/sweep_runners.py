@@ -76,7 +76,7 @@ class Processes:
 
     def _one(self, task: Task) -> None:
         environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(task["threads"]))
-        self._children.run("sweep_trial", given=json.dumps(task), environment=environment, leash=True)
+        self._children.run("sweep_trial", given=json.dumps(task), environment=environment)
 
 
 class DaskCluster:

@@ -10,7 +10,6 @@ its own that holds what is finished; a task that was killed goes on where it sto
 
 import hashlib
 import json
-import os
 import sys
 import threading
 import time
@@ -27,6 +26,7 @@ from ..acquisition.pairs import split_by_product
 from ..acquisition.setting import setting_from_text
 from ..errors import FileFormatError, InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
+from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
 from .sweep_file import Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
 from .sweep_settings import open_references, start_pair, twin_at
@@ -508,17 +508,9 @@ def _recipe(training: Mapping[str, Any], dataset: Path) -> "Recipe":
 # ------------------------------------------------------------------------------------------------ a process of its own
 
 
-def _end_with_parent() -> None:
-    """Wait for the end of standard input, which comes when the parent is gone, and end too."""
-    while os.read(0, 1):
-        pass
-    os._exit(1)
-
-
 def main() -> int:
     """Do the task that stands in the first line of standard input; its failure is the last line of standard error."""
-    task = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    task = json.loads(line_from_parent())
     try:
         run_task(task)
     except RaytwinError as error:

@@ -114,7 +114,7 @@ def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
         if isinstance(point, Mapping) and point.get("used") and float(point.get("signal_DN", 0.0)) > 0
     ]
     if points and not min(points) / _FAR_BELOW <= signal_DN <= max(points) * _FAR_ABOVE:
-        found.append(f"level ({min(points):.3g} to {max(points):.3g} DN calibrated)")
+        found.append(f"level ({min(points):.0f} to {max(points):.0f} DN calibrated)")
     return tuple(found)
 
 
@@ -278,7 +278,7 @@ def _without_effects(twin: Twin, setting: Setting) -> Prediction:
         room = 2.0**instrument.bits - 1 - twin.dark_DN.value
         held = mean_frame.value / binned.signal * binned.at_the_adc
         if held > room:
-            warnings.append(f"the detector saturates: {held:.4g} DN above dark, room for {room:.4g} DN")
+            warnings.append(f"the detector saturates: {held:.0f} DN above dark, room for {room:.0f} DN")
     if photons is not None and instrument.counting:
         check_count_rate(instrument, setting, photons.value)
     if extrapolated:

@@ -197,8 +197,12 @@ def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exp
         axis.set(title=f"{exposure:g} ms", xlabel="contrast $\\Delta R$", ylim=(-0.1, 1.12))
         if number % 2 == 0:
             axis.set_ylabel("probability of detection")
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(loc="lower right", bbox_to_anchor=(1.0, 0.13), fontsize=9)
+    told: dict[str, Any] = {}
+    for axis in axes:
+        told |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
+    if told:
+        # of the whole figure: within a panel it would lie on a curve
+        figure.legend(told.values(), told, loc="outside upper left", ncols=2, frameon=False, fontsize=9)
     return png_of(figure)
 
 

@@ -16,7 +16,8 @@ from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .coarse import UNSEEN, in_pixels
 from .forward_model import can_displace, can_show
-from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Priors, fit_curve, law_terms, weigh_hypotheses
+from .held_out import Gap, held_out
+from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
 from .next_series import best_measurement, proposal_text
 from .placing import ALONG_COLUMNS, ALONG_ROWS
 from .plan import WORTH_IT, best_repeat, repeat_text
@@ -24,7 +25,8 @@ from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .refine import refine
 from .registration import SHARP_PX
-from .strengths import applied_at_best, strength_of, strengths_on
+from .strengths import applied_at_best, strength_of
+from .veto import is_refused, vetoed, with_doubt
 from .whitening import Whitening
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
@@ -32,38 +34,8 @@ EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from whic
 POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
-_MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
-# of a probe that shows the gap: of 25 sealed effects named rightly none left more than 0.16, of 27 of a second simulator one 0.22;
-# of nine taken for the nearest name once their own was withheld six left 0.34 to 1
-_MOST_LEFT_TYPICALLY = 0.3
-# a voltage and a filter act as physics has it, whoever simulates them: right ones left nothing of the gap, one named for the other
-# 0.39 to 0.44
-_ACTS_EXACTLY = frozenset(("kv_error", "filtration_error"))
-_MOST_LEFT_EXACTLY = 0.25
-# of the squares of an axis that shows the gap from so many standard deviations on: what leaves more has nothing to do with it
-_NEGLECTS, _NEGLECTED_FROM = 0.9, 50.0
-_SHOWN = 5.0  # standard deviations from which a probe shows it
-# of the gap's sum of squares: right explanations of twelve sessions had less than 0.001, lost bits 0.103, off-focal radiation
-# named glare 0.27 to 0.42 in three
-_MOST_CONTRADICTED = 0.15
-# of all squares that an explanation may leave beyond what nuisances, laws and noise usually take: of sixty right ones one left
-# 0.09 and the others below 0.05, seams of tiles named gain map and bad pixels 0.13 to 0.16
-_MOST_UNFIT = 0.11
-_USUALLY_LEFT = 0.6  # of a probe's square where nothing is wrong: floors make it more than counting noise
-# what an effect does by chance, rms over what is expected: right gain maps and output drifts 0.4 to 0.8, tiles and their seams
-# named gain map 3.4 to 8.7
-_MOST_PULLED = 2.0
-# times the strength that the rest shows, which what it does by chance may have: slow and fast parts of a drift are not one law
-_LOOSELY_TIED = {"output_drift": 3.0}
-_LEAST_CHANCES = 5  # parts of what an effect does by chance that must show
-_LEAST_UNFIT = 0.1  # of the probes' number: what is usually left is no better known
-_CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
-_UNSEEN = 3.0  # standard deviations of a probe
 STRAINED_FROM = 5.0  # prior standard deviations
 _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
-# share of an explanation's probability: 48 of 49 sealed cases stated as certain were exactly right, and 112 of 122 of two runs
-# before it once the faults that they showed were mended
-DOUBT = 0.07
 # log evidence: of 64 sealed sessions without effect six showed 4 to 8 of a focal spot, edges being drawn no better
 _CHANCE = {"focal_spot": 5.0}
 # the same where edges are sharper than a third of a pixel, as in squares of pixels: two panels without effect showed 6 of a tail
@@ -74,7 +46,6 @@ _SHARP_CHANCE = {
 }
 # photons followed one by one reach shadows that no kernel fills: up to 2e-3 of scatter's log evidence
 _LOOSE = ("object_scatter",)
-_VETO = 0.9  # of the effects' probability that goes to an unknown effect when they leave more
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
 
@@ -103,24 +74,6 @@ class Place:
     location: str
     unit: str
     z: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Gap:
-    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
-
-    left: what is left of a typical probe that showed the gap (median of |after| over |before|); None: too few showed it.
-    contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
-    neglected: axes that show the gap clearly and of which the explanation takes nothing.
-    """
-
-    before: float
-    after: float
-    floor: float
-    shrinks_by: tuple[float, float, float] | None
-    left: float | None = None
-    contradicted: float = 0.0
-    neglected: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -326,14 +279,9 @@ def judge(
         replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
         for item in hypotheses
     )
-    marginal: dict[str, float] = {}
-    for hypothesis in hypotheses:
-        for effect in hypothesis.effects:
-            marginal[effect] = marginal.get(effect, 0.0) + hypothesis.probability
-    none = next((item.probability for item in hypotheses if not item.effects), 0.0)
-    unknown = marginal.pop(UNKNOWN, 0.0)
+    marginal = _by_effect(hypotheses)
     # an effect that nearly every likely hypothesis holds is named, whatever companions it is offered with
-    core = {effect for effect, probability in marginal.items() if probability >= EXPLAINED_FROM}
+    core = {effect for effect, value in marginal.items() if effect != UNKNOWN and value >= EXPLAINED_FROM}
     leading = next((item for item in hypotheses if core and set(item.effects) == core), hypotheses[0])
     tied: list[Hypothesis] = []
     if not leading.effects:
@@ -354,28 +302,18 @@ def judge(
         if len({effect for item in tied for effect in item.effects}) < 2:
             verdict = "explained"
     tell("held-out data")
-    gap, held_out, shares = _held_out(problem, leading, rng)
-    if (
-        leading.effects
-        and leading.effects != (UNKNOWN,)
-        and (_leaves_too_much(gap, leading) or _misfit(problem, leading).refused)
-    ):
+    gap, by_axis, shares = held_out(problem, leading, rng)
+    if leading.effects and leading.effects != (UNKNOWN,) and is_refused(problem, gap, leading):
         # the best of the wrong ones
         verdict = "unknown_effect"
-        moved = _VETO * (1.0 - none - unknown)
-        unknown += moved
-        marginal = {effect: (1.0 - _VETO) * probability for effect, probability in marginal.items()}
-        hypotheses = _vetoed(hypotheses)
+        hypotheses = vetoed(hypotheses)
         leading = hypotheses[0]
         tied = []
-        gap, held_out, shares = _held_out(problem, leading, rng)
+        gap, by_axis, shares = held_out(problem, leading, rng)
     # what the fit can no longer doubt may still be wrong in kind
-    hypotheses = _with_doubt(hypotheses)
+    hypotheses = with_doubt(hypotheses)
     leading = next(item for item in hypotheses if item.effects == leading.effects)
-    marginal = {}
-    for item in hypotheses:
-        for effect in item.effects:
-            marginal[effect] = marginal.get(effect, 0.0) + item.probability
+    marginal = _by_effect(hypotheses)
     none = next((item.probability for item in hypotheses if not item.effects), 0.0)
     unknown = marginal.pop(UNKNOWN, 0.0)
     named = leading.effects if leading.effects and leading.effects != (UNKNOWN,) else ()
@@ -437,7 +375,7 @@ def judge(
         where=tuple(places),
         threshold_z=threshold,
         gap=gap,
-        held_out=held_out,
+        held_out=by_axis,
         ambiguous_with=tuple(pairs) if verdict == "ambiguous" else (),
         next_measurement=_next_measurement(problem, tied, rng) if verdict == "ambiguous" else None,
         twin=improved,
@@ -448,6 +386,15 @@ def judge(
         not_tested=_out_of_reach(problem, whitened, shared),
         strained=_strained(problem, leading, nuisances),
     )
+
+
+def _by_effect(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
+    """Probability of each effect over all hypotheses that hold it."""
+    result: dict[str, float] = {}
+    for hypothesis in hypotheses:
+        for effect in hypothesis.effects:
+            result[effect] = result.get(effect, 0.0) + hypothesis.probability
+    return result
 
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: Nuisances) -> tuple[tuple[str, float], ...]:
@@ -498,126 +445,6 @@ def _next_measurement(
     }
 
 
-def _plausible(hypothesis: Hypothesis) -> bool:
-    """Whether all strengths lie within their plausible ranges."""
-    return all(
-        curve.low <= hypothesis.strengths[effect][0] <= curve.high for effect, curve in hypothesis.variants.items()
-    )
-
-
-def _leaves_too_much(gap: Gap, leading: Hypothesis) -> bool:
-    """Whether an explanation leaves too much of a clear gap, or sees one where there is none.
-
-    Too much of the typical probe, of an axis, or of all probes together; one series far outside all others may hold most of
-    the gap, and there a law that is right in kind may be off, unless its strength is no plausible one.
-    """
-    if gap.neglected or (gap.left is not None and gap.left > _MOST_LEFT_TYPICALLY):
-        return True
-    null = max(gap.floor, 1.0)
-    if gap.before < 1.3 * null:
-        return False
-    if gap.contradicted > _MOST_CONTRADICTED:
-        return True
-    left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
-    if _ACTS_EXACTLY.issuperset(leading.effects):
-        return left > _MOST_LEFT_EXACTLY
-    return left > _MOST_LEFT and (gap.left is None or not _plausible(leading))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Misfit:
-    """What speaks against an explanation on all probes.
-
-    Fields: left: squares beyond what nuisances, laws and noise usually take, over those that there were; pulled: what effects do
-    by chance, rms over what is expected of it, the largest of the effects.
-    """
-
-    left: float
-    pulled: float
-
-    @property
-    def refused(self) -> bool:
-        """Whether it is too much for an explanation."""
-        return self.left > _MOST_UNFIT or self.pulled > _MOST_PULLED
-
-
-def _misfit(problem: Problem, leading: Hypothesis) -> _Misfit:
-    """How an explanation with the strengths that fit all probes best leaves them."""
-    residual, factors, own = problem.residual, [problem.factors], np.ones(len(problem.residual))
-    width = problem.factors.shape[1]
-    chances: list[slice] = []
-    for effect in leading.effects:
-        curve, strength = leading.variants[effect], leading.strengths[effect][0]
-        residual = residual - curve.response(strength)
-        of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
-        if curve.jitter is not None:
-            own = own + strength**2 * curve.jitter
-        if curve.spread is not None:
-            factors.append(strength * _LOOSELY_TIED.get(effect, 1.0) * curve.spread)
-            chances.append(slice(width, width + curve.spread.shape[1]))
-            width += curve.spread.shape[1]
-        factors.append(of_law)
-        width += of_law.shape[1]
-        own = own + of_probe
-    root = np.sqrt(own)
-    allowed = Nuisances(np.concatenate(factors, axis=1) / root[:, None])
-    # what nuisances and laws are pulled by counts as well
-    beyond = float(residual / root @ allowed.solve(residual / root)) - _USUALLY_LEFT * len(residual)
-    there = float(problem.residual @ Nuisances(problem.factors).solve(problem.residual))
-    left = beyond / max(there, 1e-12) if beyond > _LEAST_UNFIT * len(residual) else 0.0
-    found, known = allowed.fitted(residual / root), 1.0 - allowed.variance
-    pulled = [
-        math.sqrt(float(np.sum(found[chance][seen] ** 2) / np.sum(known[chance][seen])))
-        for chance in chances
-        if np.count_nonzero(seen := known[chance] > 0.5) >= _LEAST_CHANCES
-    ]
-    return _Misfit(left=left, pulled=max(pulled, default=0.0))
-
-
-def _with_doubt(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Hypotheses, most probable first, with a share of each explanation's probability given to what it may have missed.
-
-    Half of it to an unknown effect, half to the likeliest explanation with one effect more or less.
-    """
-    probability = {item.effects: item.probability for item in hypotheses}
-    unknown_known = (UNKNOWN,) in probability
-    for item in hypotheses:
-        if not item.effects or item.effects == (UNKNOWN,):
-            continue
-        taken = DOUBT * item.probability
-        near = next((other.effects for other in hypotheses if _one_apart(item.effects, other.effects)), None)
-        probability[item.effects] -= taken
-        if near is not None and unknown_known:
-            probability[near] += 0.5 * taken
-            probability[(UNKNOWN,)] += 0.5 * taken
-        elif near is not None or unknown_known:
-            probability[near if near is not None else (UNKNOWN,)] += taken
-        else:
-            probability[item.effects] += taken
-    result = (replace(item, probability=probability[item.effects]) for item in hypotheses)
-    return tuple(sorted(result, key=lambda item: -item.probability))
-
-
-def _one_apart(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
-    """Whether one explanation has all effects of the other and one more; no effect at all and the unknown are none."""
-    one, other = set(first), set(second)
-    return bool(second) and UNKNOWN not in other and len(one ^ other) == 1
-
-
-def _vetoed(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Hypotheses with nearly all of the effects' probability moved to an unknown effect."""
-    named = sum(item.probability for item in hypotheses if item.effects and item.effects != (UNKNOWN,))
-    result = []
-    for item in hypotheses:
-        if item.effects == (UNKNOWN,):
-            result.append(replace(item, probability=item.probability + _VETO * named))
-        elif item.effects:
-            result.append(replace(item, probability=(1.0 - _VETO) * item.probability))
-        else:
-            result.append(item)
-    return tuple(sorted(result, key=lambda item: -item.probability))
-
-
 def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:
     """z of each probe given all others: (C^-1 r)_i / sqrt((C^-1)_ii)."""
     from scipy.linalg import solve_triangular
@@ -639,152 +466,6 @@ def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator)
     draws += rng.standard_normal((_REPLICATES, nuisances.factors.shape[1])) @ nuisances.factors.T
     solved = draws - (draws @ factor.T) @ factor
     return float(np.quantile(np.max(np.abs(solved / diagonal), axis=1), 0.95))
-
-
-def folds_of(problem: Problem) -> NDArray[np.intp]:
-    """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage."""
-    counts: dict[tuple[Any, ...], int] = {}
-    folds = []
-    for view in problem.views:
-        series = view.session.series
-        key = (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
-        counts[key] = counts.get(key, -1) + 1
-        folds.append(counts[key] % 2)
-    return np.array(folds, dtype=np.intp)
-
-
-def left_over(
-    problem: Problem, fit: NDArray[np.bool_], added: Sequence[tuple[Curve, float]] = ()
-) -> NDArray[np.float64]:
-    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction.
-
-    added: effects and their strengths that are taken off; what they do by chance is fitted beside the nuisances and counts as
-    noise. What their laws may be off by is fitted as well, so that no nuisance is drawn away by it, but neither taken off nor
-    counted.
-    """
-    from scipy.linalg import cho_solve, solve_triangular
-
-    residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
-    for curve, strength in added:
-        residual = residual - curve.response(strength)
-        if curve.spread is not None:
-            factors = np.concatenate([factors, strength * curve.spread], axis=1)
-        if curve.jitter is not None:
-            own = own + strength**2 * curve.jitter
-    inexact, laws = own[fit], [factors[fit]]
-    for curve, strength in added:
-        of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
-        laws.append(of_law[fit])
-        inexact = inexact + of_probe[fit]
-    known = np.concatenate(laws, axis=1) / np.sqrt(inexact)[:, None]
-    lower = np.linalg.cholesky(np.eye(known.shape[1]) + known.T @ known)
-    fitted = cho_solve((lower, True), known.T @ (residual[fit] / np.sqrt(inexact)))
-    held = factors[~fit]
-    left = residual[~fit] - held @ fitted[: held.shape[1]]
-    # variance of the nuisances' part alone: those of the laws come last
-    part = np.zeros((known.shape[1], len(held)))
-    part[: held.shape[1]] = held.T
-    half = solve_triangular(lower, part, lower=True)
-    return np.asarray(left / np.sqrt(own[~fit] + np.sum(half**2, axis=0)))
-
-
-def _held_out(
-    problem: Problem, leading: Hypothesis, rng: np.random.Generator
-) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
-    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
-    folds = folds_of(problem)[problem.series_of]
-    size = len(problem.residual)
-    before, after = np.full(size, np.nan), np.full(size, np.nan)
-    alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}
-    sds = np.ones(size)
-    effects = [effect for effect in leading.effects if effect != UNKNOWN]
-    for fold in (0, 1):
-        fit = folds != fold
-        held = ~fit
-        if not fit.any() or not held.any():
-            continue
-        inner = Nuisances(problem.factors[fit])
-        before[held] = left_over(problem, fit)
-        sds[held] = inner.predicted_sd(problem.factors[held])
-        strengths = strengths_on(problem, leading, effects, fit, inner)
-        added = [(leading.variants[effect], strengths[effect]) for effect in effects]
-        after[held] = left_over(problem, fit, added) if effects else before[held]
-        for one, effect in zip(added, effects, strict=True):
-            alone[effect][held] = left_over(problem, fit, [one])
-    known = np.isfinite(before)
-    before, after, sd, series = before[known], after[known], sds[known], problem.series_of[known]
-    axes = np.array([name.axis for name in problem.names])[known]
-    if before.size == 0:
-        return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
-
-    def rms(values: NDArray[np.float64], chosen: NDArray[np.bool_] | None = None) -> float:
-        use = values if chosen is None else values[chosen]
-        return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
-
-    # what a repeat of the same measurement would show: counting noise without all that the twin's nuisances allow
-    noise = problem.noise[known] / sd
-    floor = rms(noise)
-    rows = []
-    for axis in dict.fromkeys(axes):
-        chosen = axes == axis
-        rows.append((str(axis), rms(before, chosen), rms(after, chosen), rms(noise, chosen)))
-
-    def share(values: NDArray[np.float64]) -> tuple[float, float, float] | None:
-        scale = 1.0 / math.sqrt(2.0 * before.size)
-        if rms(before) < floor + 3.0 * scale:
-            return None
-        point = (rms(before) - rms(values)) / (rms(before) - floor)
-        draws = []
-        numbers = np.unique(series)
-        members = [np.nonzero(series == number)[0] for number in numbers]
-        b2, v2 = before**2, values**2
-        sums = np.array([[b2[m].sum(), v2[m].sum(), len(m)] for m in members])
-        for _ in range(300):
-            total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)
-            b, v = math.sqrt(total[0] / total[2]), math.sqrt(total[1] / total[2])
-            if b > floor + scale:
-                draws.append((b - v) / (b - floor))
-        if len(draws) < 100:
-            return None
-        low, high = np.quantile(draws, [0.025, 0.975])
-        return point, min(float(low), point), max(float(high), point)
-
-    shares = {}
-    for effect, values in alone.items():
-        found = share(values[known])
-        if found is not None:
-            shares[effect] = found
-    shown = np.abs(before) > _SHOWN
-    left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
-    gap = Gap(
-        before=rms(before),
-        after=rms(after),
-        floor=floor,
-        shrinks_by=share(after) if effects else None,
-        left=left,
-        contradicted=_contradicted(before, after, problem.parts[known]),
-        neglected=_neglected(before, after, axes) if effects else (),
-    )
-    return gap, tuple(rows), shares
-
-
-def _contradicted(before: NDArray[np.float64], after: NDArray[np.float64], places: NDArray[np.intp]) -> float:
-    """Squares of `after` (probe,) in places (probe,) that showed far less before, over all squares of `before` (probe,)."""
-    was, now = np.bincount(places, weights=before**2), np.bincount(places, weights=after**2)
-    unseen = _UNSEEN**2 * np.bincount(places)
-    added = now > _CONTRADICTS * np.maximum(was, unseen)
-    return float(now[added].sum() / max(float(was.sum()), 1e-12))
-
-
-def _neglected(before: NDArray[np.float64], after: NDArray[np.float64], axes: NDArray[np.str_]) -> tuple[str, ...]:
-    """Axes (probe,) that showed a clear gap, squares of `before` (probe,), nearly all of which `after` (probe,) still has."""
-    found = []
-    for axis in dict.fromkeys(axes):
-        chosen = axes == axis
-        was, now = float(np.sum(before[chosen] ** 2)), float(np.sum(after[chosen] ** 2))
-        if was > _NEGLECTED_FROM**2 + np.count_nonzero(chosen) and now > _NEGLECTS * was:
-            found.append(str(axis))
-    return tuple(found)
 
 
 def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict[str, Any]:

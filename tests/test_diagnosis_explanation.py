@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from raytwin.diagnosis.diagnose import Cause, Gap, Place
+from raytwin.diagnosis.diagnose import Cause, Place
 from raytwin.diagnosis.explanation import paragraph
+from raytwin.diagnosis.held_out import Gap
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):

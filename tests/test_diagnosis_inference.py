@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.diagnose import DOUBT, _strained, _with_doubt
+from raytwin.diagnosis.diagnose import _strained
 from raytwin.diagnosis.inference import (
     PAIR_DOUBT,
     PAIR_DOUBT_ELSEWHERE,
@@ -22,6 +22,7 @@ from raytwin.diagnosis.inference import (
     weigh_hypotheses,
 )
 from raytwin.diagnosis.strengths import _outright
+from raytwin.diagnosis.veto import DOUBT, with_doubt
 from raytwin.diagnosis.whitening import Whitening
 
 PROBES = 600
@@ -243,13 +244,13 @@ def test_doubt_goes_to_the_unknown_and_to_the_nearest_explanation_and_keeps_the_
         hypothesis(0.0, "a"),
         hypothesis(0.0, UNKNOWN),
     ]
-    found = {item.effects: item.probability for item in _with_doubt(given)}
+    found = {item.effects: item.probability for item in with_doubt(given)}
     assert sum(found.values()) == pytest.approx(1.0)
     assert found[("a", "b")] == pytest.approx((1 - DOUBT) * 0.95 + 0.5 * DOUBT * 0.03)
     assert found[(UNKNOWN,)] == pytest.approx(0.5 * DOUBT * 0.98)
     assert found[("b",)] == pytest.approx((1 - DOUBT) * 0.03 + 0.5 * DOUBT * 0.95)
     assert found[()] == 0.02  # nothing to be wrong about
-    ordered = [item.probability for item in _with_doubt(given)]
+    ordered = [item.probability for item in with_doubt(given)]
     assert ordered == sorted(ordered, reverse=True)
 
 

@@ -9,11 +9,12 @@ import pytest
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import Gap, _contradicted, _leaves_too_much, _misfit, _neglected
 from raytwin.diagnosis.forward_model import can_displace, can_show
+from raytwin.diagnosis.held_out import Gap, contradicted_share, neglected_axes
 from raytwin.diagnosis.inference import Curve, Hypothesis, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
+from raytwin.diagnosis.veto import leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects.effect import spread_transfer
 from raytwin.generator.effects.registration import parts_px
@@ -240,7 +241,7 @@ def explanation(effect="veiling_glare", strength=10.0):
     ("before", "after", "vetoed"), [(30.0, 16.0, True), (30.0, 4.0, False), (1.1, 1.05, False), (2.5, 1.0, False)]
 )
 def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
-    assert _leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), explanation()) is vetoed
+    assert leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), explanation()) is vetoed
 
 
 @pytest.mark.parametrize(
@@ -250,7 +251,7 @@ def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a
     left, strength, vetoed
 ):
     gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
-    assert _leaves_too_much(gap, explanation(strength=strength)) is vetoed
+    assert leaves_too_much(gap, explanation(strength=strength)) is vetoed
 
 
 @pytest.mark.parametrize(
@@ -263,7 +264,7 @@ def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a
 )
 def test_a_voltage_must_explain_nearly_all_of_its_gap_and_a_trap_law_need_not(effect, after, left, vetoed):
     gap = Gap(before=5.8, after=after, floor=0.6, shrinks_by=None, left=left)
-    assert _leaves_too_much(gap, explanation(effect)) is vetoed
+    assert leaves_too_much(gap, explanation(effect)) is vetoed
 
 
 def test_an_explanation_that_takes_nothing_of_an_axis_with_a_clear_gap_is_refused():
@@ -272,11 +273,11 @@ def test_an_explanation_that_takes_nothing_of_an_axis_with_a_clear_gap_is_refuse
     noise = rng.standard_normal(200)
     before = noise + np.repeat([80.0, 12.0, 2.0, 0.0], 50)
     after = noise + np.repeat([1.0, 12.0, 2.0, 0.0], 50)
-    assert _neglected(before, after, axes) == ("noise",)  # of the tails' 14 standard deviations none is sure
-    assert _neglected(before, np.where(axes == "noise", 0.8 * after, after), axes) == ()
+    assert neglected_axes(before, after, axes) == ("noise",)  # of the tails' 14 standard deviations none is sure
+    assert neglected_axes(before, np.where(axes == "noise", 0.8 * after, after), axes) == ()
     gap = Gap(before=40.0, after=6.0, floor=0.7, shrinks_by=None, left=0.05)
-    assert not _leaves_too_much(gap, explanation())
-    assert _leaves_too_much(replace(gap, neglected=("noise",)), explanation())
+    assert not leaves_too_much(gap, explanation())
+    assert leaves_too_much(replace(gap, neglected=("noise",)), explanation())
 
 
 def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_much_it_explains():
@@ -286,12 +287,12 @@ def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_m
     before = np.concatenate([seen, seen, nothing, nothing])
     off_by_a_third = np.concatenate([0.3 * seen, -0.3 * seen, nothing, nothing])
     elsewhere = np.concatenate([0.1 * seen, 0.1 * seen, 30.0 + nothing, nothing])
-    assert _contradicted(before, off_by_a_third, places) == 0.0
-    found = _contradicted(before, elsewhere, places)
+    assert contradicted_share(before, off_by_a_third, places) == 0.0
+    found = contradicted_share(before, elsewhere, places)
     assert found == pytest.approx(900.0 / 3200.0, rel=0.05)
     gap = Gap(before=28.0, after=15.0, floor=0.7, shrinks_by=None, left=0.1, contradicted=found)
-    assert _leaves_too_much(gap, explanation())
-    assert not _leaves_too_much(replace(gap, contradicted=0.0), explanation())
+    assert leaves_too_much(gap, explanation())
+    assert not leaves_too_much(replace(gap, contradicted=0.0), explanation())
 
 
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():
@@ -364,7 +365,7 @@ def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was(
         residual = response * (1.0 + off) + left * other + noise
         planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=groups)
         leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
-        return _misfit(planted, leading)
+        return misfit_of(planted, leading)
 
     assert misfit(0.0).left == 0.0
     # a law that is off by a tenth leaves nothing that it may not
@@ -387,6 +388,6 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
     residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
     planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=np.repeat(np.arange(20), 30))
     leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
-    found = _misfit(planted, leading)
+    found = misfit_of(planted, leading)
     assert found.pulled == pytest.approx(times, rel=0.35)
     assert found.refused == refused

@@ -1,0 +1,183 @@
+"""How much of the gap an explanation leaves on series that its fit did not see."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .assemble import Problem
+from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, law_terms
+from .strengths import strengths_on
+
+_SHOWN = 5.0  # standard deviations from which a probe shows it
+_CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
+_UNSEEN = 3.0  # standard deviations of a probe
+# of the squares of an axis that shows the gap from so many standard deviations on: what leaves more has nothing to do with it
+_NEGLECTS, _NEGLECTED_FROM = 0.9, 50.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gap:
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
+
+    left: what is left of a typical probe that showed the gap (median of |after| over |before|); None: too few showed it.
+    contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
+    neglected: axes that show the gap clearly and of which the explanation takes nothing.
+    """
+
+    before: float
+    after: float
+    floor: float
+    shrinks_by: tuple[float, float, float] | None
+    left: float | None = None
+    contradicted: float = 0.0
+    neglected: tuple[str, ...] = ()
+
+
+def folds_of(problem: Problem) -> NDArray[np.intp]:
+    """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage."""
+    counts: dict[tuple[Any, ...], int] = {}
+    folds = []
+    for view in problem.views:
+        series = view.session.series
+        key = (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
+        counts[key] = counts.get(key, -1) + 1
+        folds.append(counts[key] % 2)
+    return np.array(folds, dtype=np.intp)
+
+
+def left_over(
+    problem: Problem, fit: NDArray[np.bool_], added: Sequence[tuple[Curve, float]] = ()
+) -> NDArray[np.float64]:
+    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction.
+
+    added: effects and their strengths that are taken off; what they do by chance is fitted beside the nuisances and counts as
+    noise. What their laws may be off by is fitted as well, so that no nuisance is drawn away by it, but neither taken off nor
+    counted.
+    """
+    from scipy.linalg import cho_solve, solve_triangular
+
+    residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
+    for curve, strength in added:
+        residual = residual - curve.response(strength)
+        if curve.spread is not None:
+            factors = np.concatenate([factors, strength * curve.spread], axis=1)
+        if curve.jitter is not None:
+            own = own + strength**2 * curve.jitter
+    inexact, laws = own[fit], [factors[fit]]
+    for curve, strength in added:
+        of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
+        laws.append(of_law[fit])
+        inexact = inexact + of_probe[fit]
+    known = np.concatenate(laws, axis=1) / np.sqrt(inexact)[:, None]
+    lower = np.linalg.cholesky(np.eye(known.shape[1]) + known.T @ known)
+    fitted = cho_solve((lower, True), known.T @ (residual[fit] / np.sqrt(inexact)))
+    held = factors[~fit]
+    left = residual[~fit] - held @ fitted[: held.shape[1]]
+    # variance of the nuisances' part alone: those of the laws come last
+    part = np.zeros((known.shape[1], len(held)))
+    part[: held.shape[1]] = held.T
+    half = solve_triangular(lower, part, lower=True)
+    return np.asarray(left / np.sqrt(own[~fit] + np.sum(half**2, axis=0)))
+
+
+def held_out(
+    problem: Problem, leading: Hypothesis, rng: np.random.Generator
+) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
+    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
+    folds = folds_of(problem)[problem.series_of]
+    size = len(problem.residual)
+    before, after = np.full(size, np.nan), np.full(size, np.nan)
+    alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}
+    sds = np.ones(size)
+    effects = [effect for effect in leading.effects if effect != UNKNOWN]
+    for fold in (0, 1):
+        fit = folds != fold
+        held = ~fit
+        if not fit.any() or not held.any():
+            continue
+        inner = Nuisances(problem.factors[fit])
+        before[held] = left_over(problem, fit)
+        sds[held] = inner.predicted_sd(problem.factors[held])
+        strengths = strengths_on(problem, leading, effects, fit, inner)
+        added = [(leading.variants[effect], strengths[effect]) for effect in effects]
+        after[held] = left_over(problem, fit, added) if effects else before[held]
+        for one, effect in zip(added, effects, strict=True):
+            alone[effect][held] = left_over(problem, fit, [one])
+    known = np.isfinite(before)
+    before, after, sd, series = before[known], after[known], sds[known], problem.series_of[known]
+    axes = np.array([name.axis for name in problem.names])[known]
+    if before.size == 0:
+        return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
+
+    def rms(values: NDArray[np.float64], chosen: NDArray[np.bool_] | None = None) -> float:
+        use = values if chosen is None else values[chosen]
+        return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
+
+    # what a repeat of the same measurement would show: counting noise without all that the twin's nuisances allow
+    noise = problem.noise[known] / sd
+    floor = rms(noise)
+    rows = []
+    for axis in dict.fromkeys(axes):
+        chosen = axes == axis
+        rows.append((str(axis), rms(before, chosen), rms(after, chosen), rms(noise, chosen)))
+
+    def share(values: NDArray[np.float64]) -> tuple[float, float, float] | None:
+        scale = 1.0 / math.sqrt(2.0 * before.size)
+        if rms(before) < floor + 3.0 * scale:
+            return None
+        point = (rms(before) - rms(values)) / (rms(before) - floor)
+        draws = []
+        numbers = np.unique(series)
+        members = [np.nonzero(series == number)[0] for number in numbers]
+        b2, v2 = before**2, values**2
+        sums = np.array([[b2[m].sum(), v2[m].sum(), len(m)] for m in members])
+        for _ in range(300):
+            total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)
+            b, v = math.sqrt(total[0] / total[2]), math.sqrt(total[1] / total[2])
+            if b > floor + scale:
+                draws.append((b - v) / (b - floor))
+        if len(draws) < 100:
+            return None
+        low, high = np.quantile(draws, [0.025, 0.975])
+        return point, min(float(low), point), max(float(high), point)
+
+    shares = {}
+    for effect, values in alone.items():
+        found = share(values[known])
+        if found is not None:
+            shares[effect] = found
+    shown = np.abs(before) > _SHOWN
+    left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
+    gap = Gap(
+        before=rms(before),
+        after=rms(after),
+        floor=floor,
+        shrinks_by=share(after) if effects else None,
+        left=left,
+        contradicted=contradicted_share(before, after, problem.parts[known]),
+        neglected=neglected_axes(before, after, axes) if effects else (),
+    )
+    return gap, tuple(rows), shares
+
+
+def contradicted_share(before: NDArray[np.float64], after: NDArray[np.float64], places: NDArray[np.intp]) -> float:
+    """Squares of `after` (probe,) in places (probe,) that showed far less before, over all squares of `before` (probe,)."""
+    was, now = np.bincount(places, weights=before**2), np.bincount(places, weights=after**2)
+    unseen = _UNSEEN**2 * np.bincount(places)
+    added = now > _CONTRADICTS * np.maximum(was, unseen)
+    return float(now[added].sum() / max(float(was.sum()), 1e-12))
+
+
+def neglected_axes(before: NDArray[np.float64], after: NDArray[np.float64], axes: NDArray[np.str_]) -> tuple[str, ...]:
+    """Axes (probe,) that showed a clear gap, squares of `before` (probe,), nearly all of which `after` (probe,) still has."""
+    found = []
+    for axis in dict.fromkeys(axes):
+        chosen = axes == axis
+        was, now = float(np.sum(before[chosen] ** 2)), float(np.sum(after[chosen] ** 2))
+        if was > _NEGLECTED_FROM**2 + np.count_nonzero(chosen) and now > _NEGLECTS * was:
+            found.append(str(axis))
+    return tuple(found)

@@ -43,11 +43,16 @@ def strength_text(cause: Cause) -> str:
     return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
 
 
+def location_text(location: str) -> str:
+    """Where within a series, in words; what effects would do is called by their titles."""
+    if not location.startswith(_SHAPED_LIKE):
+        return location
+    return f"in the shape of: {title_of(location.removeprefix(_SHAPED_LIKE).split(' ')[0])}"
+
+
 def _place_text(place: Place) -> str:
-    what = place.statistic if not place.location else f"{place.statistic}, {place.location}"
-    if place.location.startswith(_SHAPED_LIKE):
-        effect = place.location.removeprefix(_SHAPED_LIKE).split(" ")[0]
-        what = f"{place.statistic}, in the shape of: {title_of(effect)}"
+    where = location_text(place.location)
+    what = f"{place.statistic}, {where}" if where else place.statistic
     return f"{_AXIS_WORDS.get(place.axis, place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
 
 

@@ -25,6 +25,12 @@ def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **opti
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
+def _legend_above(figure: Any, axis: Any) -> None:
+    """The legend of one of a figure's axes above all of them: within them it would lie on what is shown."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=8, frameon=False)
+
+
 def _png(figure: Any) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
@@ -93,7 +99,7 @@ def plot_transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.fl
     """Gap in percent of the open field against -log transmission, every scene with known thickness; before and after."""
     figure, grid = _figure(9.0, 3.6, 1, 2, sharey=True)
     axes = grid[0]
-    shown = 0
+    colours: dict[str, str] = {}  # of a sort of scene
     for index, view in enumerate(diagnosis.problem.views):
         if view.session.series.kind != "object":
             continue
@@ -109,17 +115,21 @@ def plot_transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.fl
             for part, residual in zip(values, (view.residual_DN, after[index]), strict=True):
                 part.append(100.0 * float(np.mean(residual[inside])) / open_DN)
         if len(middle) > 1:
-            shown += 1
-            color = f"C{shown % 10}"
+            sort = view.session.request.scene_kind or "object"
+            label = None if sort in colours else sort
+            colour = colours.setdefault(sort, f"C{len(colours)}")
             for axis, part in zip(axes, values, strict=True):
-                axis.plot(middle, part, "o-", ms=3, lw=1, color=color, label=view.session.name if shown <= 8 else None)
+                axis.plot(middle, part, "o-", ms=2.5, lw=0.8, alpha=0.8, color=colour, label=label)
     for axis, title in zip(axes, ("before", "after"), strict=True):
         axis.axhline(0, color="k", lw=0.6)
         axis.set_title(title, fontsize=10)
+        axis.set_xscale("symlog", linthresh=2.0)
+        axis.set_xticks([0, 0.5, 1, 1.5, 2, 5, 10], ["0", "0.5", "1", "1.5", "2", "5", "10"])
+        axis.set_xlim(left=-0.1)
         axis.set_xlabel("-log transmission (twin)")
     axes[0].set_ylabel("measured less twin, % of open field")
-    if shown:
-        axes[1].legend(fontsize=6)
+    if colours:
+        _legend_above(figure, axes[1])
     else:
         axes[0].text(0.5, 0.5, "no scene of known thickness", transform=axes[0].transAxes, ha="center")
     return _png(figure)
@@ -139,7 +149,7 @@ def plot_by_axis(diagnosis: Diagnosis) -> bytes:
     if rows and max(row[1] for row in rows) > 20:
         axis.set_xscale("log")
     axis.set_xlabel("root mean square of standardised residuals, held-out series")
-    axis.legend(fontsize=8)
+    _legend_above(figure, axis)
     return _png(figure)
 
 
@@ -163,7 +173,8 @@ def plot_places(diagnosis: Diagnosis) -> bytes:
         axis.set_yscale("symlog", linthresh=10)
     axis.set_xticks(range(len(problem.views)), [view.session.name for view in problem.views], rotation=90, fontsize=5)
     axis.set_ylabel("z given all other probes")
-    axis.legend(fontsize=7, ncol=4)
+    axis.set_xlim(-1, len(problem.views))
+    _legend_above(figure, axis)
     return _png(figure)
 
 
@@ -196,7 +207,7 @@ def rms(values: NDArray[np.floating]) -> float:
 def plot_task(task: Mapping[str, Any]) -> bytes:
     """Share of objects detected against their size: the two twins' networks on their own images, and measured ones."""
     real = "measured_on_measured" if task["real_networks"] == "measured" else "after_on_measured"
-    figure, axes = _figure(9.0, 3.6, 1, 2, sharey=True)
+    figure, axes = _figure(9.0, 4.4, 1, 2, sharey=True)
     left = (
         ("before_on_before", "twin before", _BEFORE),
         ("after_on_after", "twin after", _AFTER),
@@ -233,6 +244,6 @@ def plot_task(task: Mapping[str, Any]) -> bytes:
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("longest side, mm" if task["size"] == "size_mm" else "contrast")
         axis.set_ylim(-0.03, 1.03)
-        axis.legend(fontsize=8, loc="lower right")
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
     axes[0][0].set_ylabel("share detected")
     return _png(figure)

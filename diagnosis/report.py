@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..files import whole_file
 from .assemble import map_changes
 from .diagnose import Diagnosis
-from .explanation import paragraph, strained_text, strength_text, task_text, title_of
+from .explanation import location_text, paragraph, strained_text, strength_text, task_text, title_of
 from .figures import plot_by_axis, plot_gap_maps, plot_hypotheses, plot_places, plot_task, plot_transmission_curves
 from .inference import UNKNOWN
 
@@ -82,7 +82,7 @@ def write_report(diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *,
             for item in diagnosis.hypotheses
             if item.probability > 1e-4
         ][:12],
-        where=answer["where"],
+        where=[{**place, "location": location_text(place["location"])} for place in answer["where"]],
         threshold=f"{diagnosis.threshold_z:.1f}",
         missing=list(diagnosis.not_tested.items()),
         notes=diagnosis.notes,

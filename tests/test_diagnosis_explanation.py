@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from raytwin.diagnosis.diagnose import Cause, Place
-from raytwin.diagnosis.explanation import paragraph
+from raytwin.diagnosis.explanation import location_text, paragraph
 from raytwin.diagnosis.held_out import Gap
 
 
@@ -54,6 +54,18 @@ def diagnosis(verdict, **more):
         "problem": SimpleNamespace(views=views),
     }
     return SimpleNamespace(**fields | more)
+
+
+@pytest.mark.parametrize(
+    ("location", "words"),
+    [
+        ("like object_scatter width_mm 40, energy_exponent -0.8", "in the shape of: radiation scattered by the object"),
+        ("halves along rows", "halves along rows"),
+        ("", ""),
+    ],
+)
+def test_a_location_is_words_that_a_reader_knows(location, words):
+    assert location_text(location) == words
 
 
 def test_an_unknown_effect_has_its_place_and_signature_in_words():

@@ -86,6 +86,7 @@ DEFINED_SD: Mapping[str, float] = {
 KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(
     (
+        "veiling_glare",
         "mtf_tail",
         "k_fluorescence",
         "image_lag",

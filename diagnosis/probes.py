@@ -22,7 +22,7 @@ from .fixed_pattern import Pattern
 from .lost_bits import rounded_kurtosis
 from .noise_correlation import autocovariance, correlation_sum
 from .registration import gradient
-from .summaries import BLOCK_PX, LAGS, SeriesSummary
+from .summaries import BLOCK_PX, LAGS, PIECE_FRAMES, SeriesSummary
 
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
@@ -32,6 +32,7 @@ PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours diffe
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
+_KURTOSIS_PIXELS = 2048  # in which a fading picture's is computed
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
 # what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
@@ -266,7 +267,7 @@ def expected_scalars(
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
             values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
-        values["kurtosis"] = _kurtosis(expected, context, full)
+        values["kurtosis"] = _kurtosis(expected, context, full) + moving.kurtosis(expected)
         if context.kind in ("flat", "object"):
             signal = context.reference_signal_DN
             quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / n_good
@@ -338,13 +339,16 @@ class _MovingPicture:
 
     Fields: products: mean product (trend, trend) of the pictures' pixels, of all good pixels and of each label's; lines: the
     same of the means of rows and of columns; steps (trend, trend): half of the mean product of changes from one frame to the
-    next; courses (trend, frame).
+    next; courses (trend, frame); order (pixel,): flat indices of some good pixels all over the field; there (trend, pixel): the
+    pictures in these.
     """
 
     products: tuple[NDArray[np.float64], ...]
     lines: tuple[NDArray[np.float64], ...]
     steps: NDArray[np.float64]
     courses: NDArray[np.float64]
+    order: NDArray[np.intp]
+    there: NDArray[np.float64]
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "_MovingPicture":
@@ -363,17 +367,20 @@ class _MovingPicture:
                 kept.append(own)
                 courses.append(profile - profile.mean())
         if not kept:
-            return _MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)))
+            return _MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)), areas.order[:0], np.zeros((0, 0)))
         pixels, profiles = np.stack(kept), np.stack(courses)
         whole = np.zeros((len(kept), *good.shape))
         whole.reshape(len(kept), -1)[:, areas.order] = pixels
         means = [whole.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1) for axis in (2, 1)]
         steps = np.diff(profiles, axis=1)
+        stride = max(areas.order.size // _KURTOSIS_PIXELS, 1)
         return _MovingPicture(
             tuple(_mean_product(pixels[:, part]) for part in (slice(None), *areas.parts)),
             tuple(_mean_product(one) for one in means),
             0.5 * steps @ steps.T / steps.shape[1],
             profiles,
+            areas.order[::stride],
+            pixels[:, ::stride],
         )
 
     def pixels(self, label: int | None = None) -> float:
@@ -381,6 +388,34 @@ class _MovingPicture:
         if not self.products:
             return 0.0
         return float(np.sum(self.steps * self.products[0 if label is None else 1 + label]))
+
+    def kurtosis(self, expected: ExpectedSeries) -> float:
+        """Excess kurtosis of pixels' steps from frame to frame: most of a picture that fades goes with the first of them.
+
+        Of a Gaussian step of variance v moved by m: (<m^4> - 3 <m^2>^2) / (v + <m^2>)^2, means over the frames that
+        `summarise_series` scales a pixel by.
+        """
+        if not self.products:
+            return 0.0
+
+        def pixels(variance: NDArray[np.floating]) -> NDArray[np.float64]:
+            found = np.asarray(variance, dtype=np.float64)
+            return found.ravel() if found.size == 1 else found.ravel()[self.order]
+
+        single = pixels(expected.quantum_variance_DN2) * _lag_loss(expected) + pixels(expected.white_variance_DN2)
+        noise = 2.0 * (single + expected.row_variance_DN2 + expected.column_variance_DN2)
+        steps = np.diff(self.courses, axis=1)
+        total = 0.0
+        for start in range(0, steps.shape[1], PIECE_FRAMES):
+            squares = (self.there.T @ steps[:, start : start + PIECE_FRAMES]) ** 2
+            second, fourth = squares.mean(axis=1), (squares**2).mean(axis=1)
+            whole = np.maximum(noise + second, _LEAST_DN2)
+            ratio = 3.0 + (fourth - 3.0 * second**2) / whole**2
+            # what moves is no chance: a pixel's own variance is known better than that of noise alone
+            share = 3.0 / min(steps.shape[1], PIECE_FRAMES)
+            ratio *= (1.0 + share) / (1.0 + share * (1.0 - (second / whole) ** 2))
+            total += float(ratio.mean() - 3.0) * squares.shape[1]
+        return total / steps.shape[1]
 
     def rows(self) -> float:
         """Variance of rows' means, DN^2."""

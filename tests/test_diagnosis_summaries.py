@@ -217,6 +217,41 @@ def test_a_picture_that_fades_adds_to_variances_what_it_says():
     assert moving.columns() == pytest.approx(found.column_variance_DN2, rel=1e-4)
 
 
+@pytest.mark.parametrize(("frames", "height_DN"), [(20, 25.0), (20, 60.0), (50, 25.0), (90, 60.0)])
+def test_a_picture_that_fades_gives_steps_the_tails_that_it_says(frames, height_DN):
+    """Most of an exponential's fall lies in the first steps: a tenth of them hold what the others lack."""
+    rng = np.random.default_rng(int(height_DN))
+    rows, columns = 96, 80
+    y, x = np.mgrid[:rows, :columns]
+    picture = np.where(x > 50, height_DN, 0.0)
+    course = np.exp(-np.arange(frames) / 1.5)
+    quantum = 4.0 + 0.1 * y  # DN^2
+    white = np.full((1, 1), 2.0)
+    stack = 500.0 + picture * course[:, None, None]
+    stack = stack + np.sqrt(quantum + 2.0) * rng.standard_normal((frames, rows, columns))
+    good, labels = np.ones((rows, columns), bool), np.zeros((rows, columns), np.int64)
+    found = summarise_series([stack], good=good, labels=labels)
+    still = summarise_series([stack - picture * course[:, None, None]], good=good, labels=labels)
+    expected = SimpleNamespace(
+        trend_DN=[(picture, course - course.mean())],
+        signal_DN=np.ones((1, 1)),
+        quantum_variance_DN2=quantum,
+        white_variance_DN2=white,
+        row_variance_DN2=0.0,
+        column_variance_DN2=0.0,
+        temporal_correlation=np.zeros(3),
+    )
+    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, areas=Areas.of(good, labels, 1), kind="dark"))
+    said = moving.kurtosis(expected)
+    assert said > 0.05
+    assert found.kurtosis_excess - still.kurtosis_excess == pytest.approx(said, rel=0.1, abs=0.05)
+    nothing = _MovingPicture.of(
+        SimpleNamespace(trend_DN=None, signal_DN=np.ones((1, 1))),
+        SimpleNamespace(good=good, areas=Areas.of(good, labels, 1), kind="dark"),
+    )
+    assert nothing.kurtosis(expected) == 0.0
+
+
 def test_means_over_areas_are_those_over_their_masks():
     rng = np.random.default_rng(12)
     image, good = rng.standard_normal((20, 30)), rng.random((20, 30)) > 0.1

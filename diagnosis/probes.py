@@ -415,7 +415,7 @@ class _MovingPicture:
             share = 3.0 / min(steps.shape[1], PIECE_FRAMES)
             ratio *= (1.0 + share) / (1.0 + share * (1.0 - (second / whole) ** 2))
             total += float(ratio.mean() - 3.0) * squares.shape[1]
-        return total / steps.shape[1]
+        return float(total / steps.shape[1])
 
     def rows(self) -> float:
         """Variance of rows' means, DN^2."""

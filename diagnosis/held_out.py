@@ -15,8 +15,6 @@ from .strengths import strengths_on
 _SHOWN = 5.0  # standard deviations from which a probe shows it
 _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
 _UNSEEN = 3.0  # standard deviations of a probe
-# of the squares of an axis that shows the gap from so many standard deviations on: what leaves more has nothing to do with it
-_NEGLECTS, _NEGLECTED_FROM = 0.9, 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +23,6 @@ class Gap:
 
     left: what is left of a typical probe that showed the gap (median of |after| over |before|); None: too few showed it.
     contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
-    neglected: axes that show the gap clearly and of which the explanation takes nothing.
     """
 
     before: float
@@ -34,7 +31,6 @@ class Gap:
     shrinks_by: tuple[float, float, float] | None
     left: float | None = None
     contradicted: float = 0.0
-    neglected: tuple[str, ...] = ()
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
@@ -159,7 +155,6 @@ def held_out(
         shrinks_by=share(after) if effects else None,
         left=left,
         contradicted=contradicted_share(before, after, problem.parts[known]),
-        neglected=neglected_axes(before, after, axes) if effects else (),
     )
     return gap, tuple(rows), shares
 
@@ -170,14 +165,3 @@ def contradicted_share(before: NDArray[np.float64], after: NDArray[np.float64], 
     unseen = _UNSEEN**2 * np.bincount(places)
     added = now > _CONTRADICTS * np.maximum(was, unseen)
     return float(now[added].sum() / max(float(was.sum()), 1e-12))
-
-
-def neglected_axes(before: NDArray[np.float64], after: NDArray[np.float64], axes: NDArray[np.str_]) -> tuple[str, ...]:
-    """Axes (probe,) that showed a clear gap, squares of `before` (probe,), nearly all of which `after` (probe,) still has."""
-    found = []
-    for axis in dict.fromkeys(axes):
-        chosen = axes == axis
-        was, now = float(np.sum(before[chosen] ** 2)), float(np.sum(after[chosen] ** 2))
-        if was > _NEGLECTED_FROM**2 + np.count_nonzero(chosen) and now > _NEGLECTS * was:
-            found.append(str(axis))
-    return tuple(found)

@@ -46,10 +46,10 @@ def is_refused(problem: Problem, gap: Gap, leading: Hypothesis) -> bool:
 def leaves_too_much(gap: Gap, leading: Hypothesis) -> bool:
     """Whether an explanation leaves too much of a clear gap, or sees one where there is none.
 
-    Too much of the typical probe, of an axis, or of all probes together; one series far outside all others may hold most of
+    Too much of the typical probe, or of all probes together; one series far outside all others may hold most of
     the gap, and there a law that is right in kind may be off, unless its strength is no plausible one.
     """
-    if gap.neglected or (gap.left is not None and gap.left > _MOST_LEFT_TYPICALLY):
+    if gap.left is not None and gap.left > _MOST_LEFT_TYPICALLY:
         return True
     null = max(gap.floor, 1.0)
     if gap.before < 1.3 * null:

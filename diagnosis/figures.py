@@ -14,6 +14,16 @@ from .diagnose import Diagnosis
 from .inference import UNKNOWN
 
 _BEFORE, _AFTER, _FLOOR = "#b3402a", "#2a6fb3", "#777777"
+_DEPTH_TICKS = (
+    0.0,
+    0.2,
+    0.5,
+    1.0,
+    1.5,
+    2.0,
+    5.0,
+    10.0,
+)  # of -log transmission, evenly up to 2 and by its logarithm beyond
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
@@ -123,9 +133,11 @@ def plot_transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.fl
     for axis, title in zip(axes, ("before", "after"), strict=True):
         axis.axhline(0, color="k", lw=0.6)
         axis.set_title(title, fontsize=10)
+        deepest = axis.dataLim.x1 if colours else 1.0
         axis.set_xscale("symlog", linthresh=2.0)
-        axis.set_xticks([0, 0.5, 1, 1.5, 2, 5, 10], ["0", "0.5", "1", "1.5", "2", "5", "10"])
-        axis.set_xlim(left=-0.1)
+        ticks = [tick for tick in _DEPTH_TICKS if tick <= max(1.05 * deepest, 0.5)]
+        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_xlim(-0.05 * deepest, 1.05 * deepest)
         axis.set_xlabel("-log transmission (twin)")
     axes[0].set_ylabel("measured less twin, % of open field")
     if colours:

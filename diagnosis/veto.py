@@ -11,11 +11,11 @@ from .held_out import Gap
 from .inference import UNKNOWN, Hypothesis, Nuisances, law_terms
 
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
-# of a probe that shows the gap: of 25 sealed effects named rightly none left more than 0.16, of 27 of a second simulator one 0.22;
-# of nine taken for the nearest name once their own was withheld six left 0.34 to 1
+# of a probe that shows the gap: of 19 sealed effects named rightly none left more than 0.16, of 25 sessions of a second simulator
+# one 0.22; of eleven taken for another name once their own was withheld seven left 0.34 to 1
 _MOST_LEFT_TYPICALLY = 0.3
-# a voltage and a filter act as physics has it, whoever simulates them: right ones left nothing of the gap, one named for the other
-# 0.39 to 0.44
+# a voltage and a filter act as physics has it, whoever simulates them: six right ones left nothing of the gap, of seven named for
+# the other five 0.39 to 0.44
 _ACTS_EXACTLY = frozenset(("kv_error", "filtration_error"))
 _MOST_LEFT_EXACTLY = 0.25
 # of the gap's sum of squares: right explanations of twelve sessions had less than 0.001, lost bits 0.103, off-focal radiation

@@ -212,6 +212,19 @@ def test_a_misregistration_that_shifts_and_turns_is_found_from_its_two_parts():
     assert together[0].parameters["direction_deg"] == pytest.approx(222.0, abs=2.0)
 
 
+def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried_with_both_onsets():
+    onsets = {}
+    for variant in catalogue_variants():
+        onsets.setdefault(variant.effect, set()).add(variant.since)
+    taken_in_whole = {"kv_error", "filtration_error", "gain_map_error", "excess_noise", "bad_pixels"}
+    flat = SeriesRequest(kind="flat", setting=None, frames=5, exposure_ms=50.0)
+    for name in EFFECTS:
+        if not can_show(name, flat):
+            assert onsets[name] == {"always"}  # objects alone: they calibrate nothing
+        else:
+            assert onsets[name] == ({"calibration"} if name in taken_in_whole else {"always", "calibration"})
+
+
 def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_electronic_cannot():
     displacing = {effect for effect in EFFECTS if can_displace(effect)}
     assert displacing == {

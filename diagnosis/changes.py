@@ -18,6 +18,7 @@ from ..generator.effects.effect import Parameter
 from ..generator.twin import Estimate, Twin
 from .coarse import in_squares, pixels_in_square
 from .inference import Curve
+from .probes import OUTLIERS_ANYWHERE
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 # where the mean is linear in the strength one is enough, where it nearly is two
@@ -73,7 +74,7 @@ DEFINED_BY: Mapping[str, str] = {
     "gain_map_error": "fixed_pattern",
     "image_lag": "afterglow frames 0-0",
     "quantisation": "codes",
-    "bad_pixels": "outliers in any series",
+    "bad_pixels": OUTLIERS_ANYWHERE,
 }
 # relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
 DEFINED_SD: Mapping[str, float] = {

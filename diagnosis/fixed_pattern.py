@@ -17,6 +17,8 @@ from .summaries import BLOCK_PX
 
 OUTLIER_SD = 7.0
 _LEAST_BLOCKS, _LEAST_LINES = 8, 16
+_NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
+_OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
 _ROUNDING_DN2 = 1e-12
 
@@ -170,8 +172,23 @@ def count_outliers(
     clean: NDArray[np.bool_],
     good: NDArray[np.bool_],
 ) -> int:
-    """Good pixels of a residual map (row, column) that stand out of its noise (variance, DN^2) and its pattern."""
+    """Good pixels of a residual map (row, column) that stand out of its noise (variance, DN^2), its pattern and their neighbours.
+
+    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much.
+    """
     level = residual - smooth_part(residual, clean)
     limit = OUTLIER_SD * np.sqrt(variance)
     limit = limit * max(1.0, math.sqrt(pixel_DN2 / max(float(np.mean(variance[clean])), 1e-30)))
-    return int(np.count_nonzero((np.abs(level - float(np.median(level[clean]))) > limit) & good))
+    out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
+    if not out.any():
+        return 0
+    from numpy.lib.stride_tricks import sliding_window_view
+
+    reach = _NEIGHBOURS_PX // 2
+    around = np.pad(np.where(good, level, np.nan), reach, constant_values=np.nan)
+    windows = sliding_window_view(around, (_NEIGHBOURS_PX, _NEIGHBOURS_PX))[out]
+    ordered = np.sort(windows.reshape(len(windows), -1), axis=1)  # pixels that are not in use come last
+    known = np.count_nonzero(np.isfinite(ordered), axis=1)
+    low, middle, high = (ordered[np.arange(len(ordered)), (known - 1) * quarter // 4] for quarter in (1, 2, 3))
+    beside = np.maximum(limit[out], _OUT_OF_NEIGHBOURS * (high - low))
+    return int(np.count_nonzero(np.abs(level[out] - middle) > beside))

@@ -27,6 +27,8 @@ _ON_OBJECTS_ALONE = frozenset(
 )
 # beside blurs: effects that make edges look as if they lay elsewhere
 _RESHAPES = frozenset(("misregistration", "object_scatter", "composition_error"))
+# what singles pixels out
+_STANDS_OUT = frozenset(("bad_pixels", "gain_map_error"))
 _ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 
@@ -139,6 +141,11 @@ def can_show(effect: str, request: SeriesRequest) -> bool:
 def can_displace(effect: str) -> bool:
     """Whether an effect of the catalogue, or what is wrong with its law, can seem to move a scene's picture."""
     return effect in _RESHAPES or EFFECTS[effect].stage in ("object_blur", "optics")
+
+
+def can_stand_out(effect: str) -> bool:
+    """Whether an effect of the catalogue, or what is wrong with its law, can make single pixels stand out of their neighbours."""
+    return effect in _STANDS_OUT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

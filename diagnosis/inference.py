@@ -15,7 +15,7 @@ power below 1 where tests on simulated sessions showed overconfidence.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -37,16 +37,24 @@ UNKNOWN_CHANCE = 3.0  # log evidence that sessions without any effect show by ch
 PAIR_DOUBT = 3e-3  # share of the stronger effect's log evidence that a second effect must bring
 PAIR_DOUBT_ROOT = 0.6  # and so often its square root: what a slightly wrong law leaves by chance
 PAIR_DOUBT_ELSEWHERE = 0.36  # share of both that is left of them where the two effects move no probe in common
-# no more than this, and this times the power 3/2 of the evidence: of 56 sealed effects alone, those with evidences up to 1e6 left
-# another one 5 at most (a wandering output 15, lag a dark drift 31), stronger lags and glares 40 to 7000
+# no more than this, and this share of the stronger one's evidence, which fades below an evidence of PAIR_DOUBT_FADES: beside 56
+# sealed effects of evidences up to 1e6 another one gained 5 at most (a wandering output 15), beside glares of up to 4e7 90, beside
+# one with a focal spot a tail 294 of 3e6
 PAIR_DOUBT_LEAST = 12.0
-PAIR_DOUBT_STRONG = 5e-7
-PAIR_DOUBT_SHARED = 4.0  # and so much more of the latter where both effects move the same probes
+PAIR_DOUBT_STRONG = 3e-5
+PAIR_DOUBT_FADES = 1e6
+PAIR_DOUBT_SHARED = (
+    9.0  # and so much more of the latter, times the square of the share of probes that both effects move
+)
 APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 14  # pairs, the likeliest, either order, for which both laws are taken as inexact
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
+)
+_BELOW = np.geomspace(0.34, 0.97, 12)  # strengths that are tried below the plausible range, over its lower end
+_WANTS_LESS = (
+    4.5  # log likelihood by which a strength below the plausible range must be better to speak against an effect
 )
 _MOVES = 0.3  # standard deviations of a probe by which an effect is said to move it
 _LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
@@ -578,7 +586,8 @@ def weigh_hypotheses(
     power: float = 1.0,
     pairs_from: int = 6,
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
-    loose: Collection[str] = (),
+    loose: Mapping[str, float] | None = None,
+    left: Mapping[str, float] | None = None,
     chance: Mapping[str, float] | None = None,
     elsewhere: Mapping[str, NDArray[np.bool_]] | None = None,
     places: NDArray[np.intp] | None = None,
@@ -597,7 +606,10 @@ def weigh_hypotheses(
         pairs_from: pairs are formed of the best so many effects with every other.
         law_errors: relative errors of an effect's law in each group, and how probable each is.
         chance: effect -> log evidence that sessions without it show, beyond what the nuisances allow; taken off.
-        loose: effects whose law leaves something where it predicts nothing: a second effect beside them is doubted in full.
+        loose: effects whose law leaves something where it predicts nothing, and the share of their log evidence, in place of
+            PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
+        left: effect -> share of its log evidence that what is wrong with its law may give a second one, where it is not
+            PAIR_DOUBT_STRONG.
         elsewhere: effect -> probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is
             not doubted.
         places: place of each probe (probe,), within which a law is off by a share of no more than what is seen there; the
@@ -605,6 +617,7 @@ def weigh_hypotheses(
         fits: of the curves, with the same residual, nuisances, groups, places and law errors, where they are known.
     """
     priors, chance, elsewhere = priors or Priors(), chance or {}, elsewhere or {}
+    left, loose = left or {}, loose or {}
     places = groups if places is None else places
     if fits is None:
         fits = [fit_curve(residual, curve, nuisances, groups, places=places, law_errors=law_errors) for curve in curves]
@@ -650,30 +663,39 @@ def weigh_hypotheses(
     overlaps = _overlaps([start for *_, start in starts], evidence_of, nuisances, table)
     apart = _Apart(residual, nuisances, groups, places, law_errors)
 
-    def doubted(number: int, evidence: float) -> float:
-        """Evidence of a pair less what the first's law may have left of it for the second to take up."""
+    def doubted(number: int, evidence: float, below: Mapping[str, float]) -> float:
+        """Evidence of a pair less what the first's law may have left of it for the second to take up.
+
+        below: how much more likely each effect's strengths below the plausible range are.
+        """
         _, first, second, _ = starts[number]
         strong, weak = sorted((first, second), key=lambda effect: -evidence_of[effect])
         stronger = max(evidence_of[strong], 0.0)
-        doubt = PAIR_DOUBT * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
+        doubt = loose.get(strong, PAIR_DOUBT) * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
         if strong not in loose:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlaps[number]
-            shared = 1.0 + PAIR_DOUBT_SHARED * overlaps[number]
-            doubt = min(doubt, PAIR_DOUBT_LEAST + PAIR_DOUBT_STRONG * shared * stronger**1.5)
+            shared = 1.0 + PAIR_DOUBT_SHARED * overlaps[number] ** 2
+            leaves = left.get(strong, PAIR_DOUBT_STRONG) * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
+            doubt = min(doubt, PAIR_DOUBT_LEAST + leaves * shared * stronger)
         gain = evidence - evidence_of[strong]
         if strong in elsewhere and gain > 0.0:
             clean = elsewhere[strong] & ~np.any(np.abs(singles[strong].curve.responses) > _MOVES, axis=0)
             doubt = min(doubt, max(gain - apart.evidence(clean, by_effect[weak]), 0.0) + APART_DOUBT)
+        if gain > 0.0 and below[weak] > _WANTS_LESS and (strong in loose or stronger > PAIR_DOUBT_FADES):
+            # less of it than there can be: it stands for what the first's law leaves
+            doubt = max(doubt, gain + APART_DOUBT)
         return evidence - doubt - chance.get(first, 0.0) - chance.get(second, 0.0)
 
-    ahead = [doubted(number, more + start.log_evidence) for number, (more, _, _, start) in enumerate(starts)]
+    ahead = [
+        doubted(number, more + start.log_evidence, start.below) for number, (more, _, _, start) in enumerate(starts)
+    ]
     pairs: dict[tuple[str, ...], tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]] = {}
     for rank, number in enumerate(sorted(range(len(starts)), key=lambda number: -ahead[number])):
         more, first, second, start = starts[number]
         errors = law_errors if rank < _PAIRS_IN_FULL else ()
-        found, strengths, chosen = _finish_pair(residual, start, nuisances, groups, places, errors, table=table)
+        found, strengths, chosen, below = _finish_pair(residual, start, nuisances, groups, places, errors, table=table)
         key = (min(first, second), max(first, second))
-        evidence = doubted(number, found + more)
+        evidence = doubted(number, found + more, below)
         if key not in pairs or evidence > pairs[key][0]:
             pairs[key] = (evidence, strengths, chosen)
     prior = math.log(priors.pair / n_pairs)
@@ -825,6 +847,11 @@ class _PairStart:
     log_evidence: float
     moves: float
 
+    @property
+    def below(self) -> dict[str, float]:
+        """How much more likely strengths below the plausible range are, by effect."""
+        return _by_effect(self.first, self.second, self.grid.below)
+
 
 def _start_pair(
     first: CurveFit, seconds: Sequence[CurveFit], *, states: Sequence[_State], table: _NodeTable
@@ -876,8 +903,8 @@ def _finish_pair(
     law_errors: Sequence[tuple[float, float]],
     *,
     table: _NodeTable,
-) -> tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve]]:
-    """Log evidence over none of two effects, strengths, and the variants.
+) -> tuple[float, dict[str, tuple[float, float, float]], dict[str, Curve], dict[str, float]]:
+    """Log evidence over none of two effects, strengths, the variants, and how much more likely strengths below their ranges are.
 
     Where the second moves the probes by so much that its own law matters, both may be off.
     """
@@ -920,17 +947,25 @@ def _finish_pair(
         a.effect: _interval(chosen.first, marginal_a),
         b.effect: _interval(chosen.second, marginal_b),
     }
-    return best[0] + share, strengths, {a.effect: a, b.effect: b}
+    return best[0] + share, strengths, {a.effect: a, b.effect: b}, _by_effect(a, b, chosen.below)
+
+
+def _by_effect(first: Curve, second: Curve, values: tuple[float, float]) -> dict[str, float]:
+    return {first.effect: values[0], second.effect: values[1]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PairGrid:
-    """Log likelihood over none (first, second) at strengths of two effects, and log of its mean under the prior."""
+    """Log likelihood over none (first, second) at strengths of two effects, and log of its mean under the prior.
+
+    below: how much more likely strengths below the plausible range are, of the first and of the second, the other one at its best.
+    """
 
     log_integral: float
     first: NDArray[np.float64]
     second: NDArray[np.float64]
     log_likelihood: NDArray[np.float64]
+    below: tuple[float, float] = (0.0, 0.0)
 
     @property
     def best(self) -> tuple[float, float]:
@@ -978,4 +1013,12 @@ def _pair_integral(
         xb = np.linspace(xb[max(columns[0] - 1, 0)], xb[min(columns[-1] + 1, len(xb) - 1)], _PAIR_NODES)
     if result is None:
         raise RuntimeError("no grid was tried")
-    return result
+    best, top = result.best, float(result.log_likelihood.max()) - shift
+    less_a, less_b = (
+        curve.low * _BELOW if at < 1.001 * curve.low else None for curve, at in zip((a, b), best, strict=True)
+    )
+    below = (
+        0.0 if less_a is None else float(grid_of(less_a, np.array([best[1]])).max()) - top,
+        0.0 if less_b is None else float(grid_of(np.array([best[0]]), less_b).max()) - top,
+    )
+    return replace(result, below=below)

@@ -32,6 +32,7 @@ PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours diffe
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
+OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
 _KURTOSIS_PIXELS = 2048  # in which a fading picture's is computed
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 
@@ -316,11 +317,11 @@ def expected_scalars(
         # about half of the hot ones are lost in a flat's light
         hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
         seen = hot if context.kind == "dark" else bad - 0.5 * hot
-        values["outliers"] = math.sqrt(seen * n_good + 0.375)
+        values[OUTLIERS] = math.sqrt(seen * n_good + 0.375)
         # what bad pixels add is new in every frame
         values["memory of outliers"] = 0.0
     if context.counts_all_outliers:
-        values["outliers in any series"] = math.sqrt(expected.bad_pixel_share * n_good + 0.375)
+        values[OUTLIERS_ANYWHERE] = math.sqrt(expected.bad_pixel_share * n_good + 0.375)
     return values
 
 
@@ -613,13 +614,13 @@ def measured_scalars(
                 value = 0.5 * math.log(max(found_DN2, 1e-12) / noise_DN2)
                 add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
     if outliers is not None and not context.calibrates:
-        add("tails", "outliers", "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
+        add("tails", OUTLIERS, "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")
         if memory is not None and memory[1] >= _LEAST_OUTLIERS and frames >= _LEAST_FRAMES:
             share, count = memory
             add("tails", "memory of outliers", "1", share, math.sqrt(1.6 / (frames * count)), "memory of outliers")
     if context.counts_all_outliers:
         counted = math.sqrt(all_outliers + 0.375)
-        add("tails", "outliers in any series", "sqrt(pixels)", counted, 0.5, "outliers")
+        add("tails", OUTLIERS_ANYWHERE, "sqrt(pixels)", counted, 0.5, "outliers")
     return result
 
 

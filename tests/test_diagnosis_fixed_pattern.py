@@ -1,5 +1,6 @@
 """Fixed patterns of mean frames: what noise leaves, grain, lines and pixels that stand out."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -116,6 +117,31 @@ def test_pixels_that_stand_out_of_noise_and_pattern_are_counted():
     assert count_outliers(residual, variance, 36.0, clean=clean, good=clean) == 0
     # among grain ten times as strong as noise they do not stand out
     assert count_outliers(residual, variance, 3600.0, clean=clean, good=ALL) == 0
+
+
+def test_an_edge_that_a_picture_left_is_no_outlier_and_defects_beside_and_on_it_are():
+    rng = np.random.default_rng(7)
+    variance = np.full(SHAPE, 36.0)
+    y, x = np.meshgrid(np.arange(SHAPE[0]), np.arange(SHAPE[1]), indexing="ij")
+    ghost = 500.0 / (1.0 + np.exp((y - 60.0 + 0.3 * x) / 0.7)) + 800.0 * (np.hypot(y - 90.0, x - 80.0) < 14.0)
+    level = ghost + 6.0 * rng.standard_normal(SHAPE)
+    pixel = float(np.mean(np.diff(level, axis=1) ** 2)) / 2.0
+    smooth = level - level.mean()
+    assert np.count_nonzero(np.abs(smooth) > 7.0 * math.sqrt(pixel)) > 1000  # what a level alone would call outliers
+    assert count_outliers(level, variance, 36.0, clean=ALL, good=ALL) == 0
+    defects = np.zeros(SHAPE, dtype=bool)
+    defects[20:22, 10:13] = True  # a cluster
+    defects[40:60, 100] = True  # a stretch of a line
+    defects[5, 5] = defects[70, 20] = defects[-1, -1] = True
+    level[defects] += 400.0
+    assert count_outliers(level, variance, 36.0, clean=~defects, good=ALL) == np.count_nonzero(defects)
+    # neighbours that are not in use are not asked
+    used = ALL.copy()
+    used[6, 3:8] = used[4, 3:8] = False
+    level[~used] = np.nan
+    assert count_outliers(
+        np.where(used, level, 0.0), variance, 36.0, clean=~defects & used, good=used
+    ) == np.count_nonzero(defects)
 
 
 def test_pixels_that_stand_out_before_every_object_are_the_panels_own():

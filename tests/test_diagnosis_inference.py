@@ -11,6 +11,7 @@ from raytwin.diagnosis.diagnose import _strained
 from raytwin.diagnosis.inference import (
     PAIR_DOUBT,
     PAIR_DOUBT_ELSEWHERE,
+    PAIR_DOUBT_FADES,
     PAIR_DOUBT_LEAST,
     PAIR_DOUBT_ROOT,
     UNKNOWN,
@@ -504,8 +505,41 @@ def test_a_second_effect_seen_where_the_first_cannot_act_is_not_doubted(there):
     residual = 2000.0 * strong + left + rng.standard_normal(PROBES)
     if there:
         residual += 12.0 * np.where(objects, 0.0, weak)
-    options = {"loose": ("scatter",)}
+    options = {"loose": {"scatter": PAIR_DOUBT}}
     doubted = weigh(residual, np.zeros((PROBES, 1)), made, **options)
     assert doubted[0].effects == ("scatter",)
     found = weigh(residual, np.zeros((PROBES, 1)), made, elsewhere={"scatter": ~objects}, **options)
     assert found[0].effects == (("lag", "scatter") if there else ("scatter",))
+
+
+@pytest.mark.parametrize("size, named", [(0.6, False), (2.0, True)])
+def test_beside_a_strong_effect_less_of_a_second_one_than_there_can_be_is_what_the_first_ones_law_leaves(size, named):
+    rng = np.random.default_rng(31)
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[:300] = rng.standard_normal(300)
+    weak[300:] = 60.0 * rng.standard_normal(PROBES - 300)
+    made = [one_node("strong", strong, high=5000.0), one_node("weak", weak, low=1.0)]
+    without = np.zeros((PROBES, 1))
+    residual = 1000.0 * strong + size * weak + rng.standard_normal(PROBES)
+    found = weigh(residual, without, made)
+    alone = next(item for item in found if item.effects == ("strong",))
+    assert alone.log_evidence > PAIR_DOUBT_FADES
+    assert found[0].effects == (("strong", "weak") if named else ("strong",))
+    # either explains thousands of units beside the first
+    assert 0.5 * float(np.sum((residual - 1000.0 * strong) ** 2)) > 1e4
+
+
+def test_what_a_law_leaves_is_asked_of_a_second_effect_in_proportion_to_the_firsts_evidence():
+    rng = np.random.default_rng(32)
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[:300] = rng.standard_normal(300)
+    weak[250:400] = rng.standard_normal(150)
+    made = [one_node(name, direction, high=50000.0) for name, direction in (("strong", strong), ("weak", weak))]
+    without = np.zeros((PROBES, 1))
+    residual = 300.0 * strong + 6.0 * weak + rng.standard_normal(PROBES)
+    pair, alone = ("strong", "weak"), ("strong",)
+    assert weigh(residual, without, made)[0].effects == pair
+    assert weigh(residual, without, made, left={"strong": 1e-3})[0].effects == alone
+    assert weigh(residual, without, made, left={"weak": 1e-3})[0].effects == pair
+    assert weigh(residual, without, made, loose={"strong": 0.02})[0].effects == alone
+    assert weigh(residual, without, made, loose={"weak": 0.02})[0].effects == pair

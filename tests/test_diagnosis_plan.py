@@ -9,7 +9,7 @@ import pytest
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.forward_model import can_displace, can_show
+from raytwin.diagnosis.forward_model import can_displace, can_show, can_stand_out
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Curve, Hypothesis, Nuisances, node_weights, weigh_hypotheses
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
@@ -237,6 +237,10 @@ def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_elect
         "misregistration",
         "composition_error",
     }
+
+
+def test_only_what_changes_pixels_one_by_one_makes_them_stand_out():
+    assert {effect for effect in EFFECTS if can_stand_out(effect)} == {"bad_pixels", "gain_map_error"}
 
 
 def explanation(effect="veiling_glare", strength=10.0):

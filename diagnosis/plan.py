@@ -4,18 +4,21 @@ Only expectations, noise and nuisances are used, so the frames' contents do not 
 taken on another day, says as much.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.effects import EFFECTS
 from .assemble import Problem
 from .inference import Curve, Nuisances
 from .whitening import Whitening
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm
-_CLEAR = 5.0  # standard deviations
+_FINE_GRID = 121  # strengths that are asked whether they are seen
+CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
 WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
@@ -49,13 +52,17 @@ ISOLATED_BY = {
 class Distinguishability:
     """Separation of effects, standard deviations, nuisances and the other's strength and inner parameters refitted.
 
-    Fields: effects (effect,); strengths (effect,): at which each is taken, middle of its range; from_none (effect,);
+    Fields: effects (effect,); since (effect,): the onset that each is taken with, its usual one where the session can show it;
+    strengths (effect,): at which each is taken, middle of its range, its inner parameters those that are seen neither best nor
+    worst; from_none (effect,); seen_from (effect,): least strength of the plausible range that lies CLEAR from none, inf: none;
     between (effect, effect): of the row's effect from the column's at whatever strength and inner parameters come nearest.
     """
 
     effects: tuple[str, ...]
+    since: tuple[str, ...]
     strengths: NDArray[np.float64]
     from_none: NDArray[np.float64]
+    seen_from: NDArray[np.float64]
     between: NDArray[np.float64]
 
 
@@ -70,30 +77,66 @@ def distinguishability(problem: Problem) -> Distinguishability:
     for curve in curves:
         places.append(slice(position, position + len(curve.responses)))
         position += len(curve.responses)
-    effects = tuple(dict.fromkeys(curve.effect for curve in curves))
-    strengths = np.zeros(len(effects))
-    from_none = np.zeros(len(effects))
+
+    def lengths(number: int, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+        weights, own = curves[number].weights(strengths), gram[places[number], places[number]]
+        return np.asarray(np.sqrt(np.maximum(np.einsum("si,ij,sj->s", weights, own, weights), 0.0)))
+
+    order = {effect: place for place, effect in enumerate(EFFECTS)}
+    effects = tuple(
+        sorted(dict.fromkeys(curve.effect for curve in curves), key=lambda name: order.get(name, len(order)))
+    )
+    taken = [_usual(effect, curves, lengths) for effect in effects]
+    strengths = np.array([_middle(curves[number]) for number in taken])
+    from_none, seen_from = np.zeros(len(effects)), np.full(len(effects), np.inf)
     between = np.zeros((len(effects), len(effects)))
-    for row, effect in enumerate(effects):
-        first = next(index for index, curve in enumerate(curves) if curve.effect == effect)
-        own, mine = curves[first], places[first]
-        strengths[row] = np.sqrt(own.low * own.high)
-        weights = own.weights(np.array([strengths[row]]))[0]
-        length = float(weights @ gram[mine, mine] @ weights)
-        from_none[row] = np.sqrt(max(length, 0.0))
-        nearest = np.full(len(effects), length)
+    for row, (number, strength) in enumerate(zip(taken, strengths, strict=True)):
+        own, mine = curves[number], places[number]
+        from_none[row] = lengths(number, np.array([strength]))[0]
+        grid = np.geomspace(own.low, own.high, _FINE_GRID)
+        clear = np.nonzero(lengths(number, grid) >= CLEAR)[0]
+        if clear.size:
+            seen_from[row] = grid[clear[0]]
+        weights = own.weights(np.array([strength]))[0]
+        nearest = np.full(len(effects), from_none[row] ** 2)
         for curve, place in zip(curves, places, strict=True):
             column = effects.index(curve.effect)
-            grid = curve.weights(np.geomspace(curve.low / 3.0, 1.5 * curve.high, _GRID))
+            others = curve.weights(np.geomspace(curve.low / 3.0, 1.5 * curve.high, _GRID))
             distance = (
-                length
-                - 2.0 * grid @ (gram[place, mine] @ weights)
-                + np.einsum("si,ij,sj->s", grid, gram[place, place], grid)
+                from_none[row] ** 2
+                - 2.0 * others @ (gram[place, mine] @ weights)
+                + np.einsum("si,ij,sj->s", others, gram[place, place], others)
             )
             nearest[column] = min(nearest[column], float(distance.min()))
         between[row] = np.sqrt(np.maximum(nearest, 0.0))
         between[row, row] = 0.0
-    return Distinguishability(effects=effects, strengths=strengths, from_none=from_none, between=between)
+    return Distinguishability(
+        effects=effects,
+        since=tuple(curves[number].since for number in taken),
+        strengths=strengths,
+        from_none=from_none,
+        seen_from=seen_from,
+        between=between,
+    )
+
+
+def _middle(curve: Curve) -> float:
+    """Middle of the plausible range."""
+    return math.sqrt(curve.low * curve.high)
+
+
+def _usual(
+    effect: str, curves: Sequence[Curve], lengths: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+) -> int:
+    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length.
+
+    lengths: of a curve (number) at strengths (strength,), standard deviations.
+    """
+    own = [number for number, curve in enumerate(curves) if curve.effect == effect]
+    after = effect in EFFECTS and EFFECTS[effect].after_calibration
+    usual = [number for number in own if curves[number].since == ("calibration" if after else "always")] or own
+    ranked = sorted(usual, key=lambda number: float(lengths(number, np.array([_middle(curves[number])]))[0]))
+    return ranked[(len(ranked) - 1) // 2]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,20 +213,18 @@ def best_repeat(
 
 
 def table_text(found: Distinguishability) -> str:
-    """The matrix as text, one row an effect: detection, and the effects from which it is not clearly apart."""
-    lines = [f"{'effect':<18}{'strength':>9}{'from none':>11}   not told apart (separation below {_CLEAR:g})"]
+    """The matrix as text, one row an effect: onset, detection, and the effects from which it is not clearly apart."""
+    title = f"not told apart there (separation below {CLEAR:g})"
+    lines = [f"{'effect':<19}{'since':<12}{'seen from':>10}{'strength':>10} {'unit':<5}{'from none':>11}   {title}"]
     for row, effect in enumerate(found.effects):
-        if found.from_none[row] < _CLEAR:
-            lines.append(
-                f"{effect:<18}{found.strengths[row]:>9.3g}{found.from_none[row]:>11.1f}   not seen at this strength"
-            )
-            continue
+        unit = EFFECTS[effect].strength.unit if effect in EFFECTS else ""
+        least = f"{found.seen_from[row]:.3g}" if np.isfinite(found.seen_from[row]) else "-"
         near = [
             f"{other} {found.between[row, column]:.1f}"
             for column, other in enumerate(found.effects)
-            if column != row and found.between[row, column] < _CLEAR
+            if column != row and found.between[row, column] < CLEAR
         ]
-        lines.append(
-            f"{effect:<18}{found.strengths[row]:>9.3g}{found.from_none[row]:>11.1f}   {', '.join(near) or '-'}"
-        )
+        said = "not seen at this strength" if found.from_none[row] < CLEAR else ", ".join(near) or "-"
+        known = f"{least:>10}{found.strengths[row]:>10.3g} {unit:<5}{found.from_none[row]:>11.1f}"
+        lines.append(f"{effect:<19}{found.since[row]:<12}{known}   {said}")
     return "\n".join(lines)

@@ -23,9 +23,10 @@ from raytwin.generator.series import SeriesRequest, expected_series
 PROBES = 60
 
 
-def curve(effect, direction, *, low=1.0, high=100.0):
+def curve(effect, direction, *, low=1.0, high=100.0, since="always"):
     return Curve(
         effect=effect,
+        since=since,
         variant="",
         parameters={},
         low=low,
@@ -64,6 +65,24 @@ def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_o
     text = table_text(found)
     assert "drift" in text.splitlines()[1]
     assert text.splitlines()[2].endswith("-")
+
+
+def test_an_effect_is_planned_with_its_usual_onset_and_middling_inner_parameters_in_the_catalogues_order():
+    tails = [curve("mtf_tail", size * axis(0), since="calibration") for size in (0.2, 0.7, 0.6)]
+    hidden = curve("mtf_tail", 0.01 * axis(0))
+    lag = curve("image_lag", 0.2 * axis(1), high=10.0)
+    found = distinguishability(problem([lag, hidden, *tails, curve("veiling_glare", axis(2), since="calibration")]))
+    assert found.effects == tuple(effect for effect in EFFECTS if effect in {"veiling_glare", "mtf_tail", "image_lag"})
+    row = found.effects.index("mtf_tail")
+    assert found.since[row] == "calibration"  # a tail that was always there is taken in by calibration
+    assert found.from_none[row] == pytest.approx(0.6 * 10.0)
+    assert found.seen_from[row] == pytest.approx(5.0 / 0.6, rel=0.04)
+    assert found.seen_from[found.effects.index("image_lag")] == np.inf
+    glare = found.effects.index("veiling_glare")
+    assert found.since[glare] == "calibration"  # there is no other
+    lines = table_text(found).splitlines()
+    assert lines[1 + row].split()[:4] == ["mtf_tail", "calibration", f"{found.seen_from[row]:.3g}", "10"]
+    assert lines[1 + found.effects.index("image_lag")].split()[2] == "-"
 
 
 def test_a_nuisance_along_an_effect_takes_its_separation():

@@ -8,6 +8,7 @@ the task made stands in DIR/task, and a run that was stopped goes on there.
 
 import argparse
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -256,12 +257,14 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         )
     found = distinguishability(problem)
     shares = [pixels_in_square(effect, "strength", session.factor) for effect in found.effects]
-    found = replace(found, strengths=found.strengths * shares)
+    found = replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares)
     cannot = {**problem.missing_effects, **unseen}
     data = {
         "effects": list(found.effects),
+        "since": list(found.since),
         "strengths": found.strengths.tolist(),
         "from_none": found.from_none.tolist(),
+        "seen_from": [value if math.isfinite(value) else None for value in found.seen_from.tolist()],
         "between": found.between.tolist(),
         "cannot_be_judged": cannot,
     }

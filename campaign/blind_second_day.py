@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import Problem, build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
+from ..diagnosis.curves import Curve
 from ..diagnosis.held_out import folds_of, left_over
-from ..diagnosis.inference import Curve
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 

@@ -16,10 +16,10 @@ from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
 from .changes import Variant, smooth_twin, twin_changes
+from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
 from .forward_model import Change, ForwardModel, draft_cache, strength_rows
-from .inference import LEAST_RESPONSE, Curve
 from .nuisance_columns import Columns
 from .placing import place_scenes
 from .probes import ProbeName, expected_scalars

@@ -17,7 +17,7 @@ from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.effects.effect import Parameter
 from ..generator.twin import Estimate, Twin
 from .coarse import in_squares, pixels_in_square
-from .inference import Curve
+from .curves import Curve
 from .probes import OUTLIERS_ANYWHERE
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed

@@ -15,10 +15,14 @@ from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import catalogue_variants
 from .coarse import UNSEEN, in_pixels
+from .curve_fits import CurveFit, fit_curve
+from .curves import Curve
 from .forward_model import can_displace, can_show, can_stand_out
 from .held_out import Gap, held_out
-from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Priors, fit_curve, weigh_hypotheses
+from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from .next_series import best_measurement, proposal_text
+from .nuisances import Nuisances
+from .pairs import Doubts
 from .placing import ALONG_COLUMNS, ALONG_ROWS
 from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
@@ -243,6 +247,9 @@ def judge(
     def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
         return tuple(fit_curve(residual, curve, shared, problem.groups, places=probe_places) for curve in curves)
 
+    sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
+    doubts = Doubts(chance=_SHARP_CHANCE if sharp else _CHANCE, loose=_LOOSE, left=_LEFT, elsewhere=elsewhere)
+
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
             residual,
@@ -254,10 +261,7 @@ def judge(
             unknown_names=problem.part_names,
             priors=priors or Priors(),
             power=POWER,
-            loose=_LOOSE,
-            left=_LEFT,
-            chance=_SHARP_CHANCE if problem.base.noise.psf_sigma_px.value < SHARP_PX else _CHANCE,
-            elsewhere=elsewhere,
+            doubts=doubts,
             places=probe_places,
             fits=fits,
         )
@@ -455,20 +459,14 @@ def _next_measurement(
 
 def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:
     """z of each probe given all others: (C^-1 r)_i / sqrt((C^-1)_ii)."""
-    from scipy.linalg import solve_triangular
-
-    solved = nuisances.solve(problem.residual)
-    factor = solve_triangular(nuisances._cholesky, nuisances.factors.T, lower=True)
+    solved, factor = nuisances.solve(problem.residual), nuisances.half
     diagonal = 1.0 - np.sum(factor**2, axis=0)
     return np.asarray(solved / np.sqrt(np.maximum(diagonal, 1e-12)))
 
 
 def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator) -> float:
     """The |z| that the largest of all probes exceeds in 5 % of sessions without a gap (by simulation)."""
-    from scipy.linalg import solve_triangular
-
-    size = len(problem.residual)
-    factor = solve_triangular(nuisances._cholesky, nuisances.factors.T, lower=True)
+    size, factor = len(problem.residual), nuisances.half
     diagonal = np.sqrt(np.maximum(1.0 - np.sum(factor**2, axis=0), 1e-12))
     draws = rng.standard_normal((_REPLICATES, size))
     draws += rng.standard_normal((_REPLICATES, nuisances.factors.shape[1])) @ nuisances.factors.T

@@ -168,7 +168,7 @@ def plot_by_axis(diagnosis: Diagnosis) -> bytes:
 def plot_places(diagnosis: Diagnosis) -> bytes:
     """Every probe's z over the series in time order, coloured by axis, with the threshold of chance."""
     from .diagnose import _leave_one_out_z
-    from .inference import Nuisances
+    from .nuisances import Nuisances
 
     problem = diagnosis.problem
     z = _leave_one_out_z(problem, Nuisances(problem.factors))

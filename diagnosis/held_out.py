@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .assemble import Problem
-from .inference import UNKNOWN, Curve, Hypothesis, Nuisances, law_terms
+from .curves import Curve
+from .inexact_laws import law_terms
+from .inference import UNKNOWN, Hypothesis
+from .nuisances import Nuisances
 from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it

@@ -26,7 +26,8 @@ from ..generator.series import SeriesRequest, expected_series, sample_series, wi
 from ..generator.twin import Twin
 from .assemble import Problem, build_problem
 from .changes import Variant
-from .inference import Curve, Nuisances
+from .curves import Curve
+from .nuisances import Nuisances
 from .whitening import Whitening
 
 FRAMES = 20  # of each series that is planned

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
 from .assemble import Problem
-from .inference import Curve, Nuisances
+from .curves import Curve
+from .nuisances import Nuisances
 from .whitening import Whitening
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm

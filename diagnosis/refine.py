@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 from ..generator.effects.effect import Parameter
 from ..generator.effects.registration import angles_of, parts_px
 from .changes import KEPT_AS_THEY_ARE, ONE_STRENGTH, Variant
-from .inference import UNKNOWN, Curve, CurveFit, Hypothesis, Nuisances, Widened, fit_curve, widened_for
+from .curve_fits import CurveFit, fit_curve
+from .curves import Curve
+from .inexact_laws import Widened, widened_for
+from .inference import UNKNOWN, Hypothesis
+from .nuisances import Nuisances
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4

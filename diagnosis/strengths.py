@@ -11,8 +11,10 @@ from ..generator.effects import AppliedEffect
 from ..generator.series import with_conditions
 from .assemble import Problem, SeriesView, map_changes
 from .changes import DEFINED_SD
+from .curve_fits import fit_curve
 from .even_maps import Map, mean_over
-from .inference import Hypothesis, Nuisances, fit_curve
+from .inference import Hypothesis
+from .nuisances import Nuisances
 from .output_course import rms_about_mean
 
 _LAW_SD = 0.12  # relative, of a strength as real effects have it

@@ -8,7 +8,9 @@ import numpy as np
 
 from .assemble import Problem
 from .held_out import Gap
-from .inference import UNKNOWN, Hypothesis, Nuisances, law_terms
+from .inexact_laws import law_terms
+from .inference import UNKNOWN, Hypothesis
+from .nuisances import Nuisances
 
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 # of a probe that shows the gap: of 19 sealed effects named rightly none left more than 0.16, of 25 sessions of a second simulator

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .inference import Curve
+from .curves import Curve
 
 
 class Whitening:

@@ -47,7 +47,7 @@ from raytwin.campaign.blind_statistics import (
     session_statistics,
     write_statistics,
 )
-from raytwin.diagnosis.inference import Curve
+from raytwin.diagnosis.curves import Curve
 from raytwin.generator.effects import EFFECTS
 
 

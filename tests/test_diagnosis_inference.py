@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis import inference
+from raytwin.diagnosis.curve_fits import fit_curve, interval_of
+from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.diagnose import _strained
-from raytwin.diagnosis.inference import (
+from raytwin.diagnosis.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.nuisances import Nuisances
+from raytwin.diagnosis.pairs import (
     PAIR_DOUBT,
     PAIR_DOUBT_ELSEWHERE,
     PAIR_DOUBT_FADES,
     PAIR_DOUBT_LEAST,
     PAIR_DOUBT_ROOT,
-    UNKNOWN,
-    Curve,
-    Hypothesis,
-    Nuisances,
-    Priors,
-    fit_curve,
-    interval_of,
-    weigh_hypotheses,
+    Doubts,
 )
 from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.veto import DOUBT, with_doubt
@@ -78,9 +75,15 @@ def noise(rng, factors):
     return factors @ rng.standard_normal(factors.shape[1]) + rng.standard_normal(len(factors))
 
 
-def weigh(residual, factors, chosen, **options):
+def weigh(residual, factors, chosen, *, doubts=None, **options):
     return weigh_hypotheses(
-        residual, curves=chosen, nuisances=Nuisances(factors), groups=GROUPS, group_names=NAMES, **options
+        residual,
+        curves=chosen,
+        nuisances=Nuisances(factors),
+        groups=GROUPS,
+        group_names=NAMES,
+        doubts=None if doubts is None else Doubts(**doubts),
+        **options,
     )
 
 
@@ -438,7 +441,10 @@ def test_what_sessions_without_an_effect_show_by_chance_is_taken_off_alone_and_i
     rng, factors, chosen = setup
     residual = noise(rng, factors) + chosen[0].response(15.0) + chosen[2].response(30.0)
     plain = {item.effects: item.log_evidence for item in weigh(residual, factors, chosen)}
-    found = {item.effects: item.log_evidence for item in weigh(residual, factors, chosen, chance={"effect0": 4.0})}
+    found = {
+        item.effects: item.log_evidence
+        for item in weigh(residual, factors, chosen, doubts={"chance": {"effect0": 4.0}})
+    }
     for effects, evidence in found.items():
         taken = 4.0 if "effect0" in effects else 0.0
         # an unknown effect is doubted in proportion to what the best of the others explains
@@ -506,9 +512,9 @@ def test_a_second_effect_seen_where_the_first_cannot_act_is_not_doubted(there):
     if there:
         residual += 12.0 * np.where(objects, 0.0, weak)
     options = {"loose": {"scatter": PAIR_DOUBT}}
-    doubted = weigh(residual, np.zeros((PROBES, 1)), made, **options)
+    doubted = weigh(residual, np.zeros((PROBES, 1)), made, doubts=options)
     assert doubted[0].effects == ("scatter",)
-    found = weigh(residual, np.zeros((PROBES, 1)), made, elsewhere={"scatter": ~objects}, **options)
+    found = weigh(residual, np.zeros((PROBES, 1)), made, doubts={**options, "elsewhere": {"scatter": ~objects}})
     assert found[0].effects == (("lag", "scatter") if there else ("scatter",))
 
 
@@ -539,7 +545,7 @@ def test_what_a_law_leaves_is_asked_of_a_second_effect_in_proportion_to_the_firs
     residual = 300.0 * strong + 6.0 * weak + rng.standard_normal(PROBES)
     pair, alone = ("strong", "weak"), ("strong",)
     assert weigh(residual, without, made)[0].effects == pair
-    assert weigh(residual, without, made, left={"strong": 1e-3})[0].effects == alone
-    assert weigh(residual, without, made, left={"weak": 1e-3})[0].effects == pair
-    assert weigh(residual, without, made, loose={"strong": 0.02})[0].effects == alone
-    assert weigh(residual, without, made, loose={"weak": 0.02})[0].effects == pair
+    assert weigh(residual, without, made, doubts={"left": {"strong": 1e-3}})[0].effects == alone
+    assert weigh(residual, without, made, doubts={"left": {"weak": 1e-3}})[0].effects == pair
+    assert weigh(residual, without, made, doubts={"loose": {"strong": 0.02}})[0].effects == alone
+    assert weigh(residual, without, made, doubts={"loose": {"weak": 0.02}})[0].effects == pair

@@ -9,9 +9,11 @@ import pytest
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.curves import Curve, node_weights
 from raytwin.diagnosis.forward_model import can_displace, can_show, can_stand_out
 from raytwin.diagnosis.held_out import Gap, contradicted_share
-from raytwin.diagnosis.inference import Curve, Hypothesis, Nuisances, node_weights, weigh_hypotheses
+from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
+from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.veto import leaves_too_much, misfit_of

@@ -1,0 +1,75 @@
+"""What an effect would do to the probes at any strength: its responses at a few, and how they are joined."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
+STRENGTH_NODES = 25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curve:
+    """Response of the probes to one effect with its inner parameters fixed.
+
+    Fields: effect (id); variant (name of the inner parameters' choice); parameters (inner parameters, without the
+    strength); low, high: plausible range of the strength; strengths (node,) > 0 ascending; responses (node, probe): m_e at
+    the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
+    that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
+    strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
+    the strength is defined by, in which no law can be far off.
+    Between nodes and zero the response is interpolated (Lagrange through
+    the four nearest points, 0 one of them).
+    """
+
+    effect: str
+    variant: str
+    parameters: Mapping[str, float]
+    low: float
+    high: float
+    strengths: NDArray[np.float64]
+    responses: NDArray[np.float64]
+    since: str = "always"
+    spread: NDArray[np.float64] | None = None
+    jitter: NDArray[np.float64] | None = None
+    exact: NDArray[np.bool_] | None = None
+
+    @property
+    def by_chance_alone(self) -> bool:
+        """Whether the effect moves no probe by a known amount, but some by chance."""
+        return self.spread is not None and not bool(np.any(np.abs(self.responses) > LEAST_RESPONSE))
+
+    def weights(self, strength: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weights (strength, node) with which the nodes' responses add up at given strengths."""
+        return node_weights(self.strengths, np.atleast_1d(np.asarray(strength, dtype=np.float64)))
+
+    def response(self, strength: float) -> NDArray[np.float64]:
+        """Response (probe,) at one strength."""
+        return np.asarray(self.weights(np.array([strength]))[0] @ self.responses)
+
+
+def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
+    points = np.concatenate([[0.0], nodes])
+    result = np.zeros((len(strengths), len(nodes)))
+    used = min(len(points), 4)
+    # the interval's two points and their neighbours; the point 0 adds nothing
+    first = np.clip(np.searchsorted(points, strengths) - used // 2, 0, len(points) - used)
+    row = np.arange(len(strengths))
+    for i in range(used):
+        at = first + i
+        weight = np.ones(len(strengths))
+        for j in range(used):
+            if j != i:
+                other = points[first + j]
+                weight *= (strengths - other) / (points[at] - other)
+        inner = at > 0
+        result[row[inner], at[inner] - 1] = weight[inner]
+    return result
+
+
+def log_strength_nodes(low: float, high: float, count: int = STRENGTH_NODES) -> NDArray[np.float64]:
+    """Strengths at which integrals are taken, evenly in the logarithm, from a third of `low` to 1.5 `high`."""
+    return np.geomspace(low / 3.0, 1.5 * high, count)

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..generator.series import ExpectedSeries
@@ -182,8 +183,6 @@ def count_outliers(
     out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
     if not out.any():
         return 0
-    from numpy.lib.stride_tricks import sliding_window_view
-
     reach = _NEIGHBOURS_PX // 2
     around = np.pad(np.where(good, level, np.nan), reach, constant_values=np.nan)
     windows = sliding_window_view(around, (_NEIGHBOURS_PX, _NEIGHBOURS_PX))[out]

@@ -173,7 +173,7 @@ def count_outliers(
     clean: NDArray[np.bool_],
     good: NDArray[np.bool_],
 ) -> int:
-    """Good pixels of a residual map (row, column) that stand out of its noise (variance, DN^2), its pattern and their neighbours.
+    """Good pixels of a residual map (row, column) that stand out of noise (variance, DN^2), pattern and the clean ones around.
 
     An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much.
     """
@@ -183,11 +183,11 @@ def count_outliers(
     out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
     if not out.any():
         return 0
-    reach = _NEIGHBOURS_PX // 2
-    around = np.pad(np.where(good, level, np.nan), reach, constant_values=np.nan)
+    around = np.pad(np.where(clean, level, np.nan), _NEIGHBOURS_PX // 2, constant_values=np.nan)
     windows = sliding_window_view(around, (_NEIGHBOURS_PX, _NEIGHBOURS_PX))[out]
-    ordered = np.sort(windows.reshape(len(windows), -1), axis=1)  # pixels that are not in use come last
+    ordered = np.sort(windows.reshape(len(windows), -1), axis=1)  # pixels that are not clean come last
     known = np.count_nonzero(np.isfinite(ordered), axis=1)
-    low, middle, high = (ordered[np.arange(len(ordered)), (known - 1) * quarter // 4] for quarter in (1, 2, 3))
+    places = (np.maximum(known - 1, 0) * quarter // 4 for quarter in (1, 2, 3))
+    low, middle, high = (ordered[np.arange(len(ordered)), place] for place in places)
     beside = np.maximum(limit[out], _OUT_OF_NEIGHBOURS * (high - low))
-    return int(np.count_nonzero(np.abs(level[out] - middle) > beside))
+    return int(np.count_nonzero((known == 0) | (np.abs(level[out] - middle) > beside)))

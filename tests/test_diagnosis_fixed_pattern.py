@@ -135,6 +135,12 @@ def test_an_edge_that_a_picture_left_is_no_outlier_and_defects_beside_and_on_it_
     defects[5, 5] = defects[70, 20] = defects[-1, -1] = True
     level[defects] += 400.0
     assert count_outliers(level, variance, 36.0, clean=~defects, good=ALL) == np.count_nonzero(defects)
+    # whole blocks and lines two pixels wide, of which neighbours know nothing better
+    wide = defects.copy()
+    wide[10:18, 60:68] = wide[:40, 40:42] = True
+    assert count_outliers(level + 400.0 * (wide & ~defects), variance, 36.0, clean=~wide, good=ALL) == np.count_nonzero(
+        wide
+    )
     # neighbours that are not in use are not asked
     used = ALL.copy()
     used[6, 3:8] = used[4, 3:8] = False

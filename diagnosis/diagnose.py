@@ -49,11 +49,11 @@ _SHARP_CHANCE = {
     **dict.fromkeys(("mtf_tail", "motion_blur", "misregistration", "k_fluorescence"), 8.0),
     "focal_spot": 80.0,
 }
-# photons followed one by one reach shadows that no kernel fills: as a rule up to 2e-3 of scatter's log evidence goes to another
+# photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of scatter's log evidence goes to another
 # effect, 0.016 where 40 % of scatter filled a wide field
 _LOOSE = {"object_scatter": 0.02}
 # traps are more than a law of two knows: in eight sessions with lags of 0.5-4 % alone a dark drift gained up to 4e-5 of lag's
-# evidence, beside 1.7 % since the calibration 4e-4
+# evidence, beside two since the calibration 4e-4 and 5e-4
 _LEFT = {"image_lag": 2e-4}
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
@@ -215,6 +215,21 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], nuisances: Nuisance
     return {effect: found[effect] for effect in EFFECTS if effect in found}
 
 
+def _elsewhere(problem: Problem) -> dict[str, NDArray[np.bool_]]:
+    """Probes (probe,) that each effect cannot move, however wrong its law, by effect."""
+    of_places = np.array([name.statistic in (ALONG_ROWS, ALONG_COLUMNS) for name in problem.names])
+    of_outliers = np.array([name.statistic in (OUTLIERS, OUTLIERS_ANYWHERE) for name in problem.names])
+    result = {}
+    for effect in {variant.effect for variant in problem.variants}:
+        hidden = np.array([not can_show(effect, view.session.request) for view in problem.views], dtype=bool)
+        result[effect] = (
+            hidden[problem.series_of]
+            | (of_places & (not can_displace(effect)))
+            | (of_outliers & (not can_stand_out(effect)))
+        )
+    return result
+
+
 def judge(
     problem: Problem,
     twin: Twin,
@@ -231,24 +246,13 @@ def judge(
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
 
-    of_places = np.array([name.statistic in (ALONG_ROWS, ALONG_COLUMNS) for name in problem.names])
-    of_outliers = np.array([name.statistic in (OUTLIERS, OUTLIERS_ANYWHERE) for name in problem.names])
-    elsewhere = {
-        effect: np.array([not can_show(effect, view.session.request) for view in problem.views], dtype=bool)[
-            problem.series_of
-        ]
-        | (of_places & (not can_displace(effect)))
-        | (of_outliers & (not can_stand_out(effect)))
-        for effect in {variant.effect for variant in problem.variants}
-    }
-
     probe_places = problem.places
 
     def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
         return tuple(fit_curve(residual, curve, shared, problem.groups, places=probe_places) for curve in curves)
 
     sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
-    doubts = Doubts(chance=_SHARP_CHANCE if sharp else _CHANCE, loose=_LOOSE, left=_LEFT, elsewhere=elsewhere)
+    doubts = Doubts(chance=_SHARP_CHANCE if sharp else _CHANCE, loose=_LOOSE, left=_LEFT, elsewhere=_elsewhere(problem))
 
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(

@@ -142,5 +142,9 @@ def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypa
     assert "motion_blur" in strengths["squares"]
     for effect, strength in strengths["squares"].items():
         assert strength == pytest.approx(strengths["fine"][effect], rel=1e-6)
+    seen = {name: dict(zip(plan["effects"], plan["seen_from"], strict=True)) for name, plan in found.items()}
+    # a blur of so many pixels is seen from as many, however they are looked at
+    assert 0.3 < seen["squares"]["misregistration"] / seen["fine"]["misregistration"] < 10.0
+    assert dict(zip(found["fine"]["effects"], found["fine"]["units"], strict=True))["misregistration"] == "px"
     assert "quantisation" in found["squares"]["cannot_be_judged"]
     assert "quantisation" not in found["squares"]["effects"]

@@ -10,10 +10,12 @@ from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
-from raytwin.diagnosis.forward_model import can_displace, can_show, can_stand_out
+from raytwin.diagnosis.diagnose import _elsewhere
+from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
 from raytwin.diagnosis.nuisances import Nuisances
+from raytwin.diagnosis.placing import ALONG_ROWS
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.veto import leaves_too_much, misfit_of
@@ -260,8 +262,25 @@ def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_elect
     }
 
 
-def test_only_what_changes_pixels_one_by_one_makes_them_stand_out():
-    assert {effect for effect in EFFECTS if can_stand_out(effect)} == {"bad_pixels", "gain_map_error"}
+def test_what_an_effect_cannot_move_whatever_its_law_goes_by_series_and_by_statistic():
+    flat = SeriesRequest(kind="flat", setting=None, frames=5, exposure_ms=50.0)
+    requests = [replace(flat, kind=kind) for kind in ("dark", "flat", "object")]
+    statistics = ("mean frame", "outliers", "outliers in any series", ALONG_ROWS)
+    effects = ("image_lag", "bad_pixels", "gain_map_error", "object_scatter", "kv_error")
+    session = SimpleNamespace(
+        names=[SimpleNamespace(statistic=statistic) for _ in requests for statistic in statistics],
+        views=[SimpleNamespace(session=SimpleNamespace(request=request)) for request in requests],
+        series_of=np.repeat(np.arange(3), len(statistics)),
+        variants=[SimpleNamespace(effect=effect) for effect in effects],
+    )
+    found = {effect: part.reshape(3, len(statistics)) for effect, part in _elsewhere(session).items()}
+    # ghosts lie in all series, but neither make pixels stand out of their neighbours nor move a scene
+    assert found["image_lag"].tolist() == 3 * [[False, True, True, True]]
+    assert found["bad_pixels"].tolist() == 3 * [[False, False, False, True]]
+    assert not found["gain_map_error"][:, 1:3].any()
+    # scatter comes from objects, which it can seem to move; a beam does nothing to a dark
+    assert found["object_scatter"].tolist() == [4 * [True], 4 * [True], [False, True, True, False]]
+    assert found["kv_error"].tolist() == [4 * [True], *(2 * [[False, True, True, True]])]
 
 
 def explanation(effect="veiling_glare", strength=10.0):

@@ -241,6 +241,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     from ..diagnosis.plan import distinguishability, table_text
     from ..diagnosis.preparation import mislabelled, prepare_session
     from ..files import whole_file
+    from ..generator.effects import EFFECTS
 
     with _opened(arguments) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
@@ -262,6 +263,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     data = {
         "effects": list(found.effects),
         "since": list(found.since),
+        "units": [EFFECTS[effect].strength.unit for effect in found.effects],
         "strengths": found.strengths.tolist(),
         "from_none": found.from_none.tolist(),
         "seen_from": [value if math.isfinite(value) else None for value in found.seen_from.tolist()],

@@ -38,10 +38,9 @@ def new_outliers(
         if item.series.kind not in ("dark", "flat"):
             continue
         look = looks[item.name]
-        residual = look.mean_DN - maps.darks.under(item)
+        residual = maps.corrected(item, look.mean_DN)
         if item.series.kind == "flat":
             signal = signal_map(expected[item.name], shape)
-            residual = maps.over_gain(residual)
             residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
         residual = residual - smooth_part(residual, good)
         centre = float(np.median(residual[good]))
@@ -78,7 +77,7 @@ def _out_in_every_object(
             continue
         times = np.zeros(good.shape)
         for item in members:
-            measured = maps.over_gain(looks[item.name].mean_DN - maps.darks.under(item))
+            measured = maps.corrected(item, looks[item.name].mean_DN)
             residual = measured - full_size(expected[item.name].signal_DN, good.shape)
             residual = residual - median_filter(residual, size=5, mode="nearest")
             times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)

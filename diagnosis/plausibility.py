@@ -303,7 +303,9 @@ def _lit_darks(darks: Sequence[_Reading], lit: Sequence[_Reading], good: NDArray
         return []
     levels = [float(np.median(item.mean_DN[good])) for item in darks]
     lowest = min(levels)
-    weakest = min(float(np.median(item.mean_DN[good])) for item in lit if item.series.kind == "flat" or len(lit) < 3)
+    beams = [float(np.median(item.mean_DN[good])) for item in lit if item.series.kind == "flat" or len(lit) < 3]
+    # without flats the thinnest object stands for them
+    weakest = min(beams) if beams else max(float(np.median(item.mean_DN[good])) for item in lit)
     found = []
     for item, level in zip(darks, levels, strict=True):
         rest = [one for one, other in zip(levels, darks, strict=True) if other is not item]

@@ -150,9 +150,11 @@ def test_an_edge_that_a_picture_left_is_no_outlier_and_defects_beside_and_on_it_
     ) == np.count_nonzero(defects)
 
 
-def test_pixels_that_stand_out_before_every_object_are_the_panels_own():
+@pytest.mark.parametrize("divided", [False, True])
+def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
     rng = np.random.default_rng(5)
     signal = np.full(SHAPE, 3000.0)
+    gain = rng.uniform(0.5, 1.5, SHAPE)  # of pixels; frames that were divided by it show nothing of it
     dead, hot = (20, 30), (50, 90)
     kept, looks, expected = [], {}, {}
     for number in range(5):
@@ -164,13 +166,20 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own():
             picture[dead] = 0.0
             picture[hot] += 5.0 * exposure_ms  # stands out of the longer exposure alone
             name = f"product{number}_{exposure_ms:g}ms"
-            series = SimpleNamespace(kind="object", scene=f"product{number}", kV=60.0, exposure_ms=exposure_ms)
-            kept.append(SimpleNamespace(name=name, series=series, calibrates=False))
-            looks[name] = SimpleNamespace(mean_DN=picture)
+            series = SimpleNamespace(
+                kind="object",
+                scene=f"product{number}",
+                kV=60.0,
+                exposure_ms=exposure_ms,
+                corrected=frozenset(("offset", "gain") if divided else ()),
+            )
+            request = SimpleNamespace(beam_on=True)
+            kept.append(SimpleNamespace(name=name, series=series, request=request, calibrates=False))
+            looks[name] = SimpleNamespace(mean_DN=picture if divided else picture * gain)
             expected[name] = SimpleNamespace(signal_DN=drawn)
     maps = CalibratedMaps(
         darks=SimpleNamespace(under=lambda item: np.zeros(SHAPE)),
-        gain=np.ones(SHAPE),
+        gain=gain,
         shares={},
         gain_quantum=0.0,
         gain_white=0.0,

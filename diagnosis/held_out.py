@@ -1,6 +1,7 @@
 """How much of the gap an explanation leaves on series that its fit did not see."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .assemble import Problem
+from .assemble import Problem, SeriesView
 from .curves import Curve
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
@@ -37,14 +38,37 @@ class Gap:
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
-    """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage."""
-    counts: dict[tuple[Any, ...], int] = {}
+    """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage.
+
+    Where that would leave one fold a single exposure of a voltage and the other fold another one (objects measured at two
+    exposures by turns), series of equal exposure alternate: no level tells what exposures do unless both are there.
+    """
+    beams = [_beam(view) for view in problem.views]
+    folds = _alternating(beams)
+    seen: dict[float | None, tuple[set[float | None], set[float | None]]] = {}
+    for view, fold in zip(problem.views, folds, strict=True):
+        if view.session.request.beam_on:
+            seen.setdefault(view.session.series.kV, (set(), set()))[fold].add(view.session.series.exposure_ms)
+    if not any(len(one) == len(other) == 1 and one != other for one, other in seen.values()):
+        return folds
+    exposed = [(*beam, view.session.series.exposure_ms) for beam, view in zip(beams, problem.views, strict=True)]
+    repeated = Counter(exposed)
+    return _alternating([key if repeated[key] > 1 else beam for beam, key in zip(beams, exposed, strict=True)])
+
+
+def _beam(view: SeriesView) -> tuple[Any, ...]:
+    """Kind, sort of object and tube voltage of a series."""
+    series = view.session.series
+    return (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
+
+
+def _alternating(keys: Sequence[tuple[Any, ...]]) -> NDArray[np.intp]:
+    """0, 1, 0 ... among equal keys (key,)."""
+    counts: Counter[tuple[Any, ...]] = Counter()
     folds = []
-    for view in problem.views:
-        series = view.session.series
-        key = (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
-        counts[key] = counts.get(key, -1) + 1
+    for key in keys:
         folds.append(counts[key] % 2)
+        counts[key] += 1
     return np.array(folds, dtype=np.intp)
 
 

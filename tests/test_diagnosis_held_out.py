@@ -1,0 +1,48 @@
+"""Series that a fit does not see, and what is left of the gap there."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from raytwin.diagnosis.held_out import folds_of
+
+
+def problem(*rows):
+    """(kind, sort of object, kV, exposure) of each series, in order of time."""
+    views = [
+        SimpleNamespace(
+            session=SimpleNamespace(
+                series=SimpleNamespace(kind=kind, kV=kV, exposure_ms=exposure_ms),
+                request=SimpleNamespace(scene_kind=scene, beam_on=kind in ("flat", "object")),
+            )
+        )
+        for kind, scene, kV, exposure_ms in rows
+    ]
+    return SimpleNamespace(views=views)
+
+
+def products(count, exposures_ms, voltages=(40.0, 90.0)):
+    return [("object", "product", kV, ms) for _ in range(count) for ms in exposures_ms for kV in voltages]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_objects_measured_at_two_exposures_by_turns_leave_both_exposures_in_either_half(count):
+    rows = products(count, (25.0, 100.0))
+    folds = folds_of(problem(*rows))
+    for fold in (0, 1):
+        seen = {(kV, ms) for (_, _, kV, ms), own in zip(rows, folds, strict=True) if own == fold}
+        assert seen == {(kV, ms) for kV in (40.0, 90.0) for ms in (25.0, 100.0)}
+
+
+def test_a_beam_of_several_exposures_alternates_in_time():
+    flats = [("flat", None, kV, ms) for kV in (40.0, 90.0) for ms in (10.0, 25.0, 50.0, 75.0, 100.0)]
+    folds = folds_of(problem(*flats, *products(2, (25.0, 100.0))))
+    np.testing.assert_array_equal(folds[:10], [0, 1, 0, 1, 0] * 2)
+    np.testing.assert_array_equal(folds[10:], [0, 0, 1, 1] * 2)
+
+
+def test_an_exposure_that_occurs_once_alternates_with_the_others_of_its_kind():
+    once = [("flat", None, 60.0, 20.0), ("flat", None, 60.0, 80.0)]
+    np.testing.assert_array_equal(folds_of(problem(*once)), [0, 1])
+    np.testing.assert_array_equal(folds_of(problem(*once, *once)), [0, 0, 1, 1])

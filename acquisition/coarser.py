@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .acquisition_io import AcquisitionFile, Scene, Series
+from .log_images import logarithm_of_share, transmitted_share
 
 
 def coarser(acquisition: AcquisitionFile, factor: int) -> AcquisitionFile:
@@ -84,10 +85,16 @@ class _MeanFrames:
                 kept = np.memmap(file, dtype=np.float32, mode="w+", shape=self.shape)
             start = 0
             for piece in self._series.iter_frames():
-                kept[start : start + len(piece)] = means_of_squares(piece, self._factor)
+                kept[start : start + len(piece)] = self._means(piece)
                 start += len(piece)
             self._kept = kept
         return np.array(self._kept[part])
+
+    def _means(self, frames: NDArray[Any]) -> NDArray[np.float32]:
+        if "log" in self._series.corrected:
+            # light adds up, not its logarithm
+            return logarithm_of_share(means_of_squares(transmitted_share(frames), self._factor))
+        return means_of_squares(frames, self._factor)
 
 
 def _coarser_scene(scene: Scene, factor: int) -> Scene:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.log_images import light_of_log
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
 from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions
@@ -248,13 +249,21 @@ def _seen_series(
         )
     tell("frames")
     return look_at_all(
-        [item for item in stated if item.name in expected],
+        [_as_light(item, model) for item in stated if item.name in expected],
         expected,
         good=good,
         bits=acquisition.instrument.bits,
         skipped=skipped,
         tell=tell,
     )
+
+
+def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
+    """Logarithms as light, of the open field that the base twin expects."""
+    if "log" not in item.series.corrected:
+        return item
+    opened = model.expect(replace(item.request, kind="flat", thickness_mm=None, scene_kind=None))
+    return replace(item, series=light_of_log(item.series, float(np.mean(opened.signal_DN))))
 
 
 def _thicker_scenes(series: Sequence[SeriesModel]) -> dict[tuple[str, str], dict[str, NDArray[np.floating]]]:

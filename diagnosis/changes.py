@@ -125,6 +125,8 @@ READ_NOISE_SD = 0.005
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
 TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
 TILT_SD = 0.0005  # of the field's gradient between series
+# of level and gradient where frames were divided by an open field of another time: output, kV, filters and heel may differ
+DIVIDED_LEVEL_SD, DIVIDED_TILT_SD = 0.3, 0.1
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
 UNEVEN = frozenset(("dark_drift", "heel"))
 UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel

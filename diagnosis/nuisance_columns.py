@@ -109,12 +109,17 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
     rows, columns = signal.shape
     y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
     x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
-    return {
+    images: _Images = {
         f"level of {_beam(item)}": scales.LEVEL_OF_BEAM_SD * signal,
         level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
         f"tilt x of {item.name}": scales.TILT_SD * x * signal,
         f"tilt y of {item.name}": scales.TILT_SD * y * signal,
     }
+    if item.divided:
+        images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
+        images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal
+        images[f"open field of {item.name}, y"] = scales.DIVIDED_TILT_SD * y * signal
+    return images
 
 
 def level_of(item: SessionSeries) -> str:

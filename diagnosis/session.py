@@ -21,6 +21,7 @@ class SessionSeries:
     """One series and its part: `calibrates` (dark and gain maps come from it), `after` (later than the calibration).
 
     own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
+    divided: its frames were divided by an open field measured elsewhere, so that their level says nothing.
     """
 
     series: Series
@@ -28,6 +29,7 @@ class SessionSeries:
     calibrates: bool
     after: bool
     own_noise: bool = False
+    divided: bool = False
 
     @property
     def name(self) -> str:
@@ -109,7 +111,6 @@ def measured_levels(series: Sequence[Series]) -> dict[str, float]:
         if item.kind in ("flat", "object")
         and item.exposure_ms
         and (item.setting is None or item.setting.tube_load_mAs is None)
-        and "log" not in item.corrected
     ]
     if not unknown:
         return {}
@@ -127,7 +128,8 @@ def measured_levels(series: Sequence[Series]) -> dict[str, float]:
         members = [item for item in unknown if beam(item) == key]
         levels: dict[str, float] = {}
         for item in members:
-            if item.kind != "flat" or not (darks or "offset" in item.corrected):
+            measurable = item.kind == "flat" and "log" not in item.corrected
+            if not measurable or not (darks or "offset" in item.corrected):
                 continue
             dark = 0.0
             if "offset" not in item.corrected:
@@ -231,6 +233,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
                 calibrates=calibrates,
                 after=after,
                 own_noise=item.kind != "dark" and beam_of(item) in noiseless,
+                divided=bool(item.corrected & {"gain", "log"}),
             )
         )
     return tuple(result)

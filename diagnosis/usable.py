@@ -63,12 +63,10 @@ def stated_series(
 
 def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
     series = item.series
-    if "log" in series.corrected:
-        return "log images: counts are needed"
-    if series.kind == "dark":
-        return "" if series.exposure_ms is not None else "exposure unknown"
-    if series.kind == "afterglow":
-        return ""
+    if series.kind in ("dark", "afterglow"):
+        if "log" in series.corrected:
+            return f"logarithms of a series of kind {series.kind}"
+        return "exposure unknown" if series.kind == "dark" and series.exposure_ms is None else ""
     load_stated = series.setting is not None and series.setting.tube_load_mAs is not None
     if not load_stated and item.request.open_signal_DN is None:
         return "kV, exposure or tube load unknown"

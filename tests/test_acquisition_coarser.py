@@ -69,3 +69,21 @@ def test_a_factor_that_leaves_no_pixel_is_refused(session):
         for factor in (0, 24):
             with pytest.raises(InputError, match="from 1 to 23"):
                 coarser(acquisition, factor)
+
+
+def test_light_of_log_images_is_averaged_not_its_logarithm(session, tmp_path):
+    frames = session[1]
+    share = (frames[:2] + 1.0) / 65_536.0  # from opaque to open within a square
+    with write_acquisition(tmp_path / "logs.h5", instrument=Instrument(pixel_mm=0.15)) as writer:
+        setting = setting_from_text("kv=60,power_w=20,exposure_ms=50")
+        writer.add_series(
+            "logs",
+            kind="object",
+            setting=setting,
+            frames=-np.log(share).astype(np.float32),
+            corrected=("offset", "gain", "log"),
+        )
+    with open_acquisition(tmp_path / "logs.h5") as acquisition:
+        small = coarser(acquisition, 3).series[0].read_frames()
+    expected = share[:, 1:22, :30].reshape(2, 7, 3, 10, 3).mean(axis=(2, 4))
+    np.testing.assert_allclose(np.exp(-small), expected, rtol=1e-5)

@@ -79,6 +79,27 @@ def averages(file):
         node.attrs["averaged"] = count
 
 
+def divided(line, *, logarithms):
+    """Products of a session as -log(I/I0) or, times what the open field had, as I/I0; nothing else of it."""
+
+    def change(file):
+        with h5py.File(line / "session.h5", "r") as session:
+            means = {name: node["frames"][:].mean(axis=0) for name, node in session["series"].items()}
+        for name, node in list(file["series"].items()):
+            if node.attrs["kind"] != "object":
+                del file["series"][name]
+                continue
+            kV, exposure = name.split("_")[1:3]
+            dark = means[f"dark_{exposure}"]
+            flat = means[f"flat_{kV}_{exposure}_Cu0.05"] - dark
+            share = np.maximum(node["frames"][:] - dark, 1.0) / np.maximum(flat, 1.0)
+            del node["frames"]
+            node["frames"] = (-np.log(share) if logarithms else share * np.median(flat)).astype(np.float32)
+            node.attrs["corrected"] = "offset+gain+log" if logarithms else "offset+gain"
+
+    return change
+
+
 def untested(answer):
     return {item["effect"] for item in answer["not_tested"]}
 
@@ -115,6 +136,70 @@ def test_single_frames_with_a_twin_are_judged_and_lines_seen_as_they_stand_in_on
     # an output that wanders shows in levels, noise of lines in the flats that the maps do not hold
     assert not {"output_drift", "row_noise"} & untested(answer)
     assert "composition_error" in untested(answer)
+
+
+def test_images_divided_by_their_open_field_are_compared_alike_as_light_and_as_logarithms(diagnosed, line):
+    words = ("--twin", str(line / "twin.h5"))
+    answers = []
+    for logarithms in (True, False):
+        code, answer, lines = diagnosed(divided(line, logarithms=logarithms), *words)
+        assert code == 0
+        assert not lines
+        assert answer["verdict"] == "no_gap"
+        # what divides out of such images cannot be judged by them
+        assert {"output_drift", "filtration_error", "row_noise"} <= untested(answer)
+        assert "mtf_tail" not in untested(answer)
+        answers.append(answer)
+    first, second = answers
+    assert first["gap"]["before"] == pytest.approx(second["gap"]["before"], rel=0.02)
+    assert first["probability_no_gap"] == pytest.approx(second["probability_no_gap"], abs=0.02)
+
+
+def test_objects_and_darks_without_flats_are_judged_with_a_twin(diagnosed, line):
+    code, answer, lines = diagnosed(only("dark", "object"), "--twin", str(line / "twin.h5"))
+    assert code == 0
+    assert not lines
+    assert answer["verdict"] == "no_gap"
+    assert not {"row_noise", "object_scatter"} & untested(answer)
+
+
+def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
+    session = tmp_path / "bent.h5"
+    words = [
+        "--protocol",
+        "full",
+        "--only",
+        "product",
+        "--seed",
+        "31",
+        "--session",
+        "1",
+        "--size",
+        "48",
+        "--frames",
+        "10",
+    ]
+    assert main(["lab", "-o", str(session), *words, "--effect", "nonlinearity=3@always"]) == 0
+    capsys.readouterr()
+    words = ["--twin", str(line / "twin.h5"), "--json"]
+    assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), *words]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"] == "explained"
+    # each half of the series held both exposures: what one shows of the bend the other one has too
+    assert [cause["effect"] for cause in answer["causes"] if cause["probability"] > 0.6] == ["nonlinearity"]
+    strength = answer["causes"][0]["parameters"]["strength"]
+    assert strength["low"] < 3.0 < strength["high"]
+
+
+def test_a_dark_with_the_beam_on_is_found_among_objects_without_flats(diagnosed, line):
+    def change(file):
+        only("dark", "object")(file)
+        frames = file["series"]["dark_25ms_2"]["frames"]
+        frames[...] = frames[:] + 3000
+
+    code, answer, _ = diagnosed(change, "--twin", str(line / "twin.h5"))
+    assert code == 0
+    assert answer["mislabelled"][0]["series"] == ["dark_25ms_2"]
 
 
 def test_averaged_frames_of_darks_are_as_quiet_as_their_number_says(line, tmp_path):

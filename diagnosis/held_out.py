@@ -40,36 +40,47 @@ class Gap:
 def folds_of(problem: Problem) -> NDArray[np.intp]:
     """Fold 0 or 1 of each series: alternating in time within each kind, sort of object and tube voltage.
 
-    Where that would leave one fold a single exposure of a voltage and the other fold another one (objects measured at two
-    exposures by turns), series of equal exposure alternate: no level tells what exposures do unless both are there.
+    Where that would leave one fold a single exposure of a voltage and the other fold another one (series at two exposures taken
+    by turns), each goes where there are fewer of its exposure and of those that calibrate as it does: no level tells what
+    exposures do, and no gain map what has changed, unless both are there.
     """
-    beams = [_beam(view) for view in problem.views]
-    folds = _alternating(beams)
+    folds = [0] * len(problem.views)
+    beams: Counter[tuple[Any, ...]] = Counter()
     seen: dict[float | None, tuple[set[float | None], set[float | None]]] = {}
-    for view, fold in zip(problem.views, folds, strict=True):
+    for number, view in enumerate(problem.views):
+        beam, series = _beam(view), view.session.series
+        folds[number] = beams[beam] % 2
+        beams[beam] += 1
         if view.session.request.beam_on:
-            seen.setdefault(view.session.series.kV, (set(), set()))[fold].add(view.session.series.exposure_ms)
-    if not any(len(one) == len(other) == 1 and one != other for one, other in seen.values()):
-        return folds
-    exposed = [(*beam, view.session.series.exposure_ms) for beam, view in zip(beams, problem.views, strict=True)]
-    repeated = Counter(exposed)
-    return _alternating([key if repeated[key] > 1 else beam for beam, key in zip(beams, exposed, strict=True)])
+            seen.setdefault(series.kV, (set(), set()))[folds[number]].add(series.exposure_ms)
+    if any(len(one) == len(other) == 1 and one != other for one, other in seen.values()):
+        folds = _balanced(problem)
+    return np.array(folds, dtype=np.intp)
+
+
+def _balanced(problem: Problem) -> list[int]:
+    """Folds as even as in time, and in each sort of series as even in exposures and calibrating ones as they can be."""
+    counts: Counter[tuple[Any, ...]] = Counter()
+    folds = []
+    for view in problem.views:
+        beam = _beam(view)
+        alike = [(*beam, "exposure", view.session.series.exposure_ms), (*beam, "calibrates", view.session.calibrates)]
+
+        def crowded(
+            fold: int, beam: tuple[Any, ...] = beam, alike: list[tuple[Any, ...]] = alike
+        ) -> tuple[int, int, int]:
+            return counts[fold, *beam], sum(counts[fold, *key] for key in alike), fold
+
+        fold = min((0, 1), key=crowded)
+        counts.update((fold, *key) for key in (beam, *alike))
+        folds.append(fold)
+    return folds
 
 
 def _beam(view: SeriesView) -> tuple[Any, ...]:
     """Kind, sort of object and tube voltage of a series."""
     series = view.session.series
     return (series.kind, view.session.request.scene_kind, series.kV if series.kind != "dark" else None)
-
-
-def _alternating(keys: Sequence[tuple[Any, ...]]) -> NDArray[np.intp]:
-    """0, 1, 0 ... among equal keys (key,)."""
-    counts: Counter[tuple[Any, ...]] = Counter()
-    folds = []
-    for key in keys:
-        folds.append(counts[key] % 2)
-        counts[key] += 1
-    return np.array(folds, dtype=np.intp)
 
 
 def left_over(

@@ -8,16 +8,17 @@ import pytest
 from raytwin.diagnosis.held_out import folds_of
 
 
-def problem(*rows):
-    """(kind, sort of object, kV, exposure) of each series, in order of time."""
+def problem(*rows, calibrating=0):
+    """(kind, sort of object, kV, exposure) of each series, in order of time; the first ones calibrate."""
     views = [
         SimpleNamespace(
             session=SimpleNamespace(
                 series=SimpleNamespace(kind=kind, kV=kV, exposure_ms=exposure_ms),
                 request=SimpleNamespace(scene_kind=scene, beam_on=kind in ("flat", "object")),
+                calibrates=number < calibrating,
             )
         )
-        for kind, scene, kV, exposure_ms in rows
+        for number, (kind, scene, kV, exposure_ms) in enumerate(rows)
     ]
     return SimpleNamespace(views=views)
 
@@ -42,7 +43,13 @@ def test_a_beam_of_several_exposures_alternates_in_time():
     np.testing.assert_array_equal(folds[10:], [0, 0, 1, 1] * 2)
 
 
-def test_an_exposure_that_occurs_once_alternates_with_the_others_of_its_kind():
+def test_either_half_has_calibrating_and_later_flats_of_both_exposures():
+    once = [("flat", None, kV, ms) for kV in (40.0, 90.0) for ms in (20.0, 80.0)]
+    folds = folds_of(problem(*once, *once, *products(2, (20.0, 80.0)), calibrating=4))
+    np.testing.assert_array_equal(folds[:8], [0, 1, 0, 1, 1, 0, 1, 0])
+    assert np.count_nonzero(folds[8:]) == 4
+
+
+def test_two_exposures_that_occur_once_are_one_in_either_half():
     once = [("flat", None, 60.0, 20.0), ("flat", None, 60.0, 80.0)]
     np.testing.assert_array_equal(folds_of(problem(*once)), [0, 1])
-    np.testing.assert_array_equal(folds_of(problem(*once, *once)), [0, 0, 1, 1])

@@ -12,7 +12,7 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..acquisition.log_images import light_of_log
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
-from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions
+from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions, with_conditions
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
@@ -21,6 +21,8 @@ from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
 from .forward_model import Change, ForwardModel, draft_cache, strength_rows
+from .known_effects import lasting
+from .known_laws import beside_known, without_each
 from .nuisance_columns import Columns
 from .placing import place_scenes
 from .probes import ProbeName, expected_scalars
@@ -133,7 +135,7 @@ def build_problem(
 
     Args:
         acquisition: open file.
-        twin: calibrated from this session's calibrating series, or from another session.
+        twin: calibrated from this session's calibrating series, or from another session; effects that it has are no gap.
         variants: effects to try.
         calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
             marked as calibrating).
@@ -146,8 +148,9 @@ def build_problem(
     tell = progress or (lambda stage: None)
     session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere)
     requests = [item.request for item in session]
-    base, cache = smooth_twin(twin), draft_cache()
     conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
+    known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
+    base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     conditions |= beam_conditions(base, requests, cache=cache)
     model = ForwardModel(base=base, conditions=conditions, cache=cache)
     measured = _measured(session, acquisition, twin, model, tell=tell)
@@ -155,10 +158,12 @@ def build_problem(
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
     changes += [Change.of_twin(step) for step in twin_changes(model.base)]
+    changes += without_each(model.base)
     unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
     compared = _Compared(
         measured=measured,
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
+        known=len(model.base.effects),
         variants=tuple(variants),
         thicker=_thicker_scenes(expected.series),
         side=side,
@@ -298,12 +303,13 @@ class _Part:
 class _Compared:
     """A session and the changes that every series of it is asked with.
 
-    Fields: measured; asked: changes, those of variants' strengths first; variants; thicker: see `_thicker_scenes`; side: of the
-    squares of the panel's pixels that stand for pixels.
+    Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; known: number of
+    these; variants; thicker: see `_thicker_scenes`; side: of the squares of the panel's pixels that stand for pixels.
     """
 
     measured: _Measured
     asked: tuple[Asked, ...]
+    known: int
     variants: tuple[Variant, ...]
     thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
     side: int
@@ -381,7 +387,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     )
     places, place_names = _numbered([f"{axis} of {series.kind} {series.scene}".strip() for axis, series in of_probes])
     sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
-    return Problem(
+    problem = Problem(
         residual=np.concatenate([block.residual for block in blocks]),
         factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(names), 0)),
         factor_names=tuple(factors),
@@ -406,6 +412,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         respond=partial(_respond, session, [part.probes for part in parts]),
         side=compared.side,
     )
+    return beside_known(problem, -responses[len(responses) - compared.known :])
 
 
 def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
@@ -425,7 +432,8 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
     columns: Columns = {}
     first = sum(len(variant.strengths) for variant in compared.variants)
-    for item, response in zip(compared.asked[first:], responses[first:], strict=True):
+    last = len(compared.asked) - compared.known
+    for item, response in zip(compared.asked[first:last], responses[first:last], strict=True):
         if not item.failed:
             columns[item.change.label] = response / item.change.step_sd
     start = 0
@@ -501,7 +509,11 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     moved: dict[str, NDArray[np.float64]] = {}
     for view in problem.views:
         changed = expected_series(
-            problem.base, view.session.request, effects=effects, cache=cache, use_measured_level=False
+            problem.base,
+            view.session.request,
+            effects=(*problem.base.effects, *effects),
+            cache=cache,
+            use_measured_level=False,
         )
         moved[view.session.name] = np.asarray(changed.mean_DN) - np.asarray(view.expected.mean_DN)
 

@@ -338,7 +338,7 @@ def smooth_twin(twin: Twin) -> Twin:
     """The twin with all pixels alike: dark, gain and noise at their medians, no bad pixels.
 
     The diagnosis takes pixel patterns from the calibrating series themselves, so that an effect which calibration took in
-    is taken in by the same arithmetic when it is simulated.
+    is taken in by the same arithmetic when it is simulated. Effects that the twin has stay.
     """
     maps = twin.maps
     good = maps.bad_pixels == 0
@@ -358,5 +358,4 @@ def smooth_twin(twin: Twin) -> Twin:
             bad_pixels=np.zeros(maps.shape, np.uint8),
         ),
         levels=tuple(replace(item, flat_shape=flat) for item in twin.levels),
-        effects=(),
     )

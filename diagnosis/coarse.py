@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ..generator.effects import AppliedEffect
 from ..generator.effects.effect import Parameter
 from ..generator.twin import Twin
+from .known_effects import with_found
 
 if TYPE_CHECKING:
     from .diagnose import Diagnosis
@@ -95,7 +96,7 @@ def in_pixels(diagnosis: "Diagnosis", *, twin: Twin, factor: int) -> "Diagnosis"
         diagnosis,
         added=added,
         causes=tuple(causes),
-        twin=replace(twin, effects=(*twin.effects, *added)),
+        twin=replace(twin, effects=with_found(twin.effects, added)),
         not_tested={**diagnosis.not_tested, **UNSEEN},
         notes=(*diagnosis.notes, text),
     )

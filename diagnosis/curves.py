@@ -1,7 +1,7 @@
 """What an effect would do to the probes at any strength: its responses at a few, and how they are joined."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,15 @@ class Curve:
     def response(self, strength: float) -> NDArray[np.float64]:
         """Response (probe,) at one strength."""
         return np.asarray(self.weights(np.array([strength]))[0] @ self.responses)
+
+    def over(self, root: NDArray[np.float64]) -> "Curve":
+        """The curve of probes whose standard deviations are `root` (probe,) times as large."""
+        return replace(
+            self,
+            responses=self.responses / root,
+            spread=None if self.spread is None else self.spread / root[:, None],
+            jitter=None if self.jitter is None else self.jitter / root**2,
+        )
 
 
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:

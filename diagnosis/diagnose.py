@@ -20,6 +20,7 @@ from .curves import Curve
 from .forward_model import can_displace, can_show, can_stand_out
 from .held_out import Gap, held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from .known_effects import already_there, with_found
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
 from .pairs import Doubts
@@ -132,7 +133,8 @@ def diagnose(
     Args:
         acquisition: open acquisition file, anything from two flats with darks to the full protocol; without a given twin,
             frames of more than LARGEST_PIXELS are compared as means of squares of pixels.
-        twin: calibrated elsewhere; absent, the session's own calibrating series make it.
+        twin: calibrated elsewhere; absent, the session's own calibrating series make it. Effects that it has are part of what is
+            expected: the gap is what they leave.
         rng: source of randomness.
         without: effects to leave out of the catalogue.
         priors: probabilities of the kinds of hypothesis before looking.
@@ -142,7 +144,8 @@ def diagnose(
         InputError: nothing in the session can be judged.
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-    left_out = (*without, *(UNSEEN if session.factor > 1 else ()))
+    had = already_there(session.twin.effects)
+    left_out = (*without, *had, *(UNSEEN if session.factor > 1 else ()))
     try:
         problem = build_problem(
             session.acquisition,
@@ -157,7 +160,8 @@ def diagnose(
             raise mislabelled(acquisition, session.suspects) from error
         raise
     result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
-    result = replace(result, warnings=(*session.left_out, *result.warnings))
+    result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
+    result = replace(result, not_tested={**had, **result.not_tested})
     if session.suspects:
         result = _doubted(result, session.twin, session.suspects)
     if session.factor == 1:
@@ -370,7 +374,7 @@ def judge(
         if abs(z[index]) > threshold
     ]
     added = tuple(applied_at_best(problem, leading, effect) for effect in named)
-    improved = replace(twin, effects=(*twin.effects, *added))
+    improved = replace(twin, effects=with_found(twin.effects, added))
     pairs = sorted(
         {
             (min(a, b), max(a, b))

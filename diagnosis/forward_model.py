@@ -41,8 +41,8 @@ def draft_cache() -> ModelCache:
 class Change:
     """A change asked of the forward model.
 
-    Fields: label: effect or nuisance; twin; effects; parameters (parameter,) of the spectrum in place of the best ones; step_sd:
-    size of a nuisance's step in prior standard deviations; spectral: moves lit series alone.
+    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; parameters (parameter,) of the spectrum in
+    place of the best ones; step_sd: size of a nuisance's step in prior standard deviations; spectral: moves lit series alone.
     """
 
     label: str
@@ -152,7 +152,8 @@ def can_stand_out(effect: str) -> bool:
 class ForwardModel:
     """The base twin as the series of a session ask it.
 
-    Fields: base: the twin with all pixels alike; conditions of the session that effects know; cache, filled by asking.
+    Fields: base: the twin with all pixels alike, and the effects that it has; conditions of the session that effects know;
+    cache, filled by asking.
     """
 
     base: Twin
@@ -200,7 +201,7 @@ class ForwardModel:
         return expected_series(
             change.twin,
             request,
-            effects=change.effects,
+            effects=(*change.twin.effects, *change.effects),
             parameters=change.parameters,
             cache=self.cache,
             use_measured_level=False,

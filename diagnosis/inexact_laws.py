@@ -37,13 +37,13 @@ def law_factors(
     if curve.exact is not None:
         response = np.where(curve.exact, 0.0, response)
     if float(np.max(np.abs(response), initial=0.0)) * law_error >= 0.3:
-        parts.append(_group_factors(response, groups, law_error))
+        parts.append(group_factors(response, groups, law_error))
     if curve.spread is not None and float(np.max(np.abs(curve.spread))) * strength >= 0.3:
         parts.append(curve.spread * strength)
     return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
 
 
-def _group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> NDArray[np.float64]:
+def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> NDArray[np.float64]:
     """A column a group: the response there times `sd`; groups in which it would move nothing are left out."""
     power = np.bincount(groups, weights=response**2)
     kept = np.nonzero(sd**2 * power > LEAST_FACTOR)[0]

@@ -175,7 +175,7 @@ def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
 
     def level(one: Setting) -> float:
         request = SeriesRequest(kind="flat", setting=one, frames=1, exposure_ms=one.exposure_ms)
-        return float(np.mean(expected_series(twin, request, effects=(), use_measured_level=False).signal_DN))
+        return float(np.mean(expected_series(twin, request, use_measured_level=False).signal_DN))
 
     try:
         found = _scaled(setting, level(as_) / max(level(setting), 1e-9))
@@ -395,7 +395,7 @@ def _write(
                     setting=request.setting,
                     exposure_ms=None if request.setting is not None else item.exposure_ms,
                     dtype=np.float32,
-                    frames=np.stack(list(sample_series(twin, request, rng=rng, effects=(), use_measured_level=False))),
+                    frames=np.stack(list(sample_series(twin, request, rng=rng, use_measured_level=False))),
                     scene=item.scene,
                     source_object_mm=item.source_object_mm,
                     panel_rotation_deg=item.panel_rotation_deg or None,

@@ -12,17 +12,24 @@ from ..calibration.calibrate import calibrate_twin
 from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
 from .coarse import LEAST_SIDE, coarse_factor
+from .origin import made_of
 from .plausibility import Suspect, check_plausibility
 from .session import calibrating_names
+
+_OF_THIS_SESSION = (
+    "the twin was calibrated from series of this session: the first of each kind and setting, or those whose role says so, count"
+    " as its calibration, and the others are compared with it"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedSession:
     """A session ready for its diagnosis.
 
-    Fields: acquisition (less the series that cannot be used); twin; calibrated_elsewhere (the twin was given); suspects
-    (series whose labels look wrong); left_out (series that are not used, each with the reason); factor (pixels along each
-    side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels).
+    Fields: acquisition (less the series that cannot be used); twin; calibrated_elsewhere (the twin was given, and none of these
+    series is in it); suspects (series whose labels look wrong); left_out (series that are not used, each with the reason);
+    notes (how the session is looked at); factor (pixels along each side of the squares that acquisition and twin have as pixels);
+    all_pixels (the same series with all pixels).
     """
 
     acquisition: AcquisitionFile
@@ -30,6 +37,7 @@ class PreparedSession:
     calibrated_elsewhere: bool
     suspects: tuple[Suspect, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...]
     factor: int
     all_pixels: AcquisitionFile
 
@@ -78,7 +86,8 @@ def prepare_session(
             expected="series with light and noise",
         )
     acquisition = replace(acquisition, series=kept)
-    elsewhere = twin is not None
+    elsewhere = twin is not None and not made_of(twin, kept)
+    notes = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
     suspects = found.suspects
     if twin is None:
         tell("calibration")
@@ -93,6 +102,7 @@ def prepare_session(
         calibrated_elsewhere=elsewhere,
         suspects=suspects,
         left_out=tuple(left_out),
+        notes=notes,
         factor=factor,
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)

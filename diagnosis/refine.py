@@ -182,15 +182,7 @@ class _Seen:
 
     def scaled(self, curve: Curve) -> Curve:
         """A whitened curve in these units."""
-        root = self.root
-        if root is None:
-            return curve
-        return replace(
-            curve,
-            responses=curve.responses / root,
-            spread=None if curve.spread is None else curve.spread / root[:, None],
-            jitter=None if curve.jitter is None else curve.jitter / root**2,
-        )
+        return curve if self.root is None else curve.over(self.root)
 
     def apply(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Responses as asked of the forward model, whitened and in these units."""

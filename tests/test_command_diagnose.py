@@ -41,6 +41,17 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")
     assert "excess_noise" in page
     assert page.count("data:image/png;base64,") == 5
+    # against the improved twin nothing is left, and nothing is added a second time
+    words = ["diagnose", str(sessions / "noisy.h5"), "-o", str(sessions / "again"), "--json"]
+    assert main([*words, "--twin", str(sessions / "noisy" / "twin.h5")]) == 0
+    left = json.loads(capsys.readouterr().out)
+    assert left["verdict"] == "no_gap"
+    # a little less than with the effect fitted: its law may be off
+    assert 0.8 * found["gap"]["after"] < left["gap"]["before"] < 1.02 * found["gap"]["after"]
+    assert (
+        "the twin has it already (6" in {item["effect"]: item["reason"] for item in left["not_tested"]}["excess_noise"]
+    )
+    assert [effect.id for effect in read_twin(sessions / "again" / "twin.h5").effects] == ["excess_noise"]
 
 
 def test_session_without_effect_is_not_explained_by_one(sessions, capsys):

@@ -9,6 +9,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
+from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.twin_io import read_twin
@@ -156,11 +157,49 @@ def test_images_divided_by_their_open_field_are_compared_alike_as_light_and_as_l
 
 
 def test_objects_and_darks_without_flats_are_judged_with_a_twin(diagnosed, line):
-    code, answer, lines = diagnosed(only("dark", "object"), "--twin", str(line / "twin.h5"))
+    code, answer, _ = diagnosed(only("dark", "object"), "--twin", str(line / "twin.h5"))
     assert code == 0
-    assert not lines
     assert answer["verdict"] == "no_gap"
     assert not {"row_noise", "object_scatter"} & untested(answer)
+
+
+def test_a_session_is_compared_with_a_twin_of_its_own_as_without_one(diagnosed, line, tmp_path):
+    shutil.copy(line / "session.h5", tmp_path / "plain.h5")
+    with h5py.File(tmp_path / "plain.h5", "r+") as file:
+        without("role")(file)
+    assert main(["calibrate", str(tmp_path / "plain.h5"), "-o", str(tmp_path / "own.h5")]) == 0
+    code, answer, lines = diagnosed(without("role"), "--twin", str(tmp_path / "own.h5"))
+    assert code == 0
+    # its darks lie closer to the twin's than their noise allows, which had been an unknown effect
+    assert answer["verdict"] == "no_gap"
+    assert [line for line in lines if "calibrated from series of this session" in line] == lines
+
+
+def test_a_twin_knows_the_frames_it_was_made_of(line, tmp_path):
+    twin = read_twin(line / "twin.h5")
+    words = [
+        "--protocol",
+        "short",
+        "--seed",
+        "31",
+        "--size",
+        "48",
+        "--frames",
+        "10",
+        "--products",
+        "1",
+        "--session",
+        "1",
+    ]
+    assert main(["lab", "-o", str(tmp_path / "later.h5"), *words]) == 0
+    with open_acquisition(line / "session.h5") as acquisition:
+        for kind in ("dark", "flat"):
+            assert made_of(twin, acquisition.of_kind(kind))
+        assert not made_of(twin, acquisition.of_kind("object"))
+        # the evaluating ones are not in it
+        assert not made_of(twin, [item for item in acquisition.series if item.role == "evaluation"])
+    with open_acquisition(tmp_path / "later.h5") as acquisition:
+        assert not made_of(twin, acquisition.series)
 
 
 def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):

@@ -238,6 +238,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
     from ..diagnosis.coarse import UNSEEN, pixels_in_square
+    from ..diagnosis.known_effects import already_there
     from ..diagnosis.plan import distinguishability, table_text
     from ..diagnosis.preparation import mislabelled, prepare_session
     from ..files import whole_file
@@ -247,7 +248,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
         if session.suspects:
             raise mislabelled(acquisition, session.suspects)
-        unseen = UNSEEN if session.factor > 1 else {}
+        unseen = {**already_there(session.twin.effects), **(UNSEEN if session.factor > 1 else {})}
         problem = build_problem(
             session.acquisition,
             session.twin,

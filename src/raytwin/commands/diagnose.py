@@ -39,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin diagnose`."""
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file")
     parser.add_argument(
-        "--twin", metavar="TWIN", type=Path, help="twin calibrated before (default: from this session's own series)"
+        "--twin",
+        metavar="TWIN",
+        type=Path,
+        help="twin calibrated before, whose effects are part of what is expected (default: from this session's own series)",
     )
     parser.add_argument(
         "--also",

@@ -1,7 +1,9 @@
 """A session of the virtual lab from calibration to validation: the twin shares no physics with what it measures."""
 
 import json
+import shutil
 
+import h5py
 import numpy as np
 import pytest
 
@@ -95,6 +97,23 @@ def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, ca
     assert predicted["mean_DN"]["value"] == pytest.approx(row["mean_DN"]["value"])
     # the row's interval holds the measured series' own noise too
     assert row["mean_DN"]["high"] - row["mean_DN"]["low"] > predicted["mean_DN"]["high"] - predicted["mean_DN"]["low"]
+
+
+def test_a_fit_is_not_taken_for_a_prediction(session, tmp_path, capsys):
+    plain = tmp_path / "plain.h5"
+    shutil.copy(session["path"], plain)
+    with h5py.File(plain, "r+") as file:
+        for node in file["series"].values():
+            node.attrs.pop("role", None)
+    shown = []
+    for path in (session["path"], plain):
+        assert main(["calibrate", str(path), "-o", str(tmp_path / "twin.h5")]) == 0
+        capsys.readouterr()
+        assert main(["validate", str(tmp_path / "twin.h5"), str(path)]) == 0
+        shown.append(capsys.readouterr().out)
+    flats = sum(line.startswith("kv=") for line in shown[1].splitlines())
+    assert "calibrated this twin" not in shown[0]
+    assert f"{flats} of {flats} series calibrated this twin" in shown[1]
 
 
 def test_no_spectrum_is_computed_once_frames_have_been_read(session, monkeypatch):

@@ -74,6 +74,12 @@ def _text(result: dict[str, Any]) -> str:
     lines = _table(result["rows"]) if result["rows"] else []
     if result["rows"]:
         lines.append(_summary(result))
+        seen = sum(row["used_in_calibration"] for row in result["rows"])
+        if seen:
+            lines.append(
+                f"{seen} of {len(result['rows'])} series calibrated this twin: their errors say how well it fits, not how well it"
+                " predicts (hold series back with role = evaluation, or say --leave-one-out)"
+            )
     if "wedges" in result:
         lines.append(f"{'wedge':<52} {'measured':>9} {'predicted (95 %)':>28}  inside")
         for row in result["wedges"]["rows"]:

@@ -79,6 +79,17 @@ def select_layer(acquisition: AcquisitionFile, layer: str) -> AcquisitionFile:
     return replace(acquisition, instrument=instrument, series=chosen)
 
 
+def one_layer(acquisition: AcquisitionFile, layer: str | None = None) -> AcquisitionFile:
+    """The series of the layer that is asked for; None: of the front one where there are several, else all as they are.
+
+    Raises:
+        InputError: as `select_layer`.
+    """
+    if layer is None and all(item.layer != "back" for item in acquisition.series):
+        return acquisition
+    return select_layer(acquisition, layer or "front")
+
+
 def _free(name: str, number: int, taken: set[str] | dict[str, Scene]) -> str:
     return f"{number + 1}.{name}" if name in taken else name
 

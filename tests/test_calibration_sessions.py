@@ -7,7 +7,7 @@ import pytest
 
 from raytwin.acquisition import Filter, Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
-from raytwin.acquisition.sessions import merge_sessions, select_layer
+from raytwin.acquisition.sessions import merge_sessions, one_layer, select_layer
 from raytwin.calibration.calibrate import bad_pixel_counts
 from raytwin.calibration.noise_covariance import compute_noise_covariance
 from raytwin.calibration.photon_transfer import cluster_evidence, compute_photon_transfer
@@ -228,9 +228,13 @@ def test_a_layer_has_its_own_series_and_sees_what_lies_before_it(tmp_path):
         assert back.instrument.scintillator == PANEL.back_scintillator
         assert back.instrument.detector_cover == (*PANEL.scintillator, *PANEL.interlayer)
         assert select_layer(acquisition, "front").instrument == PANEL
+        assert [item.name for item in one_layer(acquisition).series] == ["dark_front", "flat_front"]
+        assert one_layer(acquisition, "back").instrument == back.instrument
         with pytest.raises(InputError, match="layer: got middle; expected front or back"):
             select_layer(acquisition, "middle")
     plain = session(tmp_path / "plain.h5", seed=1)
+    with open_acquisition(plain) as acquisition:
+        assert one_layer(acquisition) is acquisition
     with (
         open_acquisition(plain) as acquisition,
         pytest.raises(InputError, match="declare the panel's back_scintillator"),

@@ -230,6 +230,26 @@ def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
     assert strength["low"] < 3.0 < strength["high"]
 
 
+def test_the_back_layer_of_a_panel_is_no_mislabelled_front(diagnosed, line, tmp_path):
+    def with_back_layer(file):
+        for name in list(file["series"]):
+            file["series"][name].attrs["layer"] = "front"
+            file.copy(file["series"][name], file["series"], name=f"{name}_back")
+            back = file["series"][f"{name}_back"]
+            back.attrs["layer"] = "back"
+            back["frames"][...] = back["frames"][:] // 3
+
+    code, answer, lines = diagnosed(with_back_layer)
+    assert code == 0
+    assert not lines
+    assert answer["verdict"] == "no_gap"
+    code, _, lines = diagnosed(with_back_layer, "--layer", "back")
+    assert code == 2
+    assert lines == [
+        "raytwin diagnose: error: layer: got back; expected front; declare the panel's back_scintillator to work with its back layer"
+    ]
+
+
 def test_a_dark_with_the_beam_on_is_found_among_objects_without_flats(diagnosed, line):
     def change(file):
         only("dark", "object")(file)

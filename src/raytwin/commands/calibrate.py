@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from .. import __version__
     from ..acquisition import open_acquisition
-    from ..acquisition.sessions import merge_sessions, select_layer
+    from ..acquisition.sessions import merge_sessions, one_layer
     from ..calibration.calibrate import calibrate_twin, calibration_answer
     from ..files import sha256_of_file
     from ..generator.twin_io import write_twin
@@ -78,9 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         spectra.append(spectrum_from_file(file, kV=float(voltage)))
     with ExitStack() as stack:
         opened = [stack.enter_context(open_acquisition(path)) for path in arguments.acquisition]
-        acquisition = merge_sessions(opened)
-        if arguments.layer is not None or any(item.layer == "back" for item in acquisition.series):
-            acquisition = select_layer(acquisition, arguments.layer or "front")
+        acquisition = one_layer(merge_sessions(opened), arguments.layer)
         twin = calibrate_twin(
             acquisition,
             rng=np.random.default_rng(arguments.seed),

@@ -52,6 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="what was measured later on the same line, such as the answer's next measurement; calibrates nothing; repeatable",
     )
+    parser.add_argument(
+        "--layer",
+        choices=("front", "back"),
+        help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
+    )
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, required=True, help="folder of the answer")
     parser.add_argument(
         "--without", metavar="ID", action="append", default=[], help="leave an effect out of the catalogue; repeatable"
@@ -163,12 +168,12 @@ def _diagnose(arguments: argparse.Namespace, twin: "Twin | None") -> int:
 def _opened(arguments: argparse.Namespace) -> "AcquisitionFile":
     """The session, with what was measured later behind it in time."""
     from ..acquisition import open_acquisition
-    from ..acquisition.sessions import merge_sessions
+    from ..acquisition.sessions import merge_sessions, one_layer
 
     first = open_acquisition(arguments.acquisition)
     if not arguments.also:
-        return first
-    merged = merge_sessions([first, *(open_acquisition(path) for path in arguments.also)])
+        return one_layer(first, arguments.layer)
+    merged = one_layer(merge_sessions([first, *(open_acquisition(path) for path in arguments.also)]), arguments.layer)
     series, begins_s, session = [], 0.0, 0
     last_s = 0.0
     for item in merged.series:

@@ -28,6 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("twin", metavar="TWIN", type=twin_file, help=HELP)
     parser.add_argument("acquisition", metavar="ACQ", type=Path, help="acquisition file with flats")
     parser.add_argument(
+        "--layer",
+        choices=("front", "back"),
+        help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
+    )
+    parser.add_argument(
         "--leave-one-out", action="store_true", help="predict each level of the twin from its other levels"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the fits that leave a level out (default 0)")
@@ -43,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..acquisition import open_acquisition
+    from ..acquisition.sessions import one_layer
     from ..calibration.validate import leave_one_out, plot_validation, validate_twin
     from ..generator.twin_io import read_twin
 
@@ -50,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("--plot", received=arguments.plot.name, expected="a name that ends in " + ", ".join(_FORMATS))
     twin = read_twin(arguments.twin)
     with open_acquisition(arguments.acquisition) as acquisition:
-        validation = validate_twin(twin, acquisition)
+        validation = validate_twin(twin, one_layer(acquisition, arguments.layer))
     if arguments.leave_one_out:
         with tqdm(total=len(twin.levels), disable=None, file=sys.stderr, desc="leaving out", unit="level") as bar:
             left_out = leave_one_out(

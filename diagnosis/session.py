@@ -13,6 +13,8 @@ from ..generator.series import SeriesRequest
 
 _REMEMBERED = 3  # series before one's own whose trapped charge may still be there
 _GAP_S = 1.0  # between series whose times are not stated
+# of what the series last, that all of them must span to be on one clock; two that take turns frame by frame span half
+_LEAST_SPAN = 0.4
 _ONE_RATE = 1.25  # largest over smallest level a unit of exposure that one unknown tube load can have
 
 
@@ -152,6 +154,15 @@ def measured_levels(series: Sequence[Series]) -> dict[str, float]:
     return result
 
 
+def _on_one_clock(series: Sequence[Series]) -> bool:
+    """Whether the times of all series can be of one clock: together they last about as long as each by itself."""
+    times = [item.time_s for item in series if item.time_s is not None and len(item.time_s) > 1]
+    if len(times) < 2:
+        return True
+    span = max(float(one[-1]) for one in times) - min(float(one[0]) for one in times)
+    return span > _LEAST_SPAN * sum(float(one[-1] - one[0]) for one in times)
+
+
 def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
@@ -171,7 +182,7 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
     noiseless = frozenset() if calibrated_elsewhere else _noiseless_beams(ordered, calibrating)
     instrument = acquisition.instrument
     levels = measured_levels(ordered)
-    clock = 0.0
+    clock, one_clock = 0.0, _on_one_clock(ordered)
     result: list[SessionSeries] = []
     requests: list[SeriesRequest] = []
     scenes: dict[str, dict[str, NDArray[np.float32]]] = {}
@@ -180,11 +191,12 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
         interval_ms = item.frame_interval_ms
         if interval_ms is None:
             interval_ms = exposure_ms * item.averaged + (instrument.readout_ms or 0.0)
-        if item.time_s is not None and len(item.time_s):
-            start = float(item.time_s[0])
-            if item.frame_interval_ms is None and len(item.time_s) > 1:
-                interval_ms = 1000.0 * float(np.median(np.diff(item.time_s)))
-            clock = float(item.time_s[-1]) + interval_ms / 1000.0
+        times_s = np.zeros(0) if item.time_s is None else item.time_s
+        if item.frame_interval_ms is None and len(times_s) > 1:
+            interval_ms = 1000.0 * float(np.median(np.diff(times_s)))
+        if len(times_s) and one_clock:
+            start = float(times_s[0])
+            clock = float(times_s[-1]) + interval_ms / 1000.0
         else:
             # beam-off frames follow straight after the exposure
             start = clock if item.kind == "afterglow" or not result else clock + _GAP_S

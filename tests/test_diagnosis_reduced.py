@@ -363,6 +363,35 @@ def test_what_a_session_cannot_show_is_listed_with_reasons(diagnosed):
     assert all(item["reason"] for item in answer["not_tested"])
 
 
+def test_times_that_begin_anew_in_every_series_follow_one_after_the_other(line, tmp_path):
+    def starts(path):
+        with open_acquisition(path) as acquisition:
+            return [(item.request.start_s, item.request.frame_interval_ms) for item in read_session(acquisition)]
+
+    own = tmp_path / "own_clocks.h5"
+    shutil.copy(line / "session.h5", own)
+    with h5py.File(own, "r+") as file:
+        for node in file["series"].values():
+            node["time_s"][...] -= node["time_s"][0]
+    (stated_s, stated_ms), (found_s, found_ms) = (np.array(starts(path)).T for path in (line / "session.h5", own))
+    np.testing.assert_allclose(found_ms, stated_ms, rtol=1e-6)
+    assert np.all(np.diff(found_s) > 0.0)
+    # what stands between two series is not known any more
+    np.testing.assert_allclose(found_s, stated_s - stated_s[0], atol=0.5 * stated_s[-1])
+
+
+def test_series_that_take_turns_frame_by_frame_are_on_one_clock(tmp_path):
+    frames = np.full((8, 16, 16), 500, np.uint16)
+    with write_acquisition(tmp_path / "turns.h5") as writer:
+        for number, kV in enumerate((60.0, 90.0)):
+            times_s = 100.0 + number + 2.0 * np.arange(8.0)
+            writer.add_series(
+                f"flat_{kV:g}", kind="flat", frames=frames, kV=kV, current_mA=1.0, exposure_ms=100.0, time_s=times_s
+            )
+    with open_acquisition(tmp_path / "turns.h5") as acquisition:
+        assert [item.request.start_s for item in read_session(acquisition)] == [100.0, 101.0]
+
+
 def test_beam_off_frames_follow_straight_after_the_exposure_where_no_times_are_stated(tmp_path):
     frames = np.full((4, 16, 16), 500, np.uint16)
     with write_acquisition(tmp_path / "timeless.h5") as writer:

@@ -528,7 +528,8 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
     views = tuple(
         SimpleNamespace(
             session=SimpleNamespace(
-                series=SimpleNamespace(kind="flat", scene="", kV=40.0), request=SimpleNamespace(scene_kind=None)
+                series=SimpleNamespace(kind="flat", scene="", kV=40.0, exposure_ms=50.0),
+                request=SimpleNamespace(scene_kind=None, beam_on=True),
             )
         )
         for _ in range(series)

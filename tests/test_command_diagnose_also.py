@@ -31,7 +31,7 @@ def write(path, *, kinds, role="calibration", pixel_mm=0.4):
 def test_later_measurements_come_last_in_time_and_calibrate_nothing(tmp_path):
     first = write(tmp_path / "first.h5", kinds=["dark", "flat"])
     more = write(tmp_path / "more.h5", kinds=["dark", "flat"])
-    with _opened(argparse.Namespace(acquisition=first, also=[more, more])) as found:
+    with _opened(argparse.Namespace(acquisition=first, also=[more, more], layer=None)) as found:
         starts = [float(item.time_s[0]) for item in found.series]
         assert starts == sorted(starts)
         assert starts[2] > 3000.0

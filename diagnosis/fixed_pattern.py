@@ -20,6 +20,7 @@ OUTLIER_SD = 7.0
 _LEAST_BLOCKS, _LEAST_LINES = 8, 16
 _NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
 _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
+_LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
 _ROUNDING_DN2 = 1e-12
 
@@ -149,7 +150,8 @@ def pattern_statistics(
 
 def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: NDArray[np.bool_]) -> float | None:
     """A sixth of the mean square of second differences of the means of rows, DN^2."""
-    use = np.where((clean.mean(axis=1) >= 0.5)[:, None], clean, changed)
+    # a stretch of defects is no line that changed: of that nearly all stands out
+    use = np.where((clean.mean(axis=1) >= _LINE_CLEAN)[:, None], clean, changed)
     seen = use.mean(axis=1) >= 0.5
     means = np.where(use, residual, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
     bent = (means[2:] - 2.0 * means[1:-1] + means[:-2])[seen[2:] & seen[1:-1] & seen[:-2]]

@@ -30,6 +30,8 @@ APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _PAIR_NODES = 13
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
 _PAIRS_IN_FULL = 14  # pairs, the likeliest, either order, for which both laws are taken as inexact
+# times the least that is plausible: of twelve seconds named beside one sealed effect, where they were none, eight lay below that
+_AT_BOTTOM = 1.2
 _BELOW = np.geomspace(0.34, 0.97, 12)  # strengths that are tried below the plausible range, over its lower end
 _WANTS_LESS = 4.5  # log likelihood by which less than is plausible must be better to speak against an effect
 _MOVES = 0.3  # standard deviations of a probe by which an effect is said to move it
@@ -59,13 +61,14 @@ class Doubts:
         chance: log evidence that sessions without it show, beyond what the nuisances allow; taken off.
         loose: effects whose law leaves something where it predicts nothing, and the share of their log evidence, in place of
             PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
-        left: share of its log evidence that what is wrong with its law may give a second one, where it is not PAIR_DOUBT_STRONG.
+        left: share of its log evidence that what is wrong with its law may give a second one, where it is not PAIR_DOUBT_STRONG;
+            by effect and onset.
         elsewhere: probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is not doubted.
     """
 
     chance: Mapping[str, float] = field(default_factory=dict)
     loose: Mapping[str, float] = field(default_factory=dict)
-    left: Mapping[str, float] = field(default_factory=dict)
+    left: Mapping[tuple[str, str], float] = field(default_factory=dict)
     elsewhere: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
@@ -116,7 +119,7 @@ def weigh_pairs(
     overlaps = _overlaps(starts, singles, observed.nuisances, table)
     doubt = _SecondDoubted(observed, singles, doubts)
     ahead = [
-        start.log_evidence - doubt.of(start, overlap, start.log_evidence, start.below)
+        start.log_evidence - doubt.of(start, overlap, start.log_evidence, start.below, start.strengths)
         for start, overlap in zip(starts, overlaps, strict=True)
     ]
     pairs: dict[tuple[str, str], Pair] = {}
@@ -125,7 +128,8 @@ def weigh_pairs(
         found, strengths, variants, below = _finish_pair(
             observed, start, observed.law_errors if rank < _PAIRS_IN_FULL else (), table=table
         )
-        evidence = found - doubt.of(start, overlaps[number], found, below)
+        at = {effect: value for effect, (value, *_) in strengths.items()}
+        evidence = found - doubt.of(start, overlaps[number], found, below, at)
         first, second = sorted(start.effects)
         if (first, second) not in pairs or evidence > pairs[first, second].log_evidence:
             pairs[first, second] = Pair(
@@ -142,7 +146,14 @@ class _SecondDoubted:
         self._doubts = doubts
         self._apart = _Apart(observed)
 
-    def of(self, pair: "_PairStart", overlap: float, evidence: float, below: Mapping[str, float]) -> float:
+    def of(
+        self,
+        pair: "_PairStart",
+        overlap: float,
+        evidence: float,
+        below: Mapping[str, float],
+        strengths: Mapping[str, float],
+    ) -> float:
         """Doubt about a pair.
 
         Args:
@@ -150,15 +161,22 @@ class _SecondDoubted:
             overlap: share of what the weaker one does that lies where the stronger one does as much.
             evidence: log evidence of the pair over none.
             below: how much more likely each effect's strengths below the plausible range are.
+            strengths: of the effects, at their best.
         """
         doubts = self._doubts
         strong, weak = sorted(pair.effects, key=lambda effect: -self._singles[effect].log_evidence)
         stronger = max(self._singles[strong].log_evidence, 0.0)
         doubt = doubts.loose.get(strong, PAIR_DOUBT) * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
-        if strong not in doubts.loose:
+        curves = {curve.effect: curve for curve in (pair.first, pair.second)}
+        # what a law that is nearly right leaves is taken up by whatever can take it, at the least that is plausible
+        at_bottom = strengths[weak] < _AT_BOTTOM * curves[weak].low
+        if strong not in doubts.loose and not at_bottom:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlap
             shared = 1.0 + PAIR_DOUBT_SHARED * overlap**2
-            leaves = doubts.left.get(strong, PAIR_DOUBT_STRONG) * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
+            leaves = (
+                doubts.left.get((strong, curves[strong].since), PAIR_DOUBT_STRONG)
+                * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
+            )
             doubt = min(doubt, PAIR_DOUBT_LEAST + leaves * shared * stronger)
         gain = evidence - self._singles[strong].log_evidence
         if strong in doubts.elsewhere and gain > 0.0:
@@ -233,6 +251,11 @@ class _PairStart:
     def effects(self) -> tuple[str, str]:
         """The two, the first first."""
         return self.first.effect, self.second.effect
+
+    @property
+    def strengths(self) -> dict[str, float]:
+        """Strengths of the highest likelihood, by effect."""
+        return _by_effect(self.first, self.second, self.grid.best)
 
     @property
     def below(self) -> dict[str, float]:

@@ -11,13 +11,19 @@ from ..generator.series import ExpectedSeries, SeriesRequest
 from . import changes as scales
 from .even_maps import full_size, signal_map
 from .probes import Scalar
-from .registration import LARGEST_PX, Placement, register, register_drawn
+from .registration import LARGEST_PX, Placement, left_over, register, register_drawn
 from .session import SessionSeries
 
 ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
+_Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _CLOSER = 0.5  # of the displacement: what a round may add to it
+# an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
+# was found 1.5 px from where it lay, and 0.02 px with a box of 15 px
+_BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
+_GAUSSIANS_PX = (2.0, 3.0, 4.0, 6.0)
+_SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many blurs must leave for others to be tried
 _SEEN_PX = 0.3  # standard deviation below which a displacement is a probe
 
 
@@ -101,7 +107,8 @@ def _placement(
         / item.series.n_frames
         for item in members
     ]
-    found = register(seen, [signal_map(expected[item.name], shape) for item in members], noises, clean)
+    pictured = [signal_map(expected[item.name], shape) for item in members]
+    found = register(seen, pictured, noises, clean)
     if not found.found:
         return None
 
@@ -113,13 +120,67 @@ def _placement(
         found = register_drawn(seen, drawn, noises, clean, found, whole_cells=sharp)
     else:
         # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
+        found, blur = _smeared(members, seen, pictured, noises, clean, found)
         for _ in range(_PLACEMENTS):
-            rest = register(seen, drawn((found.row_px, found.column_px)), noises, clean)
+            rest = register(seen, blur(drawn((found.row_px, found.column_px))), noises, clean)
             if math.hypot(rest.row_px, rest.column_px) > _CLOSER * math.hypot(found.row_px, found.column_px):
                 break  # it leads away: something else is seen than a displacement
             found = replace(rest, row_px=found.row_px + rest.row_px, column_px=found.column_px + rest.column_px)
     # nowhere near its maps: compared as it is, and the gap says so
     return found if math.hypot(found.row_px, found.column_px) <= LARGEST_PX else None
+
+
+def _smeared(
+    members: Sequence[SessionSeries],
+    seen: Sequence[NDArray[np.float64]],
+    pictured: Sequence[NDArray[np.float64]],
+    noises: Sequence[NDArray[np.floating]],
+    clean: NDArray[np.bool_],
+    found: Placement,
+) -> tuple[Placement, _Blur]:
+    """Where a scene lies whose pictures are smeared by more than their slopes show, and the blur that leaves least of them.
+
+    The blur goes along the belt in proportion to the exposure, or to all sides; none, where the least of either leaves no less.
+    """
+    from scipy.ndimage import gaussian_filter, uniform_filter1d
+
+    longest = max(item.request.exposure_ms for item in members)
+    axis = 1 if members[0].request.belt_axis == "column" else 0
+
+    def box(length_px: float) -> _Blur:
+        def blur(pictures: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+            # odd: an even box would move them by half a pixel
+            lengths = [2 * round((length_px * item.request.exposure_ms / longest - 1.0) / 2.0) + 1 for item in members]
+            return [uniform_filter1d(one, max(at, 1), axis=axis) for one, at in zip(pictures, lengths, strict=True)]
+
+        return blur
+
+    def gaussian(sd_px: float) -> _Blur:
+        return lambda pictures: [gaussian_filter(one, sd_px) for one in pictures]
+
+    # smeared, it may be found far from where it lies
+    unmoved = replace(found, row_px=0.0, column_px=0.0)
+    best: tuple[Placement, _Blur, float] = found, _as_it_is, left_over(seen, pictured, clean, found)
+    for make, sizes in ((box, _BOXES_PX), (gaussian, _GAUSSIANS_PX)):
+        here = best[2]
+        tried = [make(size)(pictured) for size in sizes[:_SMEARED_SIZES]]
+        if min(left_over(seen, one, clean, at) for one in tried for at in (found, unmoved)) > _SMEARED * here:
+            continue
+        for size in sizes:
+            blur = make(size)
+            blurred = blur(pictured)
+            placed = register(seen, blurred, noises, clean)
+            rest = left_over(seen, blurred, clean, placed)
+            if rest > here:
+                break
+            here = rest
+            if here < best[2]:
+                best = placed, blur, here
+    return best[0], best[1]
+
+
+def _as_it_is(pictures: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
+    return pictures
 
 
 def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:

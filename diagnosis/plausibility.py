@@ -632,7 +632,15 @@ def _scales_of_map(item: _Reading, maps: _Maps) -> list[float]:
 
 
 def _scaled(scales: Mapping[str, Sequence[float]], placements: Mapping[str, Sequence[_Reading]]) -> list[Suspect]:
-    """Scenes whose path lengths want one and the same factor at every voltage, far from 1."""
+    """Scenes whose path lengths want one and the same factor at every voltage, far from 1.
+
+    Where all scenes at one distance want such a factor and none at another one does, it is no fault of their maps: scatter
+    falls with the gap.
+    """
+    wanted: dict[float | None, list[float]] = {}
+    for scene, values in scales.items():
+        if values:
+            wanted.setdefault(placements[scene][0].series.source_object_mm, []).append(float(np.median(values)))
     found = []
     for scene, values in scales.items():
         members = placements[scene]
@@ -640,7 +648,15 @@ def _scaled(scales: Mapping[str, Sequence[float]], placements: Mapping[str, Sequ
         if len(values) < 4 or len(voltages) < 2 or max(values) - min(values) > _SCALE_AGREES:
             continue
         middle = float(np.median(values))
-        if abs(middle) > _SCALE_OFF:
+        here = members[0].series.source_object_mm
+        like_it = {at: [value / middle > 0.5 for value in group] for at, group in wanted.items()} if middle else {}
+        of_the_gap = (
+            len(like_it.get(here, [])) > 1
+            and all(like_it[here])
+            and len(like_it) > 1
+            and not any(any(group) for at, group in like_it.items() if at != here)
+        )
+        if abs(middle) > _SCALE_OFF and not of_the_gap:
             found.append(
                 Suspect(
                     series=tuple(item.name for item in members),

@@ -251,21 +251,30 @@ def _refined(
     if here is None:
         return None
     strength = here.best
+    slopes: _Slopes | None = None
     for _ in range((_ROUNDS if in_proportion else 2 * _ROUNDS) if inner else 0):
-        steps = _newton(here, best, inner, seen, respond)
-        before, start = here.log_evidence, best.parameters
+        learnt = slopes is not None
+        slopes = slopes or _slopes_at(here, best, inner, seen, respond)
+        steps = _newton(here, best, slopes, seen)
+        before, start, at = here.log_evidence, best.parameters, here
+        taken: dict[str, float] = {}
         for share in shares:
             helped = here.log_evidence > before
             if share != 1.0 and helped == (share < 1.0):
                 continue
             parameters = dict(start)
             for item in inner:
-                parameters[item.name] = _moved(item, start[item.name], share * steps[item.name])
+                parameters[item.name] = _moved(item, start[item.name], share * steps.get(item.name, 0.0))
             candidate = tried(near(parameters, trial))
             if candidate is not None and candidate.log_evidence > here.log_evidence:
                 here, strength = candidate, candidate.best
                 best = replace(best, parameters=parameters)
-        if here.log_evidence - before < max(_ENOUGH, _ENOUGH_SHARE * before):
+                taken = {item.name: _way(item, start[item.name], parameters[item.name]) for item in inner}
+        if here.log_evidence - before >= max(_ENOUGH, _ENOUGH_SHARE * before):
+            slopes = slopes.learnt(at, here, taken)
+        elif learnt:
+            slopes = None
+        else:
             break
     final = near(best.parameters, _NEAR)
     answer = respond([final])
@@ -283,16 +292,38 @@ def _refined(
     return (final, answer[0]) if 0 in answer else None
 
 
-def _newton(
-    here: CurveFit, variant: Variant, inner: Sequence[Parameter], seen: _Seen, respond: Responder
-) -> dict[str, float]:
-    """Steps of the inner parameters, each in half of its range, towards where the probes want them.
+@dataclass(frozen=True, slots=True)
+class _Slopes:
+    """How a response changes with inner parameters: rows (parameter, probe) for each half of a parameter's range, at one strength."""
 
-    Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
-    by _LAW_ERROR, each parameter within about its range.
-    """
-    # a share of photons beyond what is plausible asks for another shape, not for more photons
-    strength = min(max(here.best, variant.low), variant.high)
+    names: tuple[str, ...]
+    rows: NDArray[np.float64]
+    strength: float
+
+    def at(self, strength: float) -> NDArray[np.float64]:
+        """The rows at another strength, to which they are taken to be in proportion."""
+        return self.rows * (strength / self.strength)
+
+    def learnt(self, before: CurveFit, after: CurveFit, step: Mapping[str, float]) -> "_Slopes":
+        """With what a step has shown, along that step.
+
+        Source: Broyden (1965), doi:10.1090/S0025-5718-1965-0198670-6.
+        """
+        strength = after.best
+        taken = np.array([step[name] for name in self.names])
+        rows, length = self.at(strength), float(taken @ taken)
+        if length == 0.0:  # at the ends of their ranges: better by its strength alone
+            return _Slopes(self.names, rows, strength)
+        change = np.asarray(after.curve.response(strength)) - np.asarray(before.curve.response(strength))
+        rows = rows + np.outer(taken, change - taken @ rows) / length
+        return _Slopes(self.names, rows, strength)
+
+
+def _slopes_at(
+    here: CurveFit, variant: Variant, inner: Sequence[Parameter], seen: _Seen, respond: Responder
+) -> _Slopes:
+    """What small steps of the inner parameters do to the response; those that cannot be asked are left out."""
+    strength = _plausible(here, variant)
     at = np.asarray(here.curve.response(strength))
     steps, asked = [], []
     for item in inner:
@@ -301,18 +332,45 @@ def _newton(
         moved = {**variant.parameters, item.name: _moved(item, value, steps[-1])}
         asked.append(replace(variant, parameters=moved, strengths=(strength,)))
     answer = respond(asked)
-    rows = [at] + [(seen.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
-    kept = [inner[number].name for number in sorted(answer)]
+    rows = [(seen.apply(answer[number])[0] - at) / steps[number] for number in sorted(answer)]
+    return _Slopes(
+        tuple(inner[number].name for number in sorted(answer)), np.reshape(rows, (len(rows), at.size)), strength
+    )
+
+
+def _plausible(here: CurveFit, variant: Variant) -> float:
+    """The strength found, within its range: a share of photons beyond it asks for another shape, not for more photons."""
+    return min(max(here.best, variant.low), variant.high)
+
+
+def _newton(here: CurveFit, variant: Variant, slopes: _Slopes, seen: _Seen) -> dict[str, float]:
+    """Steps of the inner parameters, each in half of its range, towards where the probes want them.
+
+    Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
+    by _LAW_ERROR, each parameter within about its range.
+    """
+    strength = _plausible(here, variant)
+    at = np.asarray(here.curve.response(strength))
     found = seen.widened(here.curve, strength)
-    left, slopes, wide = (seen.residual - at) / found.root, np.stack(rows) / found.root, found.nuisances
-    normal = wide.inner(slopes, slopes)
+    left, wide = (seen.residual - at) / found.root, found.nuisances
+    rows = np.concatenate([at[None, :], slopes.at(strength)]) / found.root
+    normal = wide.inner(rows, rows)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12
-    solved = np.linalg.solve(normal, wide.inner(slopes, left[None, :])[:, 0])
+    solved = np.linalg.solve(normal, wide.inner(rows, left[None, :])[:, 0])
     # shortened as a whole: what parameters explain alike must keep its direction
     farthest = float(np.max(np.abs(solved[1:]), initial=0.0))
     solved *= min(1.0, _FARTHEST / max(farthest, 1e-12))
-    return {item.name: 0.0 for item in inner} | {name: float(solved[1 + number]) for number, name in enumerate(kept)}
+    return {name: float(step) for name, step in zip(slopes.names, solved[1:], strict=True)}
+
+
+def _way(item: Parameter, value: float, moved: float) -> float:
+    """The step that moves a parameter's value so far, in halves of its range."""
+    if item.log:
+        return 2.0 * math.log(moved / value) / math.log(item.high / item.low)
+    if item.name.endswith("_deg") and item.high - item.low >= 360.0:
+        return ((moved - value + 180.0) % 360.0 - 180.0) / 180.0
+    return 2.0 * (moved - value) / (item.high - item.low)
 
 
 def _moved(item: Parameter, value: float, step: float) -> float:

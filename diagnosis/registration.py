@@ -163,6 +163,30 @@ def register(
     return _placement(current, covariance)
 
 
+def left_over(
+    measured: Sequence[NDArray[np.floating]],
+    expected: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    placement: Placement,
+) -> float:
+    """Sum of the squares that pictures leave of measured ones at a placement, levels free, each over its highest signal squared.
+
+    Args:
+        measured, expected: signals (row, column), DN, of each series.
+        mask: pixels to use.
+        placement: where the scene is taken to lie.
+    """
+    total = 0.0
+    for image, model in zip(measured, expected, strict=True):
+        picture, level = resample(fill(image, mask), placement)[mask], np.asarray(model, dtype=np.float64)[mask]
+        power = float(level @ level) + 1e-30
+        total += (
+            max(float(picture @ picture) - float(level @ picture) ** 2 / power, 0.0)
+            / max(float(level.max()), 1e-30) ** 2
+        )
+    return total
+
+
 def register_drawn(
     measured: Sequence[NDArray[np.floating]],
     draw: Callable[[tuple[float, float]], Sequence[NDArray[np.floating]]],

@@ -99,6 +99,10 @@ def test_a_line_whose_pixels_all_stand_out_is_a_line_and_a_dead_one_a_defect():
     dead = np.zeros(SHAPE)
     dead[:, 40] = -5000.0
     assert found_in(dead, clean=flagged).columns_DN2 < 1e-6
+    # nor does a stretch of defects over more than half of one
+    stretch = np.zeros(SHAPE)
+    stretch[: int(0.55 * SHAPE[0]), 40] = 0.1 * 5000.0
+    assert found_in(stretch, clean=stretch == 0).columns_DN2 < 1e-6
     # pixels that stand out here and there do not make a line
     scattered = np.zeros(SHAPE)
     scattered[::7, 40] = 400.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis import inference
-from raytwin.diagnosis.curve_fits import fit_curve, interval_of
+from raytwin.diagnosis.curve_fits import CurveFit, fit_curve, interval_of
 from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.diagnose import _strained
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
@@ -20,6 +20,7 @@ from raytwin.diagnosis.pairs import (
     PAIR_DOUBT_ROOT,
     Doubts,
 )
+from raytwin.diagnosis.refine import _Slopes
 from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.veto import DOUBT, with_doubt
 from raytwin.diagnosis.whitening import Whitening
@@ -545,10 +546,48 @@ def test_what_a_law_leaves_is_asked_of_a_second_effect_in_proportion_to_the_firs
     residual = 300.0 * strong + 6.0 * weak + rng.standard_normal(PROBES)
     pair, alone = ("strong", "weak"), ("strong",)
     assert weigh(residual, without, made)[0].effects == pair
-    assert weigh(residual, without, made, doubts={"left": {"strong": 1e-3}})[0].effects == alone
-    assert weigh(residual, without, made, doubts={"left": {"weak": 1e-3}})[0].effects == pair
+    assert weigh(residual, without, made, doubts={"left": {("strong", "always"): 1e-3}})[0].effects == alone
+    assert weigh(residual, without, made, doubts={"left": {("weak", "always"): 1e-3}})[0].effects == pair
     assert weigh(residual, without, made, doubts={"loose": {"strong": 0.02}})[0].effects == alone
     assert weigh(residual, without, made, doubts={"loose": {"weak": 0.02}})[0].effects == pair
     plain = residual + 14.0 * weak
     assert weigh(plain, without, made, doubts={"loose": {"strong": 1e-5}})[0].effects == pair
     assert weigh(plain, without, made, doubts={"loose": {"strong": 0.02}})[0].effects == alone
+
+
+@pytest.mark.parametrize(("low", "named"), [(3.0, True), (4.8, False)])
+def test_a_second_effect_at_the_least_that_is_plausible_must_bring_more_than_a_law_leaves(low, named):
+    rng = np.random.default_rng(33)
+    strong, weak = np.zeros(PROBES), np.zeros(PROBES)
+    strong[:300] = rng.standard_normal(300)
+    weak[250:400] = rng.standard_normal(150)
+    made = [one_node("strong", strong, high=50000.0), one_node("weak", weak, low=low, high=100.0)]
+    residual = 60.0 * strong + 5.0 * weak + rng.standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), made)
+    assert found[0].effects == (("strong", "weak") if named else ("strong",))
+    rest = residual - 60.0 * strong
+    gain = 0.5 * float(np.sum(rest**2) - np.sum((rest - 5.0 * weak) ** 2))
+    alone = next(item for item in found if item.effects == ("strong",)).log_evidence
+    assert PAIR_DOUBT_LEAST < gain < PAIR_DOUBT * alone + PAIR_DOUBT_ROOT * alone**0.5
+
+
+def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
+    rng = np.random.default_rng(34)
+    true, start = rng.standard_normal((2, PROBES)), rng.standard_normal(PROBES)
+    step = {"width": 0.4, "order": -0.2}
+    ahead = start + 0.4 * true[0] - 0.2 * true[1]
+
+    def fit(response, strength):
+        curve = one_node("one", response, low=0.5, high=50.0)
+        at = np.array([strength])
+        return CurveFit(curve=curve, log_evidence=0.0, strengths=at, log_likelihood=np.zeros(1), separation=1.0)
+
+    known = _Slopes(("width", "order"), true + 0.3 * rng.standard_normal(true.shape), 1.0)
+    learnt = known.learnt(fit(start, 1.0), fit(ahead, 2.0), step)
+    taken = np.array([0.4, -0.2])
+    # of twice the strength twice the change, along the step; across it nothing is learnt
+    np.testing.assert_allclose(taken @ learnt.at(2.0), 2.0 * (ahead - start), atol=1e-9)
+    across = np.array([0.2, 0.4])
+    np.testing.assert_allclose(across @ learnt.at(2.0), 2.0 * across @ known.rows, atol=1e-9)
+    same = known.learnt(fit(start, 1.0), fit(start, 2.0), {"width": 0.0, "order": 0.0})
+    np.testing.assert_allclose(same.at(1.0), known.rows)

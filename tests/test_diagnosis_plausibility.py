@@ -1,6 +1,7 @@
 """Labels that the frames contradict are found and said; effects at the ends of their ranges are not taken for wrong labels."""
 
 import shutil
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _without_common, check_plausibility
+from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _scaled, _without_common, check_plausibility
 from raytwin.diagnosis.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
@@ -173,3 +174,29 @@ def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field(
         values = np.delete(left[:, *part].reshape(7, -1), 5 * left[:, *part].shape[2] + 5, axis=1)
         wanted = float(np.mean(0.7 * picture[part]))
         assert np.mean(values**2) == pytest.approx(wanted, rel=4.0 * np.sqrt(2.0 / values.size) + 2.0 / 4800)
+
+
+def factors_of(**wanted):
+    """Suspects among scenes of two series each, 40 and 90 kV, at a distance (mm) with a factor on their path lengths."""
+    placements = {
+        scene: [
+            SimpleNamespace(
+                name=f"{scene}_{kV:g}kV",
+                label=SimpleNamespace(kV=kV),
+                series=SimpleNamespace(source_object_mm=distance),
+            )
+            for kV in (40.0, 90.0)
+        ]
+        for scene, (distance, _) in wanted.items()
+    }
+    scales = {scene: 4 * [float(np.log(factor))] for scene, (_, factor) in wanted.items()}
+    return [name for suspect in _scaled(scales, placements) for name in suspect.series]
+
+
+def test_what_all_scenes_at_one_gap_want_is_no_fault_of_their_maps():
+    near, far = {"wedge_a": (700.0, 0.76), "wedge_b": (700.0, 0.77)}, {"wedge_c": (500.0, 0.95)}
+    assert factors_of(**near, **far) == []
+    # one map alone, maps that are wrong at either gap, and maps of one gap with nothing to compare them with
+    assert factors_of(wedge_a=(700.0, 0.76), wedge_b=(700.0, 1.0), **far) == ["wedge_a_40kV", "wedge_a_90kV"]
+    assert len(factors_of(**near, wedge_c=(500.0, 0.75))) == 6
+    assert len(factors_of(**near)) == 4

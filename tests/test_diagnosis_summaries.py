@@ -5,12 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.special import ndtr
 
 from raytwin.diagnosis.defects import memory_of
 from raytwin.diagnosis.fixed_pattern import Pattern
 from raytwin.diagnosis.lost_bits import rounded_kurtosis
+from raytwin.diagnosis.placing import _smeared
 from raytwin.diagnosis.probes import (
     Areas,
     MapProjection,
@@ -162,6 +163,39 @@ def test_displacement_of_a_scene_is_found_within_a_tenth_of_a_pixel(row, column)
         0,
         0,
     )
+
+
+def steps(row_px=0.0, column_px=0.0):
+    """Two by three steps of a wedge, rendered on quarter pixels, not smeared by more than the panel does."""
+    y, x = np.mgrid[: 128 * 4, : 128 * 4] / 4.0
+    depth = np.where((np.abs(y - row_px - 64) < 50) & (np.abs(x - column_px - 64) < 50), 1.0, 0.0)
+    depth *= 0.3 + 0.5 * (y - row_px > 64) + 0.4 * (x - column_px > 48) + 0.4 * (x - column_px > 80)
+    return 3e4 * gaussian_filter(np.exp(-depth), 4 * 0.55).reshape(128, 4, 128, 4).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize(("axis", "belt"), [(0, "row"), (1, "column")])
+def test_a_wedge_that_moved_by_many_pixels_is_found_where_it_lies(axis, belt):
+    members = [
+        SimpleNamespace(request=SimpleNamespace(exposure_ms=time_ms, belt_axis=belt)) for time_ms in (50.0, 100.0)
+    ]
+    model, noises = [steps(), 0.5 * steps()], [np.full((128, 128), 100.0)] * 2
+    measured = [
+        uniform_filter1d(share * steps(0.25, -0.25), length, axis=axis) for share, length in ((1.0, 9), (0.5, 17))
+    ]
+    everywhere = np.ones((128, 128), bool)
+    blind = register(measured, model, noises, everywhere)
+    found, blur = _smeared(members, measured, model, noises, everywhere, blind)
+    assert found.row_px == pytest.approx(0.25, abs=0.1)
+    assert found.column_px == pytest.approx(-0.25, abs=0.1)
+    off = math.hypot(blind.row_px - 0.25, blind.column_px + 0.25)
+    assert off > 5.0 * math.hypot(found.row_px - 0.25, found.column_px + 0.25)
+    again = blur(model)
+    assert np.std(again[1] - measured[1]) < 0.3 * np.std(model[1] - measured[1])
+    sharp = [steps(0.25, -0.25), 0.5 * steps(0.25, -0.25)]
+    seen = register(sharp, model, noises, everywhere)
+    same, none = _smeared(members, sharp, model, noises, everywhere, seen)
+    assert same == seen
+    assert none(model) is model
 
 
 def test_an_even_field_shows_no_displacement():

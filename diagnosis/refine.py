@@ -32,6 +32,7 @@ _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 _ROUNDS = 5
 _ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
+_SHAPE = "order"  # of a spread: sought last
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
@@ -74,23 +75,37 @@ def refine(
         whitener: of responses.
     """
     result = []
-    done: set[str] = set()
-    for hypothesis in _within_reach(hypotheses):
+    whole = _Seen(residual=residual, nuisances=nuisances, groups=groups, places=places, whitener=whitener)
+    for effect, beside in _to_refine(_within_reach(hypotheses)):
+        seen = whole
+        for curve, strength in beside:
+            seen = seen.beside(curve, strength)
+        fits = [seen.fit(curve) for curve in curves if curve.effect == effect]
+        clear = [fit for fit in fits if _separation(fit, seen) >= REFINED_FROM]
+        starts = [(variants[effect, fit.curve.variant], fit) for fit in _starts_of(clear)] if clear else []
+        if effect == "misregistration":
+            starts += _displaced_and_distorted(clear, variants)
+        refined = (_refined(variant, fit, seen, respond) for variant, fit in starts)
+        result += [found for found in refined if found is not None]
+    return result
+
+
+def _to_refine(hypotheses: Sequence[Hypothesis]) -> list[tuple[str, list[tuple[Curve, float]]]]:
+    """Effects of the leading hypotheses, most probable first, each with what stands beside it (curve, strength).
+
+    Of the first hypothesis, if it is a pair, the effect that moves more is refined alone as well: on the grid a second effect may
+    stand for what is wrong with its inner parameters, and beside that they stay wrong.
+    """
+    result: list[tuple[str, list[tuple[Curve, float]]]] = []
+    for number, hypothesis in enumerate(hypotheses):
+        at = {effect: (hypothesis.variants[effect], hypothesis.strengths[effect][0]) for effect in hypothesis.effects}
+        if number == 0 and len(at) > 1:
+            moves = {effect: float(np.sum(curve.response(strength) ** 2)) for effect, (curve, strength) in at.items()}
+            result.append((max(moves, key=lambda effect: moves[effect]), []))
+        known = {effect for effect, beside in result if beside or len(hypothesis.effects) == 1}
         for effect in hypothesis.effects:
-            if effect in done or len(done) >= _MOST_EFFECTS:
-                continue
-            done.add(effect)
-            seen = _Seen(residual=residual, nuisances=nuisances, groups=groups, places=places, whitener=whitener)
-            for other in hypothesis.effects:
-                if other != effect:
-                    seen = seen.beside(hypothesis.variants[other], hypothesis.strengths[other][0])
-            fits = [seen.fit(curve) for curve in curves if curve.effect == effect]
-            clear = [fit for fit in fits if _separation(fit, seen) >= REFINED_FROM]
-            starts = [(variants[effect, fit.curve.variant], fit) for fit in _starts_of(clear)] if clear else []
-            if effect == "misregistration":
-                starts += _displaced_and_distorted(clear, variants)
-            refined = (_refined(variant, fit, seen, respond) for variant, fit in starts)
-            result += [found for found in refined if found is not None]
+            if effect not in known and len({name for name, _ in result} | {effect}) <= _MOST_EFFECTS:
+                result.append((effect, [one for name, one in at.items() if name != effect]))
     return result
 
 
@@ -251,31 +266,32 @@ def _refined(
     if here is None:
         return None
     strength = here.best
-    slopes: _Slopes | None = None
-    for _ in range((_ROUNDS if in_proportion else 2 * _ROUNDS) if inner else 0):
-        learnt = slopes is not None
-        slopes = slopes or _slopes_at(here, best, inner, seen, respond)
-        steps = _newton(here, best, slopes, seen)
-        before, start, at = here.log_evidence, best.parameters, here
-        taken: dict[str, float] = {}
-        for share in shares:
-            helped = here.log_evidence > before
-            if share != 1.0 and helped == (share < 1.0):
-                continue
-            parameters = dict(start)
-            for item in inner:
-                parameters[item.name] = _moved(item, start[item.name], share * steps.get(item.name, 0.0))
-            candidate = tried(near(parameters, trial))
-            if candidate is not None and candidate.log_evidence > here.log_evidence:
-                here, strength = candidate, candidate.best
-                best = replace(best, parameters=parameters)
-                taken = {item.name: _way(item, start[item.name], parameters[item.name]) for item in inner}
-        if here.log_evidence - before >= max(_ENOUGH, _ENOUGH_SHARE * before):
-            slopes = slopes.learnt(at, here, taken)
-        elif learnt:
-            slopes = None
-        else:
-            break
+    for part in _in_turn(inner):
+        slopes: _Slopes | None = None
+        for _ in range(_ROUNDS if in_proportion else 2 * _ROUNDS):
+            learnt = slopes is not None
+            slopes = slopes or _slopes_at(here, best, part, seen, respond)
+            steps = _newton(here, best, slopes, seen)
+            before, start, at = here.log_evidence, best.parameters, here
+            taken: dict[str, float] = {}
+            for share in shares:
+                helped = here.log_evidence > before
+                if share != 1.0 and helped == (share < 1.0):
+                    continue
+                parameters = dict(start)
+                for item in part:
+                    parameters[item.name] = _moved(item, start[item.name], share * steps.get(item.name, 0.0))
+                candidate = tried(near(parameters, trial))
+                if candidate is not None and candidate.log_evidence > here.log_evidence:
+                    here, strength = candidate, candidate.best
+                    best = replace(best, parameters=parameters)
+                    taken = {item.name: _way(item, start[item.name], parameters[item.name]) for item in part}
+            if here.log_evidence - before >= max(_ENOUGH, _ENOUGH_SHARE * before):
+                slopes = slopes.learnt(at, here, taken)
+            elif learnt:
+                slopes = None
+            else:
+                break
     final = near(best.parameters, _NEAR)
     answer = respond([final])
     for _ in range(_CENTRINGS):
@@ -290,6 +306,15 @@ def _refined(
         final = near(best.parameters, _NEAR)
         answer = respond([final])
     return (final, answer[0]) if 0 in answer else None
+
+
+def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:
+    """Parameters that are sought together, one set after the other: reach before shape, which can stand for it far off.
+
+    With both from the start a veiling glare of 4 % was found as 2.4 % of another shape, with 130 less of log evidence.
+    """
+    plain = [item for item in inner if item.name != _SHAPE]
+    return [part for part in (plain, inner) if part] if len(plain) < len(inner) else [part for part in (inner,) if part]
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,6 +56,7 @@ _LOOSE = {"object_scatter": 0.02}
 # traps are more than a law of two knows: in eight sessions with lags of 0.5-4 % alone a dark drift gained up to 4e-5 of lag's
 # evidence, beside three since the calibration 4e-4, 5e-4 and 2.5e-3
 _LEFT = {("image_lag", "always"): 2e-4, ("image_lag", "calibration"): 1e-3}
+_TOLD = frozenset(("gain_map_error", "bad_pixels", "quantisation"))
 # the same effect can show in a dozen places; a place is a gap beyond the largest of that many draws of noise
 _REPLICATES = 400
 
@@ -256,7 +257,8 @@ def judge(
         return tuple(fit_curve(residual, curve, shared, problem.groups, places=probe_places) for curve in curves)
 
     sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
-    doubts = Doubts(chance=_SHARP_CHANCE if sharp else _CHANCE, loose=_LOOSE, left=_LEFT, elsewhere=_elsewhere(problem))
+    chance = _SHARP_CHANCE if sharp else _CHANCE
+    doubts = Doubts(chance=chance, loose=_LOOSE, left=_LEFT, told=_TOLD, elsewhere=_elsewhere(problem))
 
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(

@@ -63,12 +63,15 @@ class Doubts:
             PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
         left: share of its log evidence that what is wrong with its law may give a second one, where it is not PAIR_DOUBT_STRONG;
             by effect and onset.
+        told: effects that pixels or codes of their own tell, which no other effect's law can leave: found at the least that is
+            plausible they are doubted no more than elsewhere.
         elsewhere: probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is not doubted.
     """
 
     chance: Mapping[str, float] = field(default_factory=dict)
     loose: Mapping[str, float] = field(default_factory=dict)
     left: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    told: frozenset[str] = frozenset()
     elsewhere: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
@@ -169,7 +172,7 @@ class _SecondDoubted:
         doubt = doubts.loose.get(strong, PAIR_DOUBT) * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
         curves = {curve.effect: curve for curve in (pair.first, pair.second)}
         # what a law that is nearly right leaves is taken up by whatever can take it, at the least that is plausible
-        at_bottom = strengths[weak] < _AT_BOTTOM * curves[weak].low
+        at_bottom = weak not in doubts.told and strengths[weak] < _AT_BOTTOM * curves[weak].low
         if strong not in doubts.loose and not at_bottom:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlap
             shared = 1.0 + PAIR_DOUBT_SHARED * overlap**2

@@ -568,6 +568,10 @@ def test_a_second_effect_at_the_least_that_is_plausible_must_bring_more_than_a_l
     rest = residual - 60.0 * strong
     gain = 0.5 * float(np.sum(rest**2) - np.sum((rest - 5.0 * weak) ** 2))
     alone = next(item for item in found if item.effects == ("strong",)).log_evidence
+    assert weigh(residual, np.zeros((PROBES, 1)), made, doubts={"told": frozenset(["weak"])})[0].effects == (
+        "strong",
+        "weak",
+    )
     assert PAIR_DOUBT_LEAST < gain < PAIR_DOUBT * alone + PAIR_DOUBT_ROOT * alone**0.5
 
 

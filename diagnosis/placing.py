@@ -20,7 +20,7 @@ _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
 _CLOSER = 0.5  # of the displacement: what a round may add to it
 # an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
-# was found 1.5 px from where it lay, and 0.02 px with a box of 15 px
+# was found 1.5 px from where it lies with a box of that length
 _BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
 _GAUSSIANS_PX = (2.0, 3.0, 4.0, 6.0)
 _SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many blurs must leave for others to be tried

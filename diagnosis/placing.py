@@ -144,14 +144,16 @@ def _smeared(
     """
     from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-    longest = max(item.request.exposure_ms for item in members)
+    exposures_ms = [item.request.exposure_ms for item in members]
+    # where no series says how long it was all count as equally long
+    shares = [one / max(exposures_ms) if max(exposures_ms) > 0.0 else 1.0 for one in exposures_ms]
     axis = 1 if members[0].request.belt_axis == "column" else 0
 
     def box(length_px: float) -> _Blur:
         def blur(pictures: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
             # odd: an even box would move them by half a pixel
-            lengths = [2 * round((length_px * item.request.exposure_ms / longest - 1.0) / 2.0) + 1 for item in members]
-            return [uniform_filter1d(one, max(at, 1), axis=axis) for one, at in zip(pictures, lengths, strict=True)]
+            lengths = [max(2 * round((length_px * share - 1.0) / 2.0) + 1, 1) for share in shares]
+            return [uniform_filter1d(one, at, axis=axis) for one, at in zip(pictures, lengths, strict=True)]
 
         return blur
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from raytwin.diagnosis.defects import memory_of
@@ -179,8 +179,14 @@ def test_a_wedge_that_moved_by_many_pixels_is_found_where_it_lies(axis, belt):
         SimpleNamespace(request=SimpleNamespace(exposure_ms=time_ms, belt_axis=belt)) for time_ms in (50.0, 100.0)
     ]
     model, noises = [steps(), 0.5 * steps()], [np.full((128, 128), 100.0)] * 2
+
+    def way(reach):
+        return [(step, 0) if axis == 0 else (0, step) for step in range(-reach, reach + 1)]
+
+    # moved on by quarters of a pixel, over as many pixels in the longer exposure
     measured = [
-        uniform_filter1d(share * steps(0.25, -0.25), length, axis=axis) for share, length in ((1.0, 9), (0.5, 17))
+        share * np.mean([steps(0.25 + down / 4, -0.25 + right / 4) for down, right in way(2 * length)], axis=0)
+        for share, length in ((1.0, 8), (0.5, 16))
     ]
     everywhere = np.ones((128, 128), bool)
     blind = register(measured, model, noises, everywhere)
@@ -191,6 +197,11 @@ def test_a_wedge_that_moved_by_many_pixels_is_found_where_it_lies(axis, belt):
     assert off > 5.0 * math.hypot(found.row_px - 0.25, found.column_px + 0.25)
     again = blur(model)
     assert np.std(again[1] - measured[1]) < 0.3 * np.std(model[1] - measured[1])
+    # exposures that nobody stated count as equally long
+    unstated = [SimpleNamespace(request=SimpleNamespace(exposure_ms=0.0, belt_axis=belt))]
+    alone, _ = _smeared(unstated, measured[1:], model[1:], noises[1:], everywhere, blind)
+    assert alone.row_px == pytest.approx(0.25, abs=0.1)
+    assert alone.column_px == pytest.approx(-0.25, abs=0.1)
     sharp = [steps(0.25, -0.25), 0.5 * steps(0.25, -0.25)]
     seen = register(sharp, model, noises, everywhere)
     same, none = _smeared(members, sharp, model, noises, everywhere, seen)

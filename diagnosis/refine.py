@@ -93,8 +93,9 @@ def refine(
 def _to_refine(hypotheses: Sequence[Hypothesis]) -> list[tuple[str, list[tuple[Curve, float]]]]:
     """Effects of the leading hypotheses, most probable first, each with what stands beside it (curve, strength).
 
-    Of the first hypothesis, if it is a pair, the effect that moves more is refined alone as well: on the grid a second effect may
-    stand for what is wrong with its inner parameters, and beside that they stay wrong.
+    Each effect once alone and once beside another at the most. Of the first hypothesis, if it is a pair, the effect that moves more is
+    refined alone as well: on the grid a second effect may stand for what is wrong with its inner parameters, and beside that
+    they stay wrong.
     """
     result: list[tuple[str, list[tuple[Curve, float]]]] = []
     for number, hypothesis in enumerate(hypotheses):
@@ -314,7 +315,8 @@ def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:
     With both from the start a veiling glare of 4 % was found as 2.4 % of another shape, with 130 less of log evidence.
     """
     plain = [item for item in inner if item.name != _SHAPE]
-    return [part for part in (plain, inner) if part] if len(plain) < len(inner) else [part for part in (inner,) if part]
+    turns = [plain, inner] if len(plain) < len(inner) else [inner]
+    return [part for part in turns if part]
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from raytwin.diagnosis.pairs import (
     PAIR_DOUBT_ROOT,
     Doubts,
 )
-from raytwin.diagnosis.refine import _Slopes
+from raytwin.diagnosis.refine import _in_turn, _Slopes, _to_refine
 from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.veto import DOUBT, with_doubt
 from raytwin.diagnosis.whitening import Whitening
@@ -595,3 +595,27 @@ def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
     np.testing.assert_allclose(across @ learnt.at(2.0), 2.0 * across @ known.rows, atol=1e-9)
     same = known.learnt(fit(start, 1.0), fit(start, 2.0), {"width": 0.0, "order": 0.0})
     np.testing.assert_allclose(same.at(1.0), known.rows)
+
+
+def test_reach_is_sought_before_shape_and_the_stronger_of_a_leading_pair_alone_as_well():
+    reach, shape, angle = (SimpleNamespace(name=name) for name in ("length_mm", "order", "direction_deg"))
+    assert _in_turn([reach, shape]) == [[reach], [reach, shape]]
+    assert _in_turn([reach, angle]) == [[reach, angle]]
+    assert _in_turn([shape]) == [[shape]]
+    assert _in_turn([]) == []
+
+    def explanation(**strengths):
+        return Hypothesis(
+            effects=tuple(sorted(strengths)),
+            probability=0.5,
+            log_evidence=10.0,
+            strengths={name: (value, value, value) for name, value in strengths.items()},
+            variants={name: one_node(name, np.ones(PROBES)) for name in strengths},
+        )
+
+    pair, alone = explanation(weak=1.0, strong=9.0), explanation(strong=8.0)
+    asked = [(effect, [(curve.effect, at) for curve, at in beside]) for effect, beside in _to_refine([pair, alone])]
+    assert asked == [("strong", []), ("strong", [("weak", 1.0)]), ("weak", [("strong", 9.0)])]
+    # a pair behind a single effect: what led alone is asked once more, beside the other
+    asked = [(effect, [(curve.effect, at) for curve, at in beside]) for effect, beside in _to_refine([alone, pair])]
+    assert asked == [("strong", []), ("strong", [("weak", 1.0)]), ("weak", [("strong", 9.0)])]

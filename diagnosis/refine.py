@@ -93,9 +93,9 @@ def refine(
 def _to_refine(hypotheses: Sequence[Hypothesis]) -> list[tuple[str, list[tuple[Curve, float]]]]:
     """Effects of the leading hypotheses, most probable first, each with what stands beside it (curve, strength).
 
-    Each effect once alone and once beside another at the most. Of the first hypothesis, if it is a pair, the effect that moves more is
-    refined alone as well: on the grid a second effect may stand for what is wrong with its inner parameters, and beside that
-    they stay wrong.
+    Each effect once alone and once beside another at the most. Of the first hypothesis, if it is a pair, the effect that moves
+    more is refined alone as well: on the grid a second effect may stand for what is wrong with its inner parameters, and
+    beside that they stay wrong.
     """
     result: list[tuple[str, list[tuple[Curve, float]]]] = []
     for number, hypothesis in enumerate(hypotheses):

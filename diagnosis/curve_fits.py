@@ -88,7 +88,7 @@ def fit_curve(
             effective = credible(curve.weights(np.array([best]))[0] @ solved, seen, places)
             extra = law_factors(curve, best, effective, groups, law_error)
             own = own_variance(curve, best, effective, law_error)
-            if extra.shape[1] == 0 and float(own.max()) < LEAST_FACTOR:
+            if not extra and float(own.max()) < LEAST_FACTOR:
                 break
             # evidence over none: the residual's own terms change with the covariance
             moved, moved_nodes, wide, shift = with_law(residual, nodes, nuisances, extra, own)

@@ -61,9 +61,11 @@ class Curve:
 
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
+    if len(nodes) < 4:
+        return _through_all(nodes, strengths)
     points = np.concatenate([[0.0], nodes])
     result = np.zeros((len(strengths), len(nodes)))
-    used = min(len(points), 4)
+    used = 4
     # the interval's two points and their neighbours; the point 0 adds nothing
     first = np.clip(np.searchsorted(points, strengths) - used // 2, 0, len(points) - used)
     row = np.arange(len(strengths))
@@ -76,6 +78,20 @@ def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> 
                 weight *= (strengths - other) / (points[at] - other)
         inner = at > 0
         result[row[inner], at[inner] - 1] = weight[inner]
+    return result
+
+
+def _through_all(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same of the one polynomial through 0 and all nodes."""
+    result = np.empty((len(strengths), len(nodes)))
+    points = [float(node) for node in nodes]
+    away = [strengths - point for point in points]
+    for i, point in enumerate(points):
+        weight, below = strengths, point
+        for j, other in enumerate(points):
+            if j != i:
+                weight, below = weight * away[j], below * (point - other)
+        result[:, i] = weight / below
     return result
 
 

@@ -21,6 +21,7 @@ from .forward_model import can_displace, can_show, can_stand_out
 from .held_out import Gap, held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from .known_effects import already_there, with_found
+from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
 from .pairs import Doubts
@@ -32,6 +33,7 @@ from .probes import OUTLIERS, OUTLIERS_ANYWHERE
 from .refine import refine
 from .registration import SHARP_PX
 from .strengths import applied_at_best, strength_of
+from .unknown import unknown_evidence
 from .veto import is_refused, vetoed, with_doubt
 from .whitening import Whitening
 
@@ -247,7 +249,7 @@ def judge(
     """The answer to an assembled problem."""
     tell = progress or (lambda stage: None)
     tell("hypotheses")
-    nuisances = Nuisances(problem.factors)
+    nuisances = LocalNuisances(problem.factors, problem.blocks)
     whitening = Whitening(problem.factors, problem.blocks)
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
@@ -259,6 +261,7 @@ def judge(
 
     sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
     chance = _SHARP_CHANCE if sharp else _CHANCE
+    unknown = unknown_evidence(residual, shared, problem.parts, problem.part_names)
     doubts = Doubts(chance=chance, loose=_LOOSE, left=_LEFT, told=_TOLD, elsewhere=_elsewhere(problem))
 
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
@@ -275,6 +278,7 @@ def judge(
             doubts=doubts,
             places=probe_places,
             fits=fits,
+            unknown=unknown,
         )
 
     whitened = whitening.curves(problem.curves)
@@ -338,7 +342,7 @@ def judge(
     leading = next(item for item in hypotheses if item.effects == leading.effects)
     marginal = _by_effect(hypotheses)
     none = next((item.probability for item in hypotheses if not item.effects), 0.0)
-    unknown = marginal.pop(UNKNOWN, 0.0)
+    of_unknown = marginal.pop(UNKNOWN, 0.0)
     named = leading.effects if leading.effects and leading.effects != (UNKNOWN,) else ()
     order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
     listed = set(named) | {effect for item in tied for effect in item.effects}
@@ -393,7 +397,7 @@ def judge(
         hypotheses=hypotheses,
         causes=tuple(causes),
         probability_no_gap=none,
-        probability_unknown=unknown,
+        probability_unknown=of_unknown,
         unknown_location=next((item.location for item in hypotheses if item.effects == (UNKNOWN,)), ""),
         where=tuple(places),
         threshold_z=threshold,
@@ -420,7 +424,7 @@ def _by_effect(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
     return result
 
 
-def _strained(problem: Problem, leading: Hypothesis, nuisances: Nuisances) -> tuple[tuple[str, float], ...]:
+def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
     """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
     left = problem.residual.copy()
     for effect, curve in leading.variants.items():
@@ -468,21 +472,18 @@ def _next_measurement(
     }
 
 
-def _leave_one_out_z(problem: Problem, nuisances: Nuisances) -> NDArray[np.float64]:
+def _leave_one_out_z(problem: Problem, nuisances: LocalNuisances) -> NDArray[np.float64]:
     """z of each probe given all others: (C^-1 r)_i / sqrt((C^-1)_ii)."""
-    solved, factor = nuisances.solve(problem.residual), nuisances.half
-    diagonal = 1.0 - np.sum(factor**2, axis=0)
-    return np.asarray(solved / np.sqrt(np.maximum(diagonal, 1e-12)))
+    return np.asarray(nuisances.solve(problem.residual) / np.sqrt(np.maximum(nuisances.precision, 1e-12)))
 
 
-def _threshold(problem: Problem, nuisances: Nuisances, rng: np.random.Generator) -> float:
+def _threshold(problem: Problem, nuisances: LocalNuisances, rng: np.random.Generator) -> float:
     """The |z| that the largest of all probes exceeds in 5 % of sessions without a gap (by simulation)."""
-    size, factor = len(problem.residual), nuisances.half
-    diagonal = np.sqrt(np.maximum(1.0 - np.sum(factor**2, axis=0), 1e-12))
+    size, factors = len(problem.residual), nuisances.factors
     draws = rng.standard_normal((_REPLICATES, size))
-    draws += rng.standard_normal((_REPLICATES, nuisances.factors.shape[1])) @ nuisances.factors.T
-    solved = draws - (draws @ factor.T) @ factor
-    return float(np.quantile(np.max(np.abs(solved / diagonal), axis=1), 0.95))
+    draws += rng.standard_normal((_REPLICATES, factors.shape[1])) @ factors.T
+    z = nuisances.solve_all(draws) / np.sqrt(np.maximum(nuisances.precision, 1e-12))
+    return float(np.quantile(np.max(np.abs(z), axis=1), 0.95))
 
 
 def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict[str, Any]:

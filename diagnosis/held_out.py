@@ -13,7 +13,7 @@ from .assemble import Problem, SeriesView
 from .curves import Curve
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
-from .nuisances import Nuisances
+from .local_nuisances import LocalNuisances
 from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it
@@ -92,8 +92,6 @@ def left_over(
     noise. What their laws may be off by is fitted as well, so that no nuisance is drawn away by it, but neither taken off nor
     counted.
     """
-    from scipy.linalg import cho_solve, solve_triangular
-
     residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
     for curve, strength in added:
         residual = residual - curve.response(strength)
@@ -106,16 +104,12 @@ def left_over(
         of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
         laws.append(of_law[fit])
         inexact = inexact + of_probe[fit]
-    known = np.concatenate(laws, axis=1) / np.sqrt(inexact)[:, None]
-    lower = np.linalg.cholesky(np.eye(known.shape[1]) + known.T @ known)
-    fitted = cho_solve((lower, True), known.T @ (residual[fit] / np.sqrt(inexact)))
-    held = factors[~fit]
-    left = residual[~fit] - held @ fitted[: held.shape[1]]
-    # variance of the nuisances' part alone: those of the laws come last
-    part = np.zeros((known.shape[1], len(held)))
-    part[: held.shape[1]] = held.T
-    half = solve_triangular(lower, part, lower=True)
-    return np.asarray(left / np.sqrt(own[~fit] + np.sum(half**2, axis=0)))
+    root = np.sqrt(inexact)
+    known = LocalNuisances(np.concatenate(laws, axis=1) / root[:, None], problem.blocks[fit])
+    # the nuisances' part alone: those of the laws come last
+    held = np.pad(factors[~fit], ((0, 0), (0, known.factors.shape[1] - factors.shape[1])))
+    left = residual[~fit] - held @ known.fitted(residual[fit] / root)
+    return np.asarray(left / np.sqrt(own[~fit] + known.known_of(held)))
 
 
 def held_out(
@@ -133,10 +127,10 @@ def held_out(
         held = ~fit
         if not fit.any() or not held.any():
             continue
-        inner = Nuisances(problem.factors[fit])
         before[held] = left_over(problem, fit)
-        sds[held] = inner.predicted_sd(problem.factors[held])
-        strengths = strengths_on(problem, leading, effects, fit, inner)
+        inner = LocalNuisances(problem.factors[fit], problem.blocks[fit])
+        sds[held] = np.sqrt(1.0 + inner.known_of(problem.factors[held]))
+        strengths = strengths_on(problem, leading, effects, fit)
         added = [(leading.variants[effect], strengths[effect]) for effect in effects]
         after[held] = left_over(problem, fit, added) if effects else before[held]
         for one, effect in zip(added, effects, strict=True):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array, vstack
 
 from .curves import Curve
 from .nuisances import Nuisances
@@ -13,6 +14,7 @@ LAW_ERRORS: tuple[tuple[float, float], ...] = ((0.10, 0.7), (0.30, 0.3))
 LAW_PROBE_SHARE = 0.5  # of the law's error that is each probe's own
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
+_LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
 )
@@ -29,30 +31,52 @@ def credible(response: NDArray[np.float64], seen: NDArray[np.float64], places: N
     return np.asarray(response * share[places])
 
 
+@dataclass(frozen=True, slots=True)
+class LawFactors:
+    """What is random about effects at their strengths.
+
+    Fields: of_laws (factor, probe): a row for each group of probes and effect, what the law is off by there; spread (probe, factor):
+    what the effects do by chance.
+    """
+
+    of_laws: csc_array
+    spread: NDArray[np.float64]
+
+    def __bool__(self) -> bool:
+        return bool(self.of_laws.shape[0] or self.spread.shape[1])
+
+    def and_of(self, other: "LawFactors") -> "LawFactors":
+        """Of two effects."""
+        return LawFactors(
+            vstack([self.of_laws, other.of_laws], format="csc"), np.concatenate([self.spread, other.spread], axis=1)
+        )
+
+    def full(self) -> NDArray[np.float64]:
+        """All of them (probe, factor)."""
+        return np.concatenate([self.of_laws.toarray().T, self.spread], axis=1)
+
+
 def law_factors(
     curve: Curve, strength: float, response: NDArray[np.float64], groups: NDArray[np.intp], law_error: float
-) -> NDArray[np.float64]:
-    """What is random about an effect at a strength (probe, factor): its law's inaccuracy, and its own spread."""
-    parts = []
+) -> LawFactors:
+    """What is random about an effect at a strength: its law's inaccuracy, and its own spread."""
     if curve.exact is not None:
         response = np.where(curve.exact, 0.0, response)
-    if float(np.max(np.abs(response), initial=0.0)) * law_error >= 0.3:
-        parts.append(group_factors(response, groups, law_error))
-    if curve.spread is not None and float(np.max(np.abs(curve.spread))) * strength >= 0.3:
-        parts.append(curve.spread * strength)
-    return np.concatenate(parts, axis=1) if parts else np.zeros((len(response), 0))
+    spread = curve.spread
+    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < _LEAST_MOVED:
+        spread = np.zeros((len(response), 0))
+    moves = float(np.max(np.abs(response), initial=0.0)) * law_error >= _LEAST_MOVED
+    return LawFactors(group_factors(response, groups, law_error if moves else 0.0), spread * strength)
 
 
-def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> NDArray[np.float64]:
-    """A column a group: the response there times `sd`; groups in which it would move nothing are left out."""
+def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> csc_array:
+    """A row (factor, probe) a group: the response there times `sd`; groups in which it would move nothing are left out."""
     power = np.bincount(groups, weights=response**2)
-    kept = np.nonzero(sd**2 * power > LEAST_FACTOR)[0]
-    place = np.full(len(power), -1)
-    place[kept] = np.arange(len(kept))
-    rows = np.nonzero(place[groups] >= 0)[0]
-    columns = np.zeros((len(response), len(kept)))
-    columns[rows, place[groups[rows]]] = sd * response[rows]
-    return columns
+    kept = sd**2 * power > LEAST_FACTOR
+    inside = kept[groups]
+    places = (np.cumsum(kept) - 1)[groups[inside]]
+    starts = np.concatenate([[0], np.cumsum(inside)])
+    return csc_array((sd * response[inside], places, starts), shape=(int(np.count_nonzero(kept)), len(response)))
 
 
 def law_terms(
@@ -61,7 +85,8 @@ def law_terms(
     """What a law that is off as usual adds: factors (probe, factor) and each probe's own variance (probe,)."""
     response = curve.response(strength)
     usual = LAW_ERRORS[0][0]
-    return law_factors(curve, strength, response, groups, usual), own_variance(curve, strength, response, usual)
+    factors = law_factors(curve, strength, response, groups, usual).full()
+    return factors, own_variance(curve, strength, response, usual)
 
 
 def own_variance(
@@ -103,27 +128,27 @@ def widened_for(
     )
 
 
-def _widened(base: Nuisances, factors: NDArray[np.float64], inexact: NDArray[np.float64]) -> Widened:
-    """With more factors (probe, factor) and more variance of each probe's own (probe,)."""
+def _widened(base: Nuisances, law: LawFactors, inexact: NDArray[np.float64]) -> Widened:
+    """With what is random about a law, and more variance of each probe's own (probe,)."""
     root = np.sqrt(1.0 + inexact)
-    return Widened(Nuisances(np.concatenate([base.factors, factors], axis=1) / root[:, None]), root)
+    return Widened(base.over(root, law.spread, law.of_laws), root)
 
 
 def with_law(
     residual: NDArray[np.float64],
     nodes: NDArray[np.float64],
     base: Nuisances,
-    factors: NDArray[np.float64],
+    law: LawFactors,
     inexact: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Nuisances, float]:
     """Residual, nodes and nuisances once an effect's law may be off, and the bare residual's change of log likelihood.
 
     Args:
         residual, nodes, base: as they were.
-        factors: what is random in groups (probe, factor).
+        law: what is random in groups and by chance.
         inexact: variance of each probe's own (probe,).
     """
-    found = _widened(base, factors, inexact)
+    found = _widened(base, law, inexact)
     wide, root = found.nuisances, found.root
     moved, moved_nodes = residual / root, nodes / root
     before, after = residual[None, :], moved[None, :]

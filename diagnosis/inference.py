@@ -76,6 +76,7 @@ def weigh_hypotheses(
     doubts: Doubts | None = None,
     places: NDArray[np.intp] | None = None,
     fits: Sequence[CurveFit] | None = None,
+    unknown: tuple[float, str] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -93,6 +94,7 @@ def weigh_hypotheses(
         places: place of each probe (probe,), within which a law is off by a share of no more than what is seen there; the
             groups where absent.
         fits: of the curves, with the same residual, nuisances, groups, places and law errors, where they are known.
+        unknown: as `unknown_evidence` finds it with the same residual, nuisances and partition, where it is known.
     """
     priors, doubts = priors or Priors(), doubts or Doubts()
     places = groups if places is None else places
@@ -132,13 +134,13 @@ def weigh_hypotheses(
         )
     parts = groups if unknown_groups is None else unknown_groups
     names = group_names if unknown_names is None else unknown_names
-    unknown, place = unknown_evidence(residual, nuisances, parts, names)
+    beyond, place = unknown_evidence(residual, nuisances, parts, names) if unknown is None else unknown
     # no law is exact: a strong effect leaves a part of what it does to be explained by anything
     explained = max(item.log_evidence for item, _ in weighed)
-    unknown -= UNKNOWN_CHANCE + UNKNOWN_DOUBT * max(0.0, min(unknown, explained))
+    beyond -= UNKNOWN_CHANCE + UNKNOWN_DOUBT * max(0.0, min(beyond, explained))
     weighed.append(
         (
-            Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=unknown, location=place),
+            Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=beyond, location=place),
             math.log(priors.unknown),
         )
     )

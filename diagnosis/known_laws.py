@@ -11,7 +11,7 @@ from ..generator.twin import Twin
 from .changes import Variant
 from .forward_model import Change
 from .inexact_laws import LAW_ERRORS, LAW_PROBE_SHARE, group_factors
-from .nuisances import Nuisances
+from .local_nuisances import LocalNuisances
 
 if TYPE_CHECKING:
     from .assemble import Problem
@@ -41,10 +41,10 @@ def beside_known(problem: "Problem", responses: NDArray[np.float64]) -> "Problem
     if not len(responses):
         return problem
     factors = [problem.factors]
-    left = Nuisances(problem.factors).solve_all(responses)
+    left = LocalNuisances(problem.factors, problem.blocks).solve_all(responses)
     own = np.ones(responses.shape[1])
     for response, effective in zip(responses, left, strict=True):
-        factors += [_STRENGTH_SD * response[:, None], group_factors(effective, problem.groups, _LAW_ERROR)]
+        factors += [_STRENGTH_SD * response[:, None], group_factors(effective, problem.groups, _LAW_ERROR).toarray().T]
         own = own + (LAW_PROBE_SHARE * _LAW_ERROR * effective) ** 2
     widened = np.concatenate(factors, axis=1)
     names = [f"law of what the twin has, {number}" for number in range(widened.shape[1] - problem.factors.shape[1])]

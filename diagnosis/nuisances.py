@@ -1,81 +1,102 @@
-"""Factor model of the nuisances: r ~ N(m, C) with C = I + F F^T, of which only projections are needed."""
+"""Factor model of the nuisances: r ~ N(m, C) with C = I + F F^T + E E^T, of which only projections are needed."""
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array, vstack
 
 
 class Nuisances:
-    """Factor model of the nuisances: what of a vector is left when they may take up what they can."""
+    """Factor model of the nuisances: what of a vector is left when they may take up what they can.
 
-    def __init__(self, factors: NDArray[np.float64], cholesky: NDArray[np.float64] | None = None) -> None:
-        """`factors` (probe, factor): response to one prior standard deviation of each nuisance."""
+    `factors` F (probe, factor) are full; `of_laws` E^T (factor, probe), if any, are sparse, as the laws of effects give them: a
+    column a group of probes and effect. E is integrated out first: with one effect it costs no more than its entries.
+    """
+
+    def __init__(self, factors: NDArray[np.float64], of_laws: csc_array | None = None) -> None:
+        """Both give the response to one prior standard deviation of each nuisance."""
         self.factors = factors
-        self._cholesky: NDArray[np.float64] = (
-            np.asarray(np.linalg.cholesky(np.eye(factors.shape[1]) + factors.T @ factors))
-            if cholesky is None
-            else cholesky
-        )
-        self.log_determinant = 2.0 * float(np.sum(np.log(np.diag(self._cholesky))))
+        self.of_laws = of_laws if of_laws is not None and of_laws.shape[0] else None
+        normal = np.eye(factors.shape[1]) + factors.T @ factors
+        self.log_determinant = 0.0
+        if self.of_laws is not None:
+            self._laws = _RootOfLaws(self.of_laws)
+            self._shared = self._laws.half(self.of_laws @ factors)
+            normal -= self._shared.T @ self._shared
+            self.log_determinant = self._laws.log_determinant
+        self._cholesky: NDArray[np.float64] = np.asarray(np.linalg.cholesky(normal))
+        self.log_determinant += 2.0 * float(np.sum(np.log(np.diag(self._cholesky))))
+
+    def over(self, root: NDArray[np.float64], factors: NDArray[np.float64], of_laws: csc_array) -> "Nuisances":
+        """With more factors of both kinds, of probes whose standard deviations are `root` (probe,) times as large."""
+        inverse = 1.0 / root
+        wider = self.factors if not factors.shape[1] else np.concatenate([self.factors, factors], axis=1)
+        every = of_laws if self.of_laws is None else vstack([self.of_laws, of_laws], format="csc")
+        return Nuisances(wider * inverse[:, None], _scaled(every, inverse))
 
     def project(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """z (vector, factor) with a^T C^-1 b = a.b - z_a.z_b for vectors (vector, probe)."""
         from scipy.linalg import solve_triangular
 
-        return np.asarray(solve_triangular(self._cholesky, self.factors.T @ vectors.T, lower=True).T)
+        right = self.factors.T @ vectors.T
+        if self.of_laws is None:
+            return np.asarray(solve_triangular(self._cholesky, right, lower=True, check_finite=False).T)
+        own = self._laws.half(self.of_laws @ vectors.T)
+        right -= self._shared.T @ own
+        return np.concatenate([own, solve_triangular(self._cholesky, right, lower=True, check_finite=False)]).T
 
     def inner(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Matrix a C^-1 b^T for a (i, probe), b (j, probe)."""
-        return np.asarray(a @ b.T - self.project(a) @ self.project(b).T)
+        left = self.project(a)
+        return np.asarray(a @ b.T - left @ (left if b is a else self.project(b)).T)
 
     def solve(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """C^-1 vector (probe,)."""
-        from scipy.linalg import cho_solve
-
-        return np.asarray(vector - self.factors @ cho_solve((self._cholesky, True), self.factors.T @ vector))
+        return np.asarray(self.solve_all(vector[None, :])[0])
 
     def solve_all(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """C^-1 of each of the vectors (vector, probe): what the nuisances leave of them."""
         from scipy.linalg import cho_solve
 
-        return np.asarray(vectors - cho_solve((self._cholesky, True), self.factors.T @ vectors.T).T @ self.factors.T)
+        right = self.factors.T @ vectors.T
+        if self.of_laws is None:
+            fitted = cho_solve((self._cholesky, True), right, check_finite=False)
+            return np.asarray(vectors - fitted.T @ self.factors.T)
+        own = self._laws.half(self.of_laws @ vectors.T)
+        fitted = cho_solve((self._cholesky, True), right - self._shared.T @ own, check_finite=False)
+        of_laws = self._laws.transposed_half(own - self._shared @ fitted)
+        return np.asarray(vectors - fitted.T @ self.factors.T - (self.of_laws.T @ of_laws).T)
 
-    def fitted(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Most probable nuisances (factor,), in prior standard deviations, for a residual (probe,)."""
-        from scipy.linalg import cho_solve
 
-        return np.asarray(cho_solve((self._cholesky, True), self.factors.T @ vector))
+class _RootOfLaws:
+    """L of I + E^T E = L L^T; a diagonal where no probe has two of the columns."""
 
-    @property
-    def variance(self) -> NDArray[np.float64]:
-        """Variance (factor,) of nuisances once the probes are seen, prior variance 1."""
+    def __init__(self, of_laws: csc_array) -> None:
+        if int(np.max(np.diff(of_laws.indptr), initial=0)) <= 1:
+            squares = np.bincount(of_laws.indices, weights=of_laws.data**2, minlength=of_laws.shape[0])
+            self._root = np.sqrt(1.0 + squares)
+            self.log_determinant = 2.0 * float(np.sum(np.log(self._root)))
+        else:
+            self._root = np.linalg.cholesky(np.eye(of_laws.shape[0]) + (of_laws @ of_laws.T).toarray())
+            self.log_determinant = 2.0 * float(np.sum(np.log(np.diag(self._root))))
+
+    def half(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """L^-1 right (factor, vector)."""
         from scipy.linalg import solve_triangular
 
-        half = solve_triangular(self._cholesky, np.eye(len(self._cholesky)), lower=True)
-        return np.asarray(np.sum(half**2, axis=0))
+        if self._root.ndim == 1:
+            return np.asarray(right / self._root[:, None])
+        return np.asarray(solve_triangular(self._root, right, lower=True, check_finite=False))
 
-    @property
-    def half(self) -> NDArray[np.float64]:
-        """L^-1 F^T (factor, probe): C^-1 = I - half^T half."""
+    def transposed_half(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """L^-T right (factor, vector)."""
         from scipy.linalg import solve_triangular
 
-        return np.asarray(solve_triangular(self._cholesky, self.factors.T, lower=True))
+        if self._root.ndim == 1:
+            return np.asarray(right / self._root[:, None])
+        return np.asarray(solve_triangular(self._root, right, lower=True, trans="T", check_finite=False))
 
-    def predicted_sd(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviations (probe,) of other probes with these factors, once the nuisances are fitted on the own ones."""
-        from scipy.linalg import solve_triangular
 
-        half = solve_triangular(self._cholesky, factors.T, lower=True)
-        return np.asarray(np.sqrt(1.0 + np.sum(half**2, axis=0)))
-
-    def widened(self, extra: NDArray[np.float64]) -> "Nuisances":
-        """With more factors (probe, extra); what is known of the old ones is used again."""
-        from scipy.linalg import solve_triangular
-
-        old, new = self.factors.shape[1], extra.shape[1]
-        below = solve_triangular(self._cholesky, self.factors.T @ extra, lower=True).T
-        corner = np.eye(new) + extra.T @ extra - below @ below.T
-        cholesky = np.zeros((old + new, old + new))
-        cholesky[:old, :old] = self._cholesky
-        cholesky[old:, :old] = below
-        cholesky[old:, old:] = np.linalg.cholesky(corner)
-        return Nuisances(np.concatenate([self.factors, extra], axis=1), cholesky)
+def _scaled(of_laws: csc_array, factor: NDArray[np.float64]) -> csc_array:
+    """Columns of (factor, probe) times `factor` (probe,)."""
+    data = of_laws.data * np.repeat(factor, np.diff(of_laws.indptr))
+    return csc_array((data, of_laws.indices, of_laws.indptr), shape=of_laws.shape)

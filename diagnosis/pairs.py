@@ -234,7 +234,7 @@ def _states_of(leading: CurveFit, observed: Observed, table: _NodeTable) -> list
     for law_error, probability in observed.law_errors:
         extra = law_factors(curve, leading.best, effective, observed.groups, law_error)
         own = own_variance(curve, leading.best, effective, law_error)
-        if extra.shape[1] or float(own.max()) >= LEAST_FACTOR:
+        if extra or float(own.max()) >= LEAST_FACTOR:
             moved, nodes, wide, shift = with_law(residual, table.nodes, nuisances, extra, own)
             result.append(state(wide, nodes, moved, shift + math.log(probability)))
     return result
@@ -329,14 +329,9 @@ def _finish_pair(
             for _ in range(2):
                 effective_a = credible(a.weights(np.array([start[0]]))[0] @ solved[: len(a.responses)], seen, places)
                 effective_b = credible(b.weights(np.array([start[1]]))[0] @ solved[len(a.responses) :], seen, places)
-                extra = np.concatenate(
-                    [
-                        law_factors(a, start[0], effective_a, groups, law_error),
-                        law_factors(b, start[1], effective_b, groups, law_error),
-                    ],
-                    axis=1,
-                )
-                if not extra.shape[1]:
+                extra = law_factors(a, start[0], effective_a, groups, law_error)
+                extra = extra.and_of(law_factors(b, start[1], effective_b, groups, law_error))
+                if not extra:
                     break
                 own = own_variance(a, start[0], effective_a, law_error)
                 own = own + own_variance(b, start[1], effective_b, law_error)
@@ -398,8 +393,8 @@ def _pair_integral(
     def grid_of(sa: NDArray[np.float64], sb: NDArray[np.float64]) -> NDArray[np.float64]:
         wa, wb = a.weights(sa), b.weights(sb)
         la, lb = wa @ linear[:count], wb @ linear[count:]
-        qa = np.einsum("si,ij,sj->s", wa, gram[:count, :count], wa)
-        qb = np.einsum("si,ij,sj->s", wb, gram[count:, count:], wb)
+        qa = np.sum(wa @ gram[:count, :count] * wa, axis=1)
+        qb = np.sum(wb @ gram[count:, count:] * wb, axis=1)
         cross = wa @ gram[:count, count:] @ wb.T
         return np.asarray(la[:, None] + lb[None, :] - 0.5 * (qa[:, None] + qb[None, :]) - cross)
 

@@ -21,47 +21,37 @@ def unknown_evidence(
     Every group may have an extra variance tau^2, log-uniform over a grid, with probability UNKNOWN_SHARE; the evidence is
     that of the best combination (each group's tau in turn, several sweeps), its prior in it, of one group at least.
     """
-    from scipy.linalg import cho_factor, cho_solve
-
-    count = len(names)
-    sizes = np.bincount(groups, minlength=count)
+    parts = [np.nonzero(groups == number)[0] for number in range(len(names))]
     factors = nuisances.factors
-    grams = np.stack([factors[groups == g].T @ factors[groups == g] for g in range(count)])
-    sums = np.stack([factors[groups == g].T @ residual[groups == g] for g in range(count)])
-    squares = np.array([float(np.sum(residual[groups == g] ** 2)) for g in range(count)])
+    grams = np.stack([factors[part].T @ factors[part] for part in parts])
+    sums = np.stack([factors[part].T @ residual[part] for part in parts])
+    squares = np.array([float(np.sum(residual[part] ** 2)) for part in parts])
+    sizes = np.array([len(part) for part in parts])
     grid = np.concatenate([[0.0], _UNKNOWN_TAU])
     cost = math.log(UNKNOWN_SHARE / len(_UNKNOWN_TAU))
-    tau2 = np.zeros(count)
-
-    def value(weights: NDArray[np.float64], inner: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
-        factor = cho_factor(inner, lower=True, check_finite=False)
-        determinant = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) - float(sizes @ np.log(weights))
-        return -0.5 * (determinant + float(weights @ squares) - float(vector @ cho_solve(factor, vector)))
-
     one = np.eye(factors.shape[1])
-    base = value(np.ones(count), one + grams.sum(axis=0), sums.sum(axis=0))
+    tau2 = np.zeros(len(parts))
     alone: list[tuple[float, int]] = []
-    best = base
+    base = best = 0.0
     for sweep in range(_SWEEPS):
         changed = False
-        for g in range(count):
-            if sizes[g] == 0:
+        for g, part in enumerate(parts):
+            if not len(part):
                 continue
             weights = 1.0 / (1.0 + tau2)
             weights[g] = 0.0
-            inner = one + np.tensordot(weights, grams, axes=1)
-            vector = weights @ sums
-            found = []
-            for tau in grid:
-                own = 1.0 / (1.0 + tau**2)
-                weights[g] = own
-                found.append(value(weights, inner + own * grams[g], vector + own * sums[g]) + (cost if tau else 0.0))
+            rest: NDArray[np.float64] = np.asarray(np.linalg.cholesky(one + np.tensordot(weights, grams, axes=1)))
+            found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
+            weights[g] = 1.0
+            found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
             if sweep == 0 and not np.any(np.delete(tau2, g)):
-                alone.append((max(found[1:]), g))
+                base = float(found[0])
+                alone.append((float(max(found[1:])) + cost, g))
+            found[1:] += cost
             at = int(np.argmax(found))
             changed |= bool(grid[at] ** 2 != tau2[g])
             tau2[g] = grid[at] ** 2
-            best = found[at] + cost * float(np.count_nonzero(np.delete(tau2, g)))
+            best = float(found[at]) + cost * float(np.count_nonzero(np.delete(tau2, g)))
         if not changed:
             break
     if not np.any(tau2):
@@ -69,3 +59,37 @@ def unknown_evidence(
     else:
         place = int(np.argmax(tau2 * sizes))
     return best - base, str(names[place])
+
+
+def _at_each(
+    weights: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    vector: NDArray[np.float64],
+    factors: NDArray[np.float64],
+    residual: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Log likelihood (weight,) with the probes of one group counting so much, but for a constant that they do not change.
+
+    Args:
+        weights: of these probes, one over their variance (weight,).
+        rest: Cholesky factor of the precision of the nuisances that all others leave (factor, factor).
+        vector: what the others say of the nuisances (factor,).
+        factors, residual: of the group's probes (probe, factor), (probe,).
+    """
+    from scipy.linalg import solve_triangular
+
+    right = np.concatenate([factors, vector[None, :]]).T
+    solved = solve_triangular(rest, right, lower=True, check_finite=False).T
+    across, asked = solved[:-1], solved[-1]
+    values, vectors = np.linalg.eigh(across @ across.T)
+    values = np.maximum(values, 0.0)
+    own = across.T @ residual
+    # both along the eigenvectors of what the group sees of the nuisances
+    of_asked, of_own = vectors.T @ (across @ asked), values * (vectors.T @ residual)
+    grown = 1.0 + np.multiply.outer(weights, values)
+    along = of_asked + np.multiply.outer(weights, of_own)
+    explained = float(asked @ asked) + 2.0 * weights * float(asked @ own) + weights**2 * float(own @ own)
+    explained -= np.sum(weights[:, None] * along**2 / grown, axis=1)
+    determinant = 2.0 * float(np.sum(np.log(np.diag(rest)))) + np.sum(np.log(grown), axis=1)
+    spread = len(residual) * np.log(weights) - weights * float(residual @ residual)
+    return np.asarray(0.5 * (spread + explained - determinant))

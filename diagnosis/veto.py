@@ -10,7 +10,7 @@ from .assemble import Problem
 from .held_out import Gap
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
-from .nuisances import Nuisances
+from .local_nuisances import LocalNuisances
 
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 # of a probe that shows the gap: of 19 sealed effects named rightly none left more than 0.16, of 25 sessions of a second simulator
@@ -107,10 +107,10 @@ def misfit_of(problem: Problem, leading: Hypothesis) -> Misfit:
         width += of_law.shape[1]
         own = own + of_probe
     root = np.sqrt(own)
-    allowed = Nuisances(np.concatenate(factors, axis=1) / root[:, None])
+    allowed = LocalNuisances(np.concatenate(factors, axis=1) / root[:, None], problem.blocks)
     # what nuisances and laws are pulled by counts as well
     beyond = float(residual / root @ allowed.solve(residual / root)) - _USUALLY_LEFT * len(residual)
-    there = float(problem.residual @ Nuisances(problem.factors).solve(problem.residual))
+    there = float(problem.residual @ LocalNuisances(problem.factors, problem.blocks).solve(problem.residual))
     left = beyond / max(there, 1e-12) if beyond > _LEAST_UNFIT * len(residual) else 0.0
     found, known = allowed.fitted(residual / root), 1.0 - allowed.variance
     pulled = [

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curves import Curve
+from .local_nuisances import local_columns
 
 
 class Whitening:
@@ -19,17 +20,15 @@ class Whitening:
 
     def __init__(self, factors: NDArray[np.float64], blocks: NDArray[np.intp]) -> None:
         """`factors` (probe, factor), `blocks` (probe,): block of each probe."""
-        touched = np.abs(factors) > 0
-        first = np.array([blocks[np.argmax(column)] for column in touched.T], dtype=np.intp)
-        local = np.array([bool(np.all(blocks[touched[:, i]] == first[i])) for i in range(factors.shape[1])], dtype=bool)
+        of_block, shared = local_columns(factors, blocks)
         self._members = []
         self._lower = []
         for block in np.unique(blocks):
             members = np.nonzero(blocks == block)[0]
-            own = factors[np.ix_(members, np.nonzero(local & (first == block))[0])]
+            own = factors[np.ix_(members, of_block.get(int(block), np.zeros(0, np.intp)))]
             self._members.append(members)
             self._lower.append(np.linalg.cholesky(np.eye(len(members)) + own @ own.T))
-        self.factors: NDArray[np.float64] = np.ascontiguousarray(self.apply(factors[:, ~local].T).T)
+        self.factors: NDArray[np.float64] = np.ascontiguousarray(self.apply(factors[:, shared].T).T)
 
     def apply(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vectors (vector, probe) with unit noise once the local nuisances are integrated out."""

@@ -10,7 +10,9 @@ from raytwin.diagnosis import inference
 from raytwin.diagnosis.curve_fits import CurveFit, fit_curve, interval_of
 from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.diagnose import _strained
+from raytwin.diagnosis.inexact_laws import group_factors
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.local_nuisances import LocalNuisances, local_columns
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.pairs import (
     PAIR_DOUBT,
@@ -96,9 +98,50 @@ def test_projection_gives_the_inner_product_of_the_inverse_covariance(setup):
     assert nuisances.inner(a[None], b[None])[0, 0] == pytest.approx(a @ np.linalg.solve(covariance, b), rel=1e-9)
     assert nuisances.solve(a) == pytest.approx(np.linalg.solve(covariance, a), rel=1e-8, abs=1e-10)
     assert nuisances.log_determinant == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-10)
-    more = rng.standard_normal((PROBES, 3))
-    wide = nuisances.widened(more)
-    assert wide.log_determinant == pytest.approx(np.linalg.slogdet(covariance + more @ more.T)[1], rel=1e-10)
+
+
+def test_what_laws_add_in_groups_is_integrated_out_as_any_factor_is(setup):
+    rng, factors, _ = setup
+    responses = rng.standard_normal((2, PROBES))
+    one, other = (group_factors(response, GROUPS, 0.7) for response in responses)
+    root = np.sqrt(1.0 + rng.random(PROBES))
+    spread = rng.standard_normal((PROBES, 2))
+    a, b = rng.standard_normal((2, 3, PROBES))
+    alone = Nuisances(factors).over(root, spread, one)
+    for found, laws in ((alone, [one]), (alone.over(np.ones(PROBES), spread[:, :0], other), [one, other])):
+        columns = [factors / root[:, None], spread / root[:, None], one.toarray().T / root[:, None]]
+        columns += [law.toarray().T for law in laws[1:]]
+        full = np.concatenate(columns, axis=1)
+        covariance = np.eye(PROBES) + full @ full.T
+        assert found.log_determinant == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-10)
+        assert found.inner(a, b) == pytest.approx(a @ np.linalg.solve(covariance, b.T), rel=1e-8, abs=1e-9)
+        assert found.solve_all(a) == pytest.approx(np.linalg.solve(covariance, a.T).T, rel=1e-8, abs=1e-9)
+    assert one.shape[0] == len(np.unique(GROUPS))
+
+
+def test_nuisances_of_single_blocks_are_solved_as_all_others(setup):
+    rng, factors, _ = setup
+    blocks = rng.integers(0, 6, PROBES)
+    local = np.zeros((PROBES, 13))
+    for block in range(6):
+        local[blocks == block, 2 * block : 2 * block + 2] = 3.0 * rng.standard_normal((np.sum(blocks == block), 2))
+    everything = np.concatenate([local[:, :5], factors, local[:, 5:]], axis=1)  # one column touches nothing
+    shuffled = everything[:, rng.permutation(everything.shape[1])]
+    of_block, shared = local_columns(shuffled, blocks)
+    assert len(shared) == factors.shape[1]
+    assert sorted(len(columns) for columns in of_block.values()) == [2, 2, 2, 2, 2, 3]
+    found, covariance = LocalNuisances(shuffled, blocks), np.eye(PROBES) + shuffled @ shuffled.T
+    vectors = rng.standard_normal((3, PROBES))
+    solved = np.linalg.solve(covariance, vectors.T).T
+    assert found.solve_all(vectors) == pytest.approx(solved, rel=1e-8, abs=1e-9)
+    assert found.solve(vectors[0]) == pytest.approx(solved[0], rel=1e-8, abs=1e-9)
+    assert found.fitted(vectors[0]) == pytest.approx(shuffled.T @ solved[0], rel=1e-8, abs=1e-9)
+    inverse = np.linalg.inv(covariance)
+    assert found.precision == pytest.approx(np.diag(inverse), rel=1e-8)
+    assert found.variance == pytest.approx(1.0 - np.einsum("pi,pq,qi->i", shuffled, inverse, shuffled), abs=1e-9)
+    more = rng.standard_normal((4, shuffled.shape[1]))
+    left = np.linalg.inv(np.eye(shuffled.shape[1]) + shuffled.T @ shuffled)
+    assert found.known_of(more) == pytest.approx(np.einsum("pi,ij,pj->p", more, left, more), rel=1e-8)
 
 
 def test_whitening_local_nuisances_leaves_the_likelihood_as_it_was(setup):
@@ -272,7 +315,7 @@ def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
     residual = factors @ np.array([-12.0, 2.0, 20.0, 6.0]) + rng.standard_normal(PROBES)
     problem = SimpleNamespace(residual=residual, factor_names=names)
     nothing = Hypothesis(effects=(), probability=1.0, log_evidence=0.0)
-    found = _strained(problem, nothing, Nuisances(factors))
+    found = _strained(problem, nothing, LocalNuisances(factors, np.zeros(PROBES, dtype=int)))
     assert [name for name, _ in found] == ["thickness of PMMA in wedge", "tilt x of flat"]
     # 600 probes of unit noise know each to 0.04
     assert [value for _, value in found] == pytest.approx([-12.0, 6.0], abs=0.25)
@@ -280,7 +323,9 @@ def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
     named = Hypothesis(
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (1.0, 0.9, 1.1)}, variants={"a": effect}
     )
-    assert [name for name, _ in _strained(problem, named, Nuisances(factors))] == ["tilt x of flat"]
+    assert [name for name, _ in _strained(problem, named, LocalNuisances(factors, np.zeros(PROBES, dtype=int)))] == [
+        "tilt x of flat"
+    ]
 
 
 def defined_curve(exact):

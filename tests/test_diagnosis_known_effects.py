@@ -66,6 +66,7 @@ def few():
         factor_names=("level",),
         curves=(curve,),
         groups=np.repeat(np.arange(3), 20),
+        blocks=np.repeat(np.arange(3), 20),
         sd=np.full(probes, 2.0),
         noise=np.full(probes, 0.8),
         respond=lambda asked: {0: np.ones((1, probes))},

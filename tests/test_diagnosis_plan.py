@@ -116,6 +116,10 @@ def test_nodes_are_joined_by_cubics():
     nodes = np.array([0.5, 1.0, 2.0, 4.0])
     at = np.array([0.2, 0.7, 1.5, 3.0, 4.5])
     assert node_weights(nodes, at) @ (nodes**3 - nodes) == pytest.approx(at**3 - at)
+    # fewer nodes and 0 carry what they can
+    assert node_weights(nodes[:3], at) @ (nodes[:3] ** 3 - nodes[:3]) == pytest.approx(at**3 - at)
+    assert node_weights(nodes[:2], at) @ (nodes[:2] ** 2 - nodes[:2]) == pytest.approx(at**2 - at)
+    assert node_weights(nodes[1:2], at) @ (3.0 * nodes[1:2]) == pytest.approx(3.0 * at)
 
 
 def refined(variants, law, residual):
@@ -407,7 +411,7 @@ def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was(
         made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
         noise = 0.7 * rng.standard_normal(size)  # floors make probes' standard deviations wider than their noise
         residual = response * (1.0 + off) + left * other + noise
-        planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=groups)
+        planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=groups, blocks=groups)
         leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
         return misfit_of(planted, leading)
 
@@ -430,7 +434,12 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
         curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
     )
     residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
-    planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=np.repeat(np.arange(20), 30))
+    planted = SimpleNamespace(
+        residual=residual,
+        factors=np.zeros((size, 1)),
+        groups=np.repeat(np.arange(20), 30),
+        blocks=np.zeros(size, dtype=int),
+    )
     leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
     found = misfit_of(planted, leading)
     assert found.pulled == pytest.approx(times, rel=0.35)

@@ -42,6 +42,7 @@ class Few:
     factor_names: tuple[str, ...]
     curves: tuple[Curve, ...]
     groups: np.ndarray
+    blocks: np.ndarray
     sd: np.ndarray
     noise: np.ndarray
     respond: Callable

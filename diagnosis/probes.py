@@ -655,21 +655,23 @@ class MapProjection:
         tolerance: float = 1e-3,
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
-        inside = np.flatnonzero(mask)
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
         sharper, root = np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0))
         correlated = _Correlation(np.asarray(autocovariance_table, dtype=np.float64))
         used: list[Template] = []
-        rows, spread = (np.empty((len(templates), inside.size)) for _ in range(2))
+        rows, spread = (np.empty((len(templates), mask.size)) for _ in range(2))
         for template in templates:
             image = template.image * sharper
             norm = math.sqrt(float(np.vdot(image, image)))
             if not (norm > _LEAST_NORM and math.isfinite(norm)):
                 continue
             image *= sharper / norm
-            rows[len(used)] = image.ravel()[inside]
-            covered = root * correlated(image * root) + image * white_DN2
-            spread[len(used)] = covered.ravel()[inside]
+            rows[len(used)] = image.ravel()  # 0 outside the mask, as the weights are
+            covered = correlated(image * root)
+            covered *= root
+            image *= white_DN2
+            covered += image
+            spread[len(used)] = covered.ravel()
             used.append(template)
         left = rows[: len(used)] @ spread[: len(used)].T
         own = np.diag(left).copy()
@@ -692,7 +694,7 @@ class MapProjection:
             from scipy.linalg import solve_triangular
 
             lower = np.tril(np.stack(columns, axis=1)[chosen])
-            self._rows[:, inside] = solve_triangular(lower, rows[chosen], lower=True)
+            self._rows[:] = solve_triangular(lower, rows[chosen], lower=True, check_finite=False)
         self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
 
     def __len__(self) -> int:

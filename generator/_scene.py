@@ -39,6 +39,7 @@ _LEAST_WEIGHT = 1e-10  # energies that add less to signal and variance are left 
 _BUDGET_BYTES = 600_000_000
 _SINGLE_PRECISION_CELLS = 2_000_000
 _MOST_MADE = 64
+_BEAMS_SHARE = 0.1  # of the budget for beams behind scenes, as large as the last one
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +81,21 @@ class BeamProjection:
         return self._cache.project(self._key, name, weights, self.model, self._scene, self._scale)[0]
 
 
+@dataclass(frozen=True, slots=True)
+class _UsualPicture:
+    """A scene with the spectrum that the twin has: its cells, pixel means (row, column), and the open field's level, any unit."""
+
+    fine: FineCells
+    picture: FloatArray
+    open: float
+
+
 @dataclass(slots=True)
 class ModelCache:
     """Scenes and projections, kept between calls of the forward model; the oldest go first beyond `budget_bytes`.
 
-    draft: pictures are only compared with each other, and may be drawn with less work (see `_spread.spread_maps`); maps
-    whose pixels are all alike are (1, 1).
+    draft: pictures are only compared with each other, and may be drawn with less work (see `_spread.spread_maps`); cells finer
+    than pixels are those of the twin's own spectrum; maps whose pixels are all alike are (1, 1).
     """
 
     budget_bytes: int = _BUDGET_BYTES
@@ -97,6 +107,7 @@ class ModelCache:
     _levels: dict[tuple[object, ...], tuple[object, float, float, float]] = field(default_factory=dict)
     _spectra: "OrderedDict[tuple[object, ...], tuple[object, FloatArray]]" = field(default_factory=OrderedDict)
     _lit: "OrderedDict[tuple[object, ...], tuple[object, int]]" = field(default_factory=OrderedDict)
+    _beams: "OrderedDict[tuple[object, ...], BeamProjection]" = field(default_factory=OrderedDict)
     _lit_held: int = 0
     _spreads: "OrderedDict[tuple[object, ...], tuple[Twin, dict[object, Any]]]" = field(default_factory=OrderedDict)
     _made: "OrderedDict[tuple[object, ...], tuple[object, Any]]" = field(default_factory=OrderedDict)
@@ -179,12 +190,24 @@ class ModelCache:
         scene = None
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
-        maps, fine = self.project(key, "signal", weights, model, scene, attenuation_scale)
+        fine_wanted = twin.noise.psf_model == "aperture"
+        whole = (*key, None if scene is None else scene.number, signal_scale, gain_scale, secondary, fine_wanted)
+        known = self._beams.get(whole)
+        if known is not None and known.model is model:
+            self._beams.move_to_end(whole)
+            return known
+        usual = self._usual(twin, beam, model, scene, key) if fine_wanted else None
+        name = "signal" if usual is None else "signal in pixels"
+        maps, fine = self.project(key, name, weights, model, scene, attenuation_scale)
         signal = signal_scale * maps[0]
         picture = None
-        if fine is not None and twin.noise.psf_model == "aperture":
+        if usual is not None:
+            # as the open field goes; what hardness changes besides is a difference of pixels
+            share = signal_scale * float(weights[0].sum()) / usual.open
+            picture = FinePicture(fine=usual.fine, scale=share, signal_DN=share * usual.picture)
+        elif fine is not None and fine_wanted:
             picture = FinePicture(fine=fine, scale=signal_scale, signal_DN=signal)
-        return BeamProjection(
+        found = BeamProjection(
             model=model,
             weights=weights,
             energies_keV=model.energies_keV[: weights.shape[1]],
@@ -198,6 +221,30 @@ class ModelCache:
             _scene=scene,
             _scale=attenuation_scale,
         )
+        self._beams[whole] = found
+        most = _BEAMS_SHARE * self.budget_bytes / (found.signal_DN.nbytes + found.variance_DN2.nbytes)
+        while len(self._beams) > max(most, 1):
+            self._beams.popitem(last=False)
+        return found
+
+    def _usual(
+        self,
+        twin: Twin,
+        beam: OpenBeam,
+        model: SpectralModel,
+        scene: _Scene | None,
+        key: tuple[object, ...],
+    ) -> "_UsualPicture | None":
+        """For a draft with another spectrum than the twin's: the picture with the twin's; None: to be drawn by itself."""
+        if not self.draft or scene is None or not scene.borders.any_steps or twin.spectral is None:
+            return None
+        shape, _ = self._split(model, np.asarray(twin.spectral.best, dtype=np.float64), beam)
+        own = (id(model), beam, shape.tobytes(), ())
+        if own == key:
+            return None
+        weights = self._shape_weights(model, shape, beam)
+        maps, fine = self.project(own, "signal", weights, model, scene, {})
+        return None if fine is None else _UsualPicture(fine, maps[0], float(weights[0].sum()))
 
     def _without_spectrum(self, twin: Twin, request: "SeriesRequest", level: Level | None) -> BeamProjection:
         if request.thickness_mm:

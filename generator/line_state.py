@@ -16,7 +16,7 @@ The stages follow the order in which a real line works:
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +140,11 @@ class LineState:
     bad_seed: int = 0
 
 
+def _made_anew(owner: object, name: object, make: Callable[[], Any]) -> Any:
+    """Where nothing is kept."""
+    return make()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineContext:
     """What an effect may know besides the state.
@@ -147,7 +152,8 @@ class LineContext:
     Fields: twin; request; model (spectral, or None); since (`always` or `calibration`); weights (2, energy): what each
     energy of the open beam adds to signal and to quantum variance, any scale; energies_keV (energy,); project:
     (name, weights (k, energy)) -> maps (k, row, column) behind the scene, or (k, 1, 1) in the open field; open_signal_DN
-    of one exposure; options of the effect that are words.
+    of one exposure; options of the effect that are words; made_of: (thing, name, make) -> what is made of a thing once, kept under
+    the name for as long as others ask for it (small results alone).
     """
 
     twin: "Twin"
@@ -159,6 +165,7 @@ class LineContext:
     project: Callable[[str, FloatArray], FloatArray] | None
     open_signal_DN: float
     options: Mapping[str, str]
+    made_of: Callable[[object, object, Callable[[], Any]], Any] = _made_anew
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -266,7 +266,7 @@ class _Choice:
     def line(self, twin: Twin, request: SeriesRequest, cache: ModelCache) -> tuple[LineState, "_Charge"]:
         """The final state of the line for a request, but for its light, and what one exposure brings."""
         lit, late = _lit(twin, request, self, cache)
-        return _read_out(twin, request, lit, late), lit.charge
+        return _read_out(twin, request, lit, late, cache), lit.charge
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,6 +308,7 @@ def _context(
     request: SeriesRequest,
     applied: AppliedEffect | None,
     projection: BeamProjection | None,
+    cache: ModelCache,
 ) -> LineContext:
     return LineContext(
         twin=twin,
@@ -319,6 +320,7 @@ def _context(
         project=None if projection is None else projection.moments,
         open_signal_DN=0.0 if projection is None else projection.open_signal_DN,
         options={} if applied is None else applied.options,
+        made_of=cache.made_of,
     )
 
 
@@ -337,7 +339,7 @@ def final_state(
     """
     cache = ModelCache() if cache is None else cache
     lit, late = _lit(twin, request, _Choice(effects, parameters, use_measured_level), cache)
-    return _read_out(twin, request, lit.at_load(), late)
+    return _read_out(twin, request, lit.at_load(), late, cache)
 
 
 @dataclass(frozen=True, slots=True)
@@ -483,7 +485,7 @@ def _drawn(
         model = cache.model(twin, request)
         for applied, effect, numbers in early:
             if effect.stage == "beam":
-                context = replace(_context(twin, request, applied, None), model=model)
+                context = replace(_context(twin, request, applied, None, cache), model=model)
                 state = effect.change(state, numbers, context)
         projection = cache.projection(
             twin,
@@ -504,7 +506,7 @@ def _drawn(
         )
         for applied, effect, numbers in early:
             if effect.stage != "beam":
-                state = effect.change(state, numbers, _context(twin, request, applied, projection))
+                state = effect.change(state, numbers, _context(twin, request, applied, projection, cache))
         if twin.noise.psf_model != "aperture" and state.shift_px != (0.0, 0.0):
             # points, not means over pixels: a step between two of them has no place that a transform could move
             state = replace(
@@ -556,11 +558,11 @@ def _cubic(distance_px: float) -> float:
     return ((-0.5 * distance_px + 2.5) * distance_px - 4.0) * distance_px + 2.0
 
 
-def _read_out(twin: Twin, request: SeriesRequest, lit: "_Lit", late: "_Active") -> LineState:
+def _read_out(twin: Twin, request: SeriesRequest, lit: "_Lit", late: "_Active", cache: ModelCache) -> LineState:
     """All stages from the exposure on."""
     state = lit.state
     for applied, effect, numbers in late:
-        state = effect.change(state, numbers, _context(twin, request, applied, lit.projection))
+        state = effect.change(state, numbers, _context(twin, request, applied, lit.projection, cache))
     return state
 
 
@@ -849,7 +851,7 @@ def sample_series(
     cache = ModelCache() if cache is None else cache
     choice = _Choice(effects, parameters, use_measured_level)
     lit, late = _lit(twin, request, choice, cache)
-    state, charge = _read_out(twin, request, lit.at_load(), late), lit.charge
+    state, charge = _read_out(twin, request, lit.at_load(), late, cache), lit.charge
     shape = twin.maps.shape
     interval = request.interval_s(twin.instrument.readout_ms)
     averaged = request.exposures_per_frame

@@ -153,15 +153,23 @@ def _albedo(name: str, energy_keV: float) -> float:
     return 1.0 - float(mass_photoelectric_cm2_g(material, energy_keV)) / total
 
 
-def _shared_at_borders(field: FloatArray, signal: FloatArray, depth: FloatArray) -> FloatArray:
-    """The field (k, row, column) with pixels that a sharp border cuts shared between the values on either side."""
+_Shared = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], FloatArray]
+
+
+def _cut_by_borders(signal: FloatArray, depth: FloatArray) -> _Shared:
+    """Pixels that a sharp border cuts, those to either side of it, and the share of each that lies behind the object."""
     borders = find_borders(depth, least_depth=_BORDER_DEPTH)
-    if not borders.pixel.size:
-        return field
-    flat, bright = field.reshape(len(field), -1).copy(), signal.ravel()
+    bright = signal.ravel()
     thick, thin = bright[borders.thick], bright[borders.thin]
     covered = np.clip((thin - bright[borders.pixel]) / np.maximum(thin - thick, 1e-30), 0.0, 1.0)
-    flat[:, borders.pixel] = covered * flat[:, borders.thick] + (1.0 - covered) * flat[:, borders.thin]
+    return borders.pixel, borders.thick, borders.thin, covered
+
+
+def _shared_at_borders(field: FloatArray, shared: _Shared) -> FloatArray:
+    """The field (k, row, column) with pixels that a sharp border cuts shared between the values on either side."""
+    pixel, thick, thin, covered = shared
+    flat = field.reshape(len(field), -1)
+    flat[:, pixel] = covered * flat[:, thick] + (1.0 - covered) * flat[:, thin]
     return flat.reshape(field.shape)
 
 
@@ -201,7 +209,9 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
     own = parameters["own_albedo"]
     source = depth if own == 0 else depth * (1.0 + own * (_scattering_share(context, energy_keV) - 1.0))
     field = np.stack([signal * source, np.broadcast_to(state.variance_DN2, shape) * source])
-    field = _shared_at_borders(field, signal, depth)
+    # whatever scatters, borders lie where they lie
+    shared = context.made_of(state.signal_DN, "borders of what scatters", lambda: _cut_by_borders(signal, depth))
+    field = _shared_at_borders(field, shared)
     scattered = _spread(field, pitch, here)
     centre = _share_at_centre(context.shape, pitch, at_usual_gap)
     behind_water = -np.log(float(behind.sum()) / float(weights.sum()))

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _pair_loops
+
 LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
 STRENGTH_NODES = 25
 
@@ -61,38 +63,7 @@ class Curve:
 
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
-    if len(nodes) < 4:
-        return _through_all(nodes, strengths)
-    points = np.concatenate([[0.0], nodes])
-    result = np.zeros((len(strengths), len(nodes)))
-    used = 4
-    # the interval's two points and their neighbours; the point 0 adds nothing
-    first = np.clip(np.searchsorted(points, strengths) - used // 2, 0, len(points) - used)
-    row = np.arange(len(strengths))
-    for i in range(used):
-        at = first + i
-        weight = np.ones(len(strengths))
-        for j in range(used):
-            if j != i:
-                other = points[first + j]
-                weight *= (strengths - other) / (points[at] - other)
-        inner = at > 0
-        result[row[inner], at[inner] - 1] = weight[inner]
-    return result
-
-
-def _through_all(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same of the one polynomial through 0 and all nodes."""
-    result = np.empty((len(strengths), len(nodes)))
-    points = [float(node) for node in nodes]
-    away = [strengths - point for point in points]
-    for i, point in enumerate(points):
-        weight, below = strengths, point
-        for j, other in enumerate(points):
-            if j != i:
-                weight, below = weight * away[j], below * (point - other)
-        result[:, i] = weight / below
-    return result
+    return np.asarray(_pair_loops.node_weights(nodes, strengths))
 
 
 def log_strength_nodes(low: float, high: float, count: int = STRENGTH_NODES) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ._pair_loops import pair_integral, pair_likelihood
 from .curve_fits import CurveFit, fit_curve, interval_under, log_mean_exp
 from .curves import Curve
 from .inexact_laws import LEAST_FACTOR, credible, law_factors, own_variance, with_law
@@ -380,50 +381,28 @@ class _PairGrid:
 def _pair_terms(
     model: Nuisances, nodes: NDArray[np.float64], residual: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return model.inner(nodes, residual[None, :])[:, 0], model.inner(nodes, nodes)
+    return model.inner(nodes, residual[None, :]).ravel(), model.inner(nodes, nodes)
 
 
 def _pair_integral(
     a: Curve, b: Curve, terms: tuple[NDArray[np.float64], NDArray[np.float64]], shift: float
 ) -> _PairGrid:
     """Mean likelihood of two effects on a grid of both strengths that closes in on the best."""
-    linear, gram = terms
-    count = len(a.responses)
+    nodes = a.strengths, b.strengths
+    ranges = (math.log(a.low), math.log(a.high)), (math.log(b.low), math.log(b.high))
+    value, at_a, at_b, grid = pair_integral(*nodes, *terms, *ranges, _PAIR_NODES)
+    result = _PairGrid(log_integral=value + shift, first=np.exp(at_a), second=np.exp(at_b), log_likelihood=grid + shift)
 
-    def grid_of(sa: NDArray[np.float64], sb: NDArray[np.float64]) -> NDArray[np.float64]:
-        wa, wb = a.weights(sa), b.weights(sb)
-        la, lb = wa @ linear[:count], wb @ linear[count:]
-        qa = np.sum(wa @ gram[:count, :count] * wa, axis=1)
-        qb = np.sum(wb @ gram[count:, count:] * wb, axis=1)
-        cross = wa @ gram[:count, count:] @ wb.T
-        return np.asarray(la[:, None] + lb[None, :] - 0.5 * (qa[:, None] + qb[None, :]) - cross)
+    def likelihood(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(pair_likelihood(*nodes, *terms, of_a, of_b))
 
-    xa = np.linspace(math.log(a.low), math.log(a.high), _PAIR_NODES)
-    xb = np.linspace(math.log(b.low), math.log(b.high), _PAIR_NODES)
-    range_a, range_b = xa[-1] - xa[0], xb[-1] - xb[0]
-    result: _PairGrid | None = None
-    for _ in range(7):
-        grid = grid_of(np.exp(xa), np.exp(xb)) + shift
-        top = float(grid.max())
-        inner = np.trapezoid(np.exp(grid - top), xb, axis=1)
-        value = top + math.log(max(float(np.trapezoid(inner, xa)), 1e-300) / (range_a * range_b))
-        result = _PairGrid(log_integral=value, first=np.exp(xa), second=np.exp(xb), log_likelihood=grid)
-        near = grid > top - 8.0
-        rows, columns = np.nonzero(near.any(axis=1))[0], np.nonzero(near.any(axis=0))[0]
-        if len(rows) >= 6 and len(columns) >= 6:
-            break
-        # zoom to where the likelihood lies, one node to each side
-        xa = np.linspace(xa[max(rows[0] - 1, 0)], xa[min(rows[-1] + 1, len(xa) - 1)], _PAIR_NODES)
-        xb = np.linspace(xb[max(columns[0] - 1, 0)], xb[min(columns[-1] + 1, len(xb) - 1)], _PAIR_NODES)
-    if result is None:
-        raise RuntimeError("no grid was tried")
     best, top = result.best, float(result.log_likelihood.max()) - shift
     less_a, less_b = (
         curve.low * _BELOW if at < 1.001 * curve.low else None for curve, at in zip((a, b), best, strict=True)
     )
     below = (
-        0.0 if less_a is None else float(grid_of(less_a, np.array([best[1]])).max()) - top,
-        0.0 if less_b is None else float(grid_of(np.array([best[0]]), less_b).max()) - top,
+        0.0 if less_a is None else float(likelihood(less_a, np.array([best[1]])).max()) - top,
+        0.0 if less_b is None else float(likelihood(np.array([best[0]]), less_b).max()) - top,
     )
     return replace(result, below=below)
 

@@ -27,7 +27,7 @@ from .nuisance_columns import Columns
 from .placing import place_scenes
 from .probes import ProbeName, expected_scalars
 from .responses import Asked, Moved, SeriesModel, SessionModel, session_model
-from .series_block import SeriesBlock, by_chance, series_block
+from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
 from .session import SessionSeries, only_own_noise, read_session
 from .summaries import SeriesSummary
@@ -454,7 +454,8 @@ def _curves(
     curves: list[Curve] = []
     chosen: list[Variant] = []
     missing: dict[str, str] = {}
-    readout_ms = compared.measured.expected.model.base.instrument.readout_ms
+    base = compared.measured.expected.model.base
+    readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
     for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
         failed = next((compared.asked[row].failed for row in rows if compared.asked[row].failed), "")
         if failed:
@@ -467,12 +468,10 @@ def _curves(
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
-        jitter = None
-        if variant.effect == "gain_map_error":
-            jitter = np.concatenate([block.pattern_jitter for block in blocks])
         exact = None
         if variant.effect in scales.DEFINED_BY:
             exact = np.array([name.statistic == scales.DEFINED_BY[variant.effect] for name in names])
+        jitter = jitter_of(variant, blocks, read_noise_DN)
         curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
         chosen.append(variant)
     for curve in curves:

@@ -258,6 +258,13 @@ def changed_gain_pattern(
     return smooth, rest
 
 
+def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Variance (2, probe) that noise of 1 DN, new in every exposure and common to rows (to columns), leaves in a mean frame."""
+    request = probes.series.session.request
+    variance = probes.projection.line_noise() / (request.frames * request.exposures_per_frame)
+    return np.pad(variance, ((0, 0), (0, len(probes) - variance.shape[1])))
+
+
 @lru_cache(maxsize=1)
 def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """The smooth part of 1 % of a changed gain map: waves (wave, row, column) that it holds by chance."""

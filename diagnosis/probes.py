@@ -689,6 +689,7 @@ class MapProjection:
             for item in (used[number] for number in chosen)
         )
         # (probe, pixel), 0 outside the mask: so maps are taken as they are
+        self._shape = mask.shape
         self._rows = np.zeros((len(chosen), mask.size), np.float32)
         if chosen:
             from scipy.linalg import solve_triangular
@@ -720,6 +721,11 @@ class MapProjection:
         """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
         variance = np.asarray(sd_DN, dtype=np.float32).ravel() ** 2
         return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
+
+    def line_noise(self) -> NDArray[np.float64]:
+        """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""
+        pixels = self._rows.reshape(len(self), *self._shape)
+        return np.stack([np.sum(pixels.sum(axis=axis, dtype=np.float64) ** 2, axis=1) for axis in (2, 1)])
 
     def names(self) -> list[ProbeName]:
         """One name a probe."""

@@ -15,6 +15,7 @@ from .nuisance_columns import (
     gain_map_noise,
     level_of,
     local_nuisances,
+    noise_of_lines,
     offset_of_later,
     uneven,
 )
@@ -31,8 +32,8 @@ class SeriesBlock:
 
     Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
     (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
-    pattern_jitter (probe,): what 1 % of a changed gain map does by chance; uneven (2, probe), by number of change: more of it on one
-    side of the panel.
+    pattern_jitter (probe,): what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to
+    rows (to columns) does; uneven (2, probe), by number of change: more of it on one side of the panel.
     """
 
     session: SessionSeries
@@ -45,6 +46,7 @@ class SeriesBlock:
     offset: NDArray[np.float64]
     pattern: NDArray[np.float64]
     pattern_jitter: NDArray[np.float64]
+    lines: NDArray[np.float64]
     uneven: dict[int, NDArray[np.float64]]
 
     def __len__(self) -> int:
@@ -94,6 +96,7 @@ def series_block(
         offset=offset_of_later(probes) * shrink,
         pattern=pattern * shrink[:, None],
         pattern_jitter=jitter * shrink**2,
+        lines=noise_of_lines(probes) * shrink**2,
         uneven={number: columns * shrink for number, columns in by_side.items()},
     )
 
@@ -124,6 +127,21 @@ def by_chance(
     if variant.effect == "gain_map_error":
         return np.concatenate([block.pattern for block in blocks])
     return _of_output(variant, blocks, readout_ms) if variant.effect == "output_drift" else None
+
+
+def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
+    """Variance (probe,) a unit of strength squared that an effect gives each probe by itself; None: none.
+
+    A gain map changes from pixel to pixel; lines of a few frames differ by chance in their means.
+    """
+    if variant.effect == "gain_map_error":
+        return np.concatenate([block.pattern_jitter for block in blocks])
+    if variant.effect == "row_noise":
+        columns = variant.parameters["column_share"]
+        shares = read_noise_DN**2 * np.array([1.0 - columns, columns])
+        every = variant.since == "always"
+        return np.concatenate([shares @ block.lines * float(every or not block.session.calibrates) for block in blocks])
+    return None
 
 
 def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:

@@ -18,6 +18,7 @@ from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it
 _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
+_DRAWS = 300
 _UNSEEN = 3.0  # standard deviations of a probe
 
 
@@ -112,6 +113,12 @@ def left_over(
     return np.asarray(left / np.sqrt(own[~fit] + known.known_of(held)))
 
 
+def noise_alone(problem: Problem, fit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """What a repeat of the same measurement would show outside `fit`: counting noise, of all that nuisances fitted there allow."""
+    inner = LocalNuisances(problem.factors[fit], problem.blocks[fit])
+    return np.asarray(problem.noise[~fit] / np.sqrt(1.0 + inner.known_of(problem.factors[~fit])))
+
+
 def held_out(
     problem: Problem, leading: Hypothesis, rng: np.random.Generator
 ) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
@@ -120,7 +127,7 @@ def held_out(
     size = len(problem.residual)
     before, after = np.full(size, np.nan), np.full(size, np.nan)
     alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}
-    sds = np.ones(size)
+    noise = np.ones(size)
     effects = [effect for effect in leading.effects if effect != UNKNOWN]
     for fold in (0, 1):
         fit = folds != fold
@@ -128,67 +135,73 @@ def held_out(
         if not fit.any() or not held.any():
             continue
         before[held] = left_over(problem, fit)
-        inner = LocalNuisances(problem.factors[fit], problem.blocks[fit])
-        sds[held] = np.sqrt(1.0 + inner.known_of(problem.factors[held]))
+        noise[held] = noise_alone(problem, fit)
         strengths = strengths_on(problem, leading, effects, fit)
         added = [(leading.variants[effect], strengths[effect]) for effect in effects]
         after[held] = left_over(problem, fit, added) if effects else before[held]
         for one, effect in zip(added, effects, strict=True):
             alone[effect][held] = left_over(problem, fit, [one])
     known = np.isfinite(before)
-    before, after, sd, series = before[known], after[known], sds[known], problem.series_of[known]
+    before, after, noise, series = before[known], after[known], noise[known], problem.series_of[known]
     axes = np.array([name.axis for name in problem.names])[known]
     if before.size == 0:
         return Gap(before=1.0, after=1.0, floor=1.0, shrinks_by=None), (), {}
 
-    def rms(values: NDArray[np.float64], chosen: NDArray[np.bool_] | None = None) -> float:
-        use = values if chosen is None else values[chosen]
-        return float(math.sqrt(np.mean(use**2))) if use.size else 1.0
-
-    # what a repeat of the same measurement would show: counting noise without all that the twin's nuisances allow
-    noise = problem.noise[known] / sd
-    floor = rms(noise)
+    floor = _rms(noise)
     rows = []
     for axis in dict.fromkeys(axes):
         chosen = axes == axis
-        rows.append((str(axis), rms(before, chosen), rms(after, chosen), rms(noise, chosen)))
-
-    def share(values: NDArray[np.float64]) -> tuple[float, float, float] | None:
-        scale = 1.0 / math.sqrt(2.0 * before.size)
-        if rms(before) < floor + 3.0 * scale:
-            return None
-        point = (rms(before) - rms(values)) / (rms(before) - floor)
-        draws = []
-        numbers = np.unique(series)
-        members = [np.nonzero(series == number)[0] for number in numbers]
-        b2, v2 = before**2, values**2
-        sums = np.array([[b2[m].sum(), v2[m].sum(), len(m)] for m in members])
-        for _ in range(300):
-            total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)
-            b, v = math.sqrt(total[0] / total[2]), math.sqrt(total[1] / total[2])
-            if b > floor + scale:
-                draws.append((b - v) / (b - floor))
-        if len(draws) < 100:
-            return None
-        low, high = np.quantile(draws, [0.025, 0.975])
-        return point, min(float(low), point), max(float(high), point)
-
+        rows.append((str(axis), _rms(before[chosen]), _rms(after[chosen]), _rms(noise[chosen])))
     shares = {}
     for effect, values in alone.items():
-        found = share(values[known])
+        found = shrinkage_of(before, values[known], floor, series, rng)
         if found is not None:
             shares[effect] = found
     shown = np.abs(before) > _SHOWN
     left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
     gap = Gap(
-        before=rms(before),
-        after=rms(after),
+        before=_rms(before),
+        after=_rms(after),
         floor=floor,
-        shrinks_by=share(after) if effects else None,
+        shrinks_by=shrinkage_of(before, after, floor, series, rng) if effects else None,
         left=left,
         contradicted=contradicted_share(before, after, problem.parts[known]),
     )
     return gap, tuple(rows), shares
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(math.sqrt(np.mean(values**2))) if values.size else 1.0
+
+
+def shrinkage_of(
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    floor: float,
+    series: NDArray[np.intp],
+    rng: np.random.Generator,
+) -> tuple[float, float, float] | None:
+    """Share of the gap above the floor that is gone, and its 95 % interval, series drawn again; None: no gap above the floor.
+
+    before, after: held-out probes (probe,), in standard deviations; floor: rms of noise alone; series of each probe (probe,).
+    """
+    scale = 1.0 / math.sqrt(2.0 * max(before.size, 1))
+    if _rms(before) < floor + 3.0 * scale:
+        return None
+    point = (_rms(before) - _rms(after)) / (_rms(before) - floor)
+    draws = []
+    numbers = np.unique(series)
+    members = [np.nonzero(series == number)[0] for number in numbers]
+    sums = np.array([[np.sum(before[m] ** 2), np.sum(after[m] ** 2), len(m)] for m in members])
+    for _ in range(_DRAWS):
+        total = sums[rng.integers(0, len(numbers), len(numbers))].sum(axis=0)
+        was, left = math.sqrt(total[0] / total[2]), math.sqrt(total[1] / total[2])
+        if was > floor + scale:
+            draws.append((was - left) / (was - floor))
+    if len(draws) < _DRAWS // 3:
+        return None
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return point, min(float(low), point), max(float(high), point)
 
 
 def contradicted_share(before: NDArray[np.float64], after: NDArray[np.float64], places: NDArray[np.intp]) -> float:

@@ -18,6 +18,7 @@ from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.placing import ALONG_ROWS
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.refine import refine
+from raytwin.diagnosis.series_block import jitter_of
 from raytwin.diagnosis.veto import leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects.effect import spread_transfer
@@ -358,6 +359,21 @@ def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_giv
 
 def test_every_effect_of_the_catalogue_has_a_measurement_that_isolates_it():
     assert set(ISOLATED_BY) == set(EFFECTS)
+
+
+@pytest.mark.parametrize(("since", "calibrating"), [("always", 1.0), ("calibration", 0.0)])
+def test_lines_give_each_series_that_has_them_chance_by_their_direction(since, calibrating):
+    def block(calibrates):
+        lines = np.array([[1.0, 2.0, 0.0], [10.0, 20.0, 0.0]])
+        return SimpleNamespace(lines=lines, session=SimpleNamespace(calibrates=calibrates))
+
+    blocks = [block(True), block(False)]
+    rows, columns = (
+        SimpleNamespace(effect="row_noise", since=since, parameters={"column_share": share}) for share in (0.0, 1.0)
+    )
+    assert jitter_of(rows, blocks, 3.0) == pytest.approx([9 * calibrating, 18 * calibrating, 0, 9, 18, 0])
+    assert jitter_of(columns, blocks, 3.0) == pytest.approx([90 * calibrating, 180 * calibrating, 0, 90, 180, 0])
+    assert jitter_of(SimpleNamespace(effect="kv_error"), blocks, 3.0) is None
 
 
 def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():

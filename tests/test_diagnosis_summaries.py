@@ -353,6 +353,16 @@ def test_a_stack_of_maps_is_projected_as_its_maps_are_and_pixel_noise_adds_in_sq
     np.testing.assert_allclose(projection.pixel_noise(sd), (sd.ravel() ** 2) @ weights**2, rtol=1e-4)
 
 
+def test_noise_of_lines_moves_what_is_projected_along_them():
+    rng = np.random.default_rng(6)
+    projection, mask, *_ = _projection(rng)
+    rows, columns = mask.shape
+    weights = projection.apply(np.eye(mask.size).reshape(-1, rows, columns)).T.reshape(-1, rows, columns)
+    of_rows = sum(weights[:, row, :].sum(axis=1) ** 2 for row in range(rows))
+    of_columns = sum(weights[:, :, column].sum(axis=1) ** 2 for column in range(columns))
+    np.testing.assert_allclose(projection.line_noise(), [of_rows, of_columns], rtol=1e-4)
+
+
 @pytest.mark.parametrize("frames", [9, 30])
 def test_the_logarithm_of_a_variance_from_few_frames_is_unbiased_and_as_uncertain_as_said(frames):
     rng, draws = np.random.default_rng(8), 4000

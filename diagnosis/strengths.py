@@ -16,7 +16,6 @@ from .even_maps import Map, mean_over
 from .inference import Hypothesis
 from .nuisances import Nuisances
 from .output_course import rms_about_mean
-from .whitening import Whitening
 
 _LAW_SD = 0.12  # relative, of a strength as real effects have it
 # the same where it is known better or worse: 34 sealed voltages and filters were off by 2 % rms; a K photon's reach stands for how
@@ -158,8 +157,8 @@ def strengths_on(
     strengths = {effect: leading.strengths[effect][0] for effect in effects}
     if not effects:
         return strengths
-    whitening = Whitening(problem.factors[fit], problem.blocks[fit])
-    inner, groups, places = Nuisances(whitening.factors), problem.groups[fit], problem.places[fit]
+    # local nuisances are not integrated out first: what whitening makes of a heel's tilts in half of a session is of another law
+    inner, groups, places = Nuisances(problem.factors[fit]), problem.groups[fit], problem.places[fit]
     for _ in range(3 if len(effects) > 1 else 1):
         for effect in effects:
             curve = leading.variants[effect]
@@ -176,7 +175,6 @@ def strengths_on(
                 jitter=None if curve.jitter is None else curve.jitter[fit],
                 exact=None if curve.exact is None else curve.exact[fit],
             )
-            residual = whitening.apply((problem.residual - others)[None, fit])[0]
-            result = fit_curve(residual, whitening.curves([part])[0], inner, groups, places=places)
+            result = fit_curve((problem.residual - others)[fit], part, inner, groups, places=places)
             strengths[effect] = result.best
     return strengths

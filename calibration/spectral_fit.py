@@ -51,6 +51,8 @@ _ROUND_DRAWS = 1024
 _FINAL_DRAWS = 2048
 _ROUNDS = 12
 _KEPT = 512
+_LEAST_EFFECTIVE = 40.0  # draws that must count
+_MORE_ROUNDS, _MORE_DRAWS = 8, 8192  # where fewer do after those rounds
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
 _BELOW_END = 0.85  # of kV in keV: up to here a measured spectrum corrects the model
 _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
@@ -563,7 +565,12 @@ class _Posterior:
         temper, effective = 0.0, 0.0
         weight = np.full(len(u), 1.0 / len(u))
         likelihood = self.log_likelihood(u)
-        for _ in range(_ROUNDS):
+        for number in range(_ROUNDS + _MORE_ROUNDS):
+            if number >= _ROUNDS:
+                # a posterior that its own covariance does not describe: more draws, for as long as too few count
+                weight, effective = _weights(likelihood + log_ratio)
+                if effective >= _LEAST_EFFECTIVE:
+                    break
             temper = _next_temper(likelihood, log_ratio, last=temper, least=0.1 * len(u))
             weight, effective = _weights(temper * likelihood + log_ratio)
             if temper >= 1.0 and effective > _ENOUGH:
@@ -574,12 +581,14 @@ class _Posterior:
             # few effective draws make a covariance too narrow in some direction
             covariance = covariance * (1.0 + 2.0 * len(mean) / max(effective, 1.0)) + 1e-8 * np.eye(len(mean))
             draws = _FINAL_DRAWS if temper >= 0.3 else _ROUND_DRAWS
+            if number >= _ROUNDS:
+                draws = _MORE_DRAWS
             u, log_proposal = _mixture_draws(mean, covariance, draws, rng)
             log_ratio = -0.5 * np.sum(u**2, axis=1) - 0.5 * u.shape[1] * math.log(2 * math.pi) - log_proposal
             likelihood = self.log_likelihood(u)
         else:
             weight, effective = _weights(likelihood + log_ratio)
-        if effective < 40:
+        if effective < _LEAST_EFFECTIVE:
             raise FitError(
                 f"the posterior of the spectrum could not be drawn (effective sample size {effective:.0f});"
                 " the levels contradict each other or the declared instrument"

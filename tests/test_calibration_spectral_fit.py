@@ -8,6 +8,7 @@ from scipy.stats import binom, truncnorm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, filters_from_text
+from raytwin.calibration import spectral_fit
 from raytwin.calibration.priors import DEPARTURE_FACTOR, DEPARTURES, GAIN_DISCREPANCY, LEVEL_DISCREPANCY
 from raytwin.calibration.spectral_fit import (
     OTHER_SCINTILLATOR,
@@ -357,6 +358,19 @@ def test_measured_spectra_fix_the_filtration_and_what_follows_from_it():
     draws = np.log(known.signal(posterior.samples, new).rate_DN_per_mAs)
     exact = math.log(known.signal(truth[None, :], new).rate_DN_per_mAs[0])
     assert abs(np.median(draws) - exact) < 0.015
+
+
+def test_a_posterior_that_is_hard_to_draw_is_drawn_on(model, monkeypatch):
+    truth = typical(model, inherent_filtration_mm_Al=1.4, kV_error=-0.006)
+    levels = levels_of(model, truth, BEAMS)
+    monkeypatch.setattr(spectral_fit, "_ROUNDS", 1)
+    monkeypatch.setattr(spectral_fit, "_ROUND_DRAWS", 64)
+    fit = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
+    assert fit.effective_draws >= 40
+    assert fit.chi_square < 0.5
+    monkeypatch.setattr(spectral_fit, "_MORE_ROUNDS", 0)
+    with pytest.raises(FitError, match="could not be drawn"):
+        fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
 
 
 def test_what_cannot_be_fitted_is_said():

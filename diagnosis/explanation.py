@@ -162,9 +162,8 @@ def _verdict_text(diagnosis: Diagnosis) -> str:
     )
     text = f"{where} It is explained by: {named}. {figures}"
     if gap.shrinks_by is not None:
-        text += (
-            f" and falls to {gap.after:.2f} once that is added, by {_percent(gap.shrinks_by)} of what is above noise."
-        )
+        value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
+        text += f" and falls to {gap.after:.2f} once that is added, by {_percent((value, low, high))} of what is above noise."
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
     return text

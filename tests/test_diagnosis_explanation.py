@@ -98,6 +98,10 @@ def test_an_explanation_states_strength_interval_probability_and_what_is_left():
     text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",)))
     assert "12.3 % (9.9 to 14.8), probability 0.94" in text
     assert "falls to 1.20 once that is added, by 82 % (75 to 90) of what is above noise" in text
+    # what is left may lie below the floor by chance; no gap shrinks by more than itself
+    beyond = Gap(before=3.0, after=0.78, floor=0.8, shrinks_by=(1.01, 0.97, 1.04))
+    text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",), gap=beyond))
+    assert "falls to 0.78 once that is added, by 100 % (97 to 100) of what is above noise" in text
     lower = cause("kv_error", 0.9, (2.0, 1.5, 2.5), sign=-1.0)
     assert "-2.00 % (-2.50 to -1.50)" in paragraph(diagnosis("explained", causes=(lower,), named=("kv_error",)))
 

@@ -114,7 +114,7 @@ def pair_integral(nodes_a: Any, nodes_b: Any, linear: Any, gram: Any, range_a: A
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _where(grid: Any, level: float) -> Any:
-    """First and last row and how many rows hold values above a level, and the same of columns."""
+    """First and last row and how many rows hold values above a level, and the same of columns; all where none does (NaN)."""
     rows, columns = np.zeros(grid.shape[0], np.bool_), np.zeros(grid.shape[1], np.bool_)
     for i in range(grid.shape[0]):
         for j in range(grid.shape[1]):
@@ -122,4 +122,6 @@ def _where(grid: Any, level: float) -> Any:
                 rows[i] = True
                 columns[j] = True
     of_rows, of_columns = np.nonzero(rows)[0], np.nonzero(columns)[0]
+    if len(of_rows) == 0:
+        return 0, len(rows) - 1, len(rows), 0, len(columns) - 1, len(columns)
     return of_rows[0], of_rows[-1], len(of_rows), of_columns[0], of_columns[-1], len(of_columns)

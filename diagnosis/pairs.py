@@ -391,6 +391,8 @@ def _pair_integral(
     nodes = a.strengths, b.strengths
     ranges = (math.log(a.low), math.log(a.high)), (math.log(b.low), math.log(b.high))
     value, at_a, at_b, grid = pair_integral(*nodes, *terms, *ranges, _PAIR_NODES)
+    if not math.isfinite(value):
+        raise ValueError(f"the likelihood of {a.effect} and {b.effect} is no number")
     result = _PairGrid(log_integral=value + shift, first=np.exp(at_a), second=np.exp(at_b), log_likelihood=grid + shift)
 
     def likelihood(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from raytwin.diagnosis.pairs import (
     PAIR_DOUBT_LEAST,
     PAIR_DOUBT_ROOT,
     Doubts,
+    _pair_integral,
 )
 from raytwin.diagnosis.refine import _in_turn, _Slopes, _to_refine
 from raytwin.diagnosis.strengths import _outright
@@ -142,6 +143,23 @@ def test_nuisances_of_single_blocks_are_solved_as_all_others(setup):
     more = rng.standard_normal((4, shuffled.shape[1]))
     left = np.linalg.inv(np.eye(shuffled.shape[1]) + shuffled.T @ shuffled)
     assert found.known_of(more) == pytest.approx(np.einsum("pi,ij,pj->p", more, left, more), rel=1e-8)
+
+
+def test_the_likelihood_of_two_effects_is_integrated_where_it_lies_and_no_number_is_told(setup):
+    rng, factors, _ = setup
+    nuisances, shapes = Nuisances(factors), rng.standard_normal((2, PROBES))
+    one, other = (one_node(name, 5.0 * shape, low=0.1, high=10.0) for name, shape in zip("ab", shapes, strict=True))
+    residual = 5.0 * shapes[0] * 2.0 + 5.0 * shapes[1] * 0.7 + noise(rng, factors)
+    nodes = np.concatenate([one.responses, other.responses])
+    found = _pair_integral(one, other, (nodes @ nuisances.solve(residual), nuisances.inner(nodes, nodes)), 3.0)
+    assert found.best == pytest.approx((2.0, 0.7), abs=0.05)
+    gram, linear = nuisances.inner(nodes, nodes), nodes @ nuisances.solve(residual)
+    best = np.linalg.solve(gram, linear)
+    # a Gaussian in the strengths under a prior that is even in their logarithms, from 0.1 to 10
+    log_volume = np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(gram)[1] - np.log(best).sum() - 2 * np.log(np.log(100.0))
+    assert found.log_integral == pytest.approx(3.0 + 0.5 * float(linear @ best) + log_volume, abs=0.05)
+    with pytest.raises(ValueError, match="of a and b is no number"):
+        _pair_integral(one, other, (np.full(2, np.nan), gram), 0.0)
 
 
 def test_whitening_local_nuisances_leaves_the_likelihood_as_it_was(setup):

@@ -470,7 +470,7 @@ def _curves(
             continue
         exact = None
         if variant.effect in scales.DEFINED_BY:
-            exact = np.array([name.statistic == scales.DEFINED_BY[variant.effect] for name in names])
+            exact = np.array([name.statistic in scales.DEFINED_BY[variant.effect] for name in names])
         jitter = jitter_of(variant, blocks, read_noise_DN)
         curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
         chosen.append(variant)

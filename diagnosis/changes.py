@@ -18,7 +18,7 @@ from ..generator.effects.effect import Parameter
 from ..generator.twin import Estimate, Twin
 from .coarse import in_squares, pixels_in_square
 from .curves import Curve
-from .probes import OUTLIERS_ANYWHERE
+from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS_ANYWHERE
 
 STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
 # where the mean is linear in the strength one is enough, where it nearly is two
@@ -70,11 +70,12 @@ _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
     ],
 }
 # probes that a strength is defined by: there no law can be far off
-DEFINED_BY: Mapping[str, str] = {
-    "gain_map_error": "fixed_pattern",
-    "image_lag": "afterglow frames 0-0",
-    "quantisation": "codes",
-    "bad_pixels": OUTLIERS_ANYWHERE,
+DEFINED_BY: Mapping[str, tuple[str, ...]] = {
+    "gain_map_error": ("fixed_pattern",),
+    "image_lag": ("afterglow frames 0-0",),
+    "quantisation": ("codes",),
+    "bad_pixels": (OUTLIERS_ANYWHERE,),
+    "misregistration": (ALONG_ROWS, ALONG_COLUMNS),  # pixels are pixels: its shift is read outright
 }
 # relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
 DEFINED_SD: Mapping[str, float] = {

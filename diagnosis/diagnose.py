@@ -25,11 +25,10 @@ from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
 from .pairs import Doubts
-from .placing import ALONG_COLUMNS, ALONG_ROWS
 from .plan import WORTH_IT, best_repeat, repeat_text
 from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
-from .probes import OUTLIERS, OUTLIERS_ANYWHERE
+from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS, OUTLIERS_ANYWHERE
 from .refine import refine
 from .registration import SHARP_PX
 from .strengths import applied_at_best, strength_of

@@ -13,7 +13,7 @@ from ..generator.effects.registration import angles_of, parts_px
 from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
 from ..generator.twin import Twin
 from .changes import TwinChange, Variant
-from .placing import ALONG_COLUMNS, ALONG_ROWS
+from .probes import ALONG_COLUMNS, ALONG_ROWS
 from .registration import SHARP_PX
 from .session import SessionSeries
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from ..generator.series import ExpectedSeries, SeriesRequest
 from . import changes as scales
 from .even_maps import full_size, signal_map
-from .probes import Scalar
+from .probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
 from .registration import LARGEST_PX, Placement, left_over, register, register_drawn
 from .session import SessionSeries
 
-ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
 _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
 _PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie

@@ -33,6 +33,7 @@ _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it i
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
+ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"  # of a scene
 _KURTOSIS_PIXELS = 2048  # in which a fading picture's is computed
 _KURTOSIS_FRAMES = 15  # below, each pixel's own variance is too uncertain to standardise by
 

@@ -14,8 +14,8 @@ from .defects import counting_series
 from .even_maps import NOWHERE, Map, compact, mean_over
 from .fixed_pattern import lines_of, pattern_noise
 from .forward_model import Change, ForwardModel
-from .placing import ALONG_COLUMNS, ALONG_ROWS, PlacedSeries
-from .probes import FIXED_COLUMNS, FIXED_ROWS, ScalarContext, expected_scalars
+from .placing import PlacedSeries
+from .probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS, ScalarContext, expected_scalars
 from .registration import Placement
 from .session import SessionSeries
 from .summaries import SeriesSummary

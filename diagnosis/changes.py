@@ -75,7 +75,7 @@ DEFINED_BY: Mapping[str, tuple[str, ...]] = {
     "image_lag": ("afterglow frames 0-0",),
     "quantisation": ("codes",),
     "bad_pixels": (OUTLIERS_ANYWHERE,),
-    "misregistration": (ALONG_ROWS, ALONG_COLUMNS),  # pixels are pixels: its shift is read outright
+    "misregistration": (ALONG_ROWS, ALONG_COLUMNS),  # where scenes lie is its shift
 }
 # relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
 DEFINED_SD: Mapping[str, float] = {

@@ -191,7 +191,9 @@ class ModelCache:
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
         fine_wanted = twin.noise.psf_model == "aperture"
-        whole = (*key, None if scene is None else scene.number, signal_scale, gain_scale, secondary, fine_wanted)
+        # drafts are drawn with the cells of the twin's own spectrum
+        own = np.asarray(twin.spectral.best, dtype=np.float64).tobytes() if self.draft else None
+        whole = (*key, None if scene is None else scene.number, signal_scale, gain_scale, secondary, fine_wanted, own)
         known = self._beams.get(whole)
         if known is not None and known.model is model:
             self._beams.move_to_end(whole)

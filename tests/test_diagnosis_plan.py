@@ -8,18 +8,16 @@ import pytest
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.assemble import Problem
-from raytwin.diagnosis.changes import DEFINED_BY, catalogue_variants
+from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
 from raytwin.diagnosis.diagnose import _elsewhere
 from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
 from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.placing import displacement_probes
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.probes import ALONG_ROWS
 from raytwin.diagnosis.refine import refine
-from raytwin.diagnosis.registration import Placement
 from raytwin.diagnosis.series_block import jitter_of
 from raytwin.diagnosis.veto import leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
@@ -361,11 +359,6 @@ def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_giv
 
 def test_every_effect_of_the_catalogue_has_a_measurement_that_isolates_it():
     assert set(ISOLATED_BY) == set(EFFECTS)
-
-
-def test_a_misregistration_is_defined_by_where_scenes_lie():
-    there = Placement(row_px=0.0, column_px=0.0, row_sd_px=0.1, column_sd_px=0.1)
-    assert {item.name for item in displacement_probes(there)} == set(DEFINED_BY["misregistration"])
 
 
 @pytest.mark.parametrize(("since", "calibrating"), [("always", 1.0), ("calibration", 0.0)])

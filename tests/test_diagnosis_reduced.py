@@ -9,6 +9,8 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
+from raytwin.diagnosis.assemble import build_problem
+from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS
@@ -42,6 +44,29 @@ def diagnosed(line, tmp_path, capsys):
         return code, json.loads(printed.out) if code == 0 else None, printed.err.strip().splitlines()
 
     return run
+
+
+def test_lines_move_later_means_by_chance_and_places_of_scenes_follow_no_law(line):
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=catalogue_variants())
+    names = problem.names
+    calibrates = np.array([problem.views[number].session.calibrates for number in problem.series_of])
+    level = np.array([name.location == "whole field" for name in names])
+    along_columns = np.array([name.location == "along columns" for name in names])
+    displaced = {"displacement along rows", "displacement along columns"}
+    seen = set()
+    for curve in problem.curves:
+        if curve.effect == "misregistration":
+            assert {names[number].statistic for number in np.flatnonzero(curve.exact)} == displaced
+        if curve.effect == "row_noise":
+            share = curve.parameters["column_share"]
+            seen.add((share, curve.since))
+            assert np.all(curve.jitter[level & ~calibrates] > 0.0)
+            assert np.any(curve.jitter[calibrates]) == (curve.since == "always")
+            # noise of rows is even along each of them
+            steps = curve.jitter[along_columns & ~calibrates]
+            assert np.median(steps) < 1e-3 * np.median(curve.jitter[level & ~calibrates]) or share == 1.0
+    assert seen == {(share, since) for share in (0.0, 1.0) for since in ("always", "calibration")}
 
 
 def only(*kinds):

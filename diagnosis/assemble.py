@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.log_images import light_of_log
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
@@ -16,7 +16,7 @@ from ..generator.series import ExpectedSeries, beam_conditions, expected_series,
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, twin_changes
+from .changes import Variant, smooth_twin, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
@@ -128,6 +128,7 @@ def build_problem(
     *,
     variants: Sequence[Variant],
     calibrated_elsewhere: bool = False,
+    exposed: Sequence[Series] = (),
     side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
@@ -139,6 +140,7 @@ def build_problem(
         variants: effects to try.
         calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
             marked as calibrating).
+        exposed: as in `read_session`.
         side: of the squares of the panel's pixels that the acquisition has for pixels.
         progress: called with the name of each stage.
 
@@ -146,8 +148,9 @@ def build_problem(
         InputError: nothing that can be judged: no darks and flats, or another detector than the twin's.
     """
     tell = progress or (lambda stage: None)
-    session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere)
+    session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere, exposed=exposed)
     requests = [item.request for item in session]
+    variants = with_pauses(variants, stated=all(item.pause_stated for item in requests[1:]))
     conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
     known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()

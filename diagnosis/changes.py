@@ -43,6 +43,8 @@ _SHARES_OF = {
     **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "misregistration"), _TWO_SHARES),
 }
 _MOST_VARIANTS = 4
+_PAUSE = next(item for item in EFFECTS["image_lag"].parameters if item.name == "idle_s")
+_PAUSES_S = (1.0, 20.0)  # in which quick traps still hold charge, and in which slow ones have lost most
 _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
     "misregistration": [
         *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
@@ -251,6 +253,22 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
                 fitted=tuple(inner),
             )
         )
+    return result
+
+
+def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
+    """The variants for a session whose times between series are stated, or not: then a lag's ghosts ask how long they were."""
+    if stated:
+        return list(variants)
+    result = []
+    for variant in variants:
+        if variant.effect != "image_lag":
+            result.append(variant)
+            continue
+        for idle_s in _PAUSES_S:
+            known = {**variant.parameters, _PAUSE.name: idle_s}
+            name = f"{variant.name}, {_PAUSE.name} {idle_s:g}"
+            result.append(replace(variant, name=name, parameters=known, fitted=(*variant.fitted, _PAUSE)))
     return result
 
 

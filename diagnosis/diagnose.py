@@ -155,6 +155,7 @@ def diagnose(
             session.twin,
             variants=catalogue_variants(without=left_out, side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
+            exposed=session.exposed,
             side=session.factor,
             progress=progress,
         )
@@ -165,13 +166,24 @@ def diagnose(
     result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
     result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
     result = replace(result, not_tested={**had, **result.not_tested})
-    if session.suspects:
-        result = _doubted(result, session.twin, session.suspects)
+    cleared = [item for item in session.suspects if _clears(result, item)]
+    notes = tuple(
+        f"{item.text}, or with {' and '.join(result.named)}, which explains the rest as well" for item in cleared
+    )
+    result = replace(result, notes=(*result.notes, *notes))
+    suspects = tuple(item for item in session.suspects if item not in cleared)
+    if suspects:
+        result = _doubted(result, session.twin, suspects)
     if session.factor == 1:
         return result
     if progress is not None:
         progress("calibration with all pixels")
     return in_pixels(result, twin=calibrated_twin(session.all_pixels, rng=rng), factor=session.factor)
+
+
+def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:
+    """Whether an explanation of the whole session says why a label looks wrong."""
+    return diagnosis.verdict == "explained" and not set(suspect.or_effects).isdisjoint(diagnosis.named)
 
 
 def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:

@@ -59,6 +59,7 @@ _DEEPEST = 4.0  # -log T beyond which nothing is compared
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
 _FITS_BETTER = 0.3  # share of what is missing from 1 that another map may leave
 _SCALE_OFF = 0.22  # logarithm of a map's scale that no composition explains
+_LIKE_SHORTER_PATHS = ("object_scatter", "veiling_glare")  # light behind an object that did not come straight
 _SCALE_AGREES = 0.07  # scatter takes more from thick parts, and not the same at every voltage
 _LOG_FACTORS = tuple(round(0.02 * step, 2) for step in range(-40, 41))
 _SHIFTS_PX = (-4, -2, 0, 2, 4)
@@ -66,19 +67,29 @@ _SHIFTS_PX = (-4, -2, 0, 2, 4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Suspect:
-    """Series whose frames contradict a label: their names, what they look like, and the evidence (natural logarithm)."""
+    """Series whose frames contradict a label.
+
+    Fields: series: their names; text: what they look like; evidence (natural logarithm); or_effects: effects that show the same, and
+    whose explanation of the whole session clears the label.
+    """
 
     series: tuple[str, ...]
     text: str
     evidence: float
+    or_effects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plausibility:
-    """What was found: suspects, strongest first; unusable: series without any signal or noise, or saturated -> why."""
+    """What was found.
+
+    Fields: suspects, strongest first; unusable: series without any signal or noise, or saturated -> why; saturated: names of
+    those that were lit too much.
+    """
 
     suspects: tuple[Suspect, ...]
     unusable: Mapping[str, str]
+    saturated: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +160,7 @@ def check_plausibility(
     """
     (progress or (lambda stage: None))("labels")
     unusable: dict[str, str] = {}
+    saturated: set[str] = set()
     readings: list[_Reading] = []
     shapes = {item.shape for item in acquisition.series}
     if len(shapes) > 1:
@@ -164,8 +176,11 @@ def check_plausibility(
         full = 0.0 if item.kind in ("dark", "afterglow") else _share_at_the_top(frames)
         if float(np.ptp(frames)) == 0.0:
             unusable[item.name] = f"every pixel of every frame is {frames.flat[0]:g} DN"
+            if item.kind in ("flat", "object") and _is_top(float(frames.flat[0]), acquisition.instrument.bits):
+                saturated.add(item.name)
         elif full > _SATURATED:
             unusable[item.name] = f"saturated: {100 * full:.2g} % of the pixels stand at {frames.max():.0f} DN"
+            saturated.add(item.name)
         else:
             readings.append(found)
     suspects: list[Suspect] = []
@@ -220,7 +235,14 @@ def check_plausibility(
     return Plausibility(
         suspects=tuple(sorted(suspects, key=lambda item: -item.evidence)),
         unusable=unusable,
+        saturated=frozenset(saturated),
     )
+
+
+def _is_top(value_DN: float, bits: int | None) -> bool:
+    """Whether a number is the largest of an ADC, of 8 bits or more where they are not known."""
+    counted = math.log2(value_DN + 1.0) if value_DN > 0.0 else 0.0
+    return counted == bits if bits is not None else counted >= 8 and counted.is_integer()
 
 
 def _share_at_the_top(frames: FloatArray) -> float:
@@ -663,6 +685,7 @@ def _scaled(scales: Mapping[str, Sequence[float]], placements: Mapping[str, Sequ
                     text=f"the thickness maps of {scene} fit its frames only if all path lengths are {math.exp(middle):.2f}"
                     " times as long",
                     evidence=100.0,
+                    or_effects=_LIKE_SHORTER_PATHS if middle < 0.0 else (),
                 )
             )
     return found

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.coarser import coarser
 from ..calibration.calibrate import calibrate_twin
 from ..errors import FitError, InputError, RaytwinError
@@ -26,13 +26,14 @@ _OF_THIS_SESSION = (
 class PreparedSession:
     """A session ready for its diagnosis.
 
-    Fields: acquisition (less the series that cannot be used); twin; calibrated_elsewhere (the twin was given, and none of these
-    series is in it); suspects (series whose labels look wrong); left_out (series that are not used, each with the reason);
-    notes (how the session is looked at); factor (pixels along each side of the squares that acquisition and twin have as pixels);
-    all_pixels (the same series with all pixels).
+    Fields: acquisition (less the series that cannot be used); exposed (of these, saturated series: what they left in the panel is
+    known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
+    wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at); factor (pixels along
+    each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels).
     """
 
     acquisition: AcquisitionFile
+    exposed: tuple[Series, ...]
     twin: Twin
     calibrated_elsewhere: bool
     suspects: tuple[Suspect, ...]
@@ -85,6 +86,7 @@ def prepare_session(
             received="; ".join(left_out),
             expected="series with light and noise",
         )
+    exposed = tuple(item for item in acquisition.series if item.name in found.saturated)
     acquisition = replace(acquisition, series=kept)
     elsewhere = twin is not None and not made_of(twin, kept)
     notes = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
@@ -98,6 +100,7 @@ def prepare_session(
         suspects = suspects or _without_spectrum(acquisition, twin)
     return PreparedSession(
         acquisition=acquisition,
+        exposed=exposed,
         twin=twin,
         calibrated_elsewhere=elsewhere,
         suspects=suspects,

@@ -163,13 +163,16 @@ def _on_one_clock(series: Sequence[Series]) -> bool:
     return span > _LEAST_SPAN * sum(float(one[-1] - one[0]) for one in times)
 
 
-def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False) -> tuple[SessionSeries, ...]:
+def read_session(
+    acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False, exposed: Sequence[Series] = ()
+) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
     Args:
         acquisition: open file.
         calibrated_elsewhere: the twin comes from another session and no series here is marked as calibrating: all were
             taken after calibration.
+        exposed: series of the same session that tell nothing by themselves, but left charge in the panel where their load is known.
 
     Raises:
         InputError: no series that the diagnosis can use.
@@ -186,7 +189,9 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
     result: list[SessionSeries] = []
     requests: list[SeriesRequest] = []
     scenes: dict[str, dict[str, NDArray[np.float32]]] = {}
-    for item in ordered:
+    lit_too_much = [item for item in exposed if item.setting is not None and item.setting.tube_load_mAs is not None]
+    silent = {item.name for item in lit_too_much}
+    for item in sorted((*ordered, *lit_too_much), key=lambda item: item.index):
         exposure_ms = item.exposure_ms or 0.0
         interval_ms = item.frame_interval_ms
         if interval_ms is None:
@@ -194,12 +199,13 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
         times_s = np.zeros(0) if item.time_s is None else item.time_s
         if item.frame_interval_ms is None and len(times_s) > 1:
             interval_ms = 1000.0 * float(np.median(np.diff(times_s)))
-        if len(times_s) and one_clock:
+        clocked = len(times_s) > 0 and one_clock
+        if clocked:
             start = float(times_s[0])
             clock = float(times_s[-1]) + interval_ms / 1000.0
         else:
             # beam-off frames follow straight after the exposure
-            start = clock if item.kind == "afterglow" or not result else clock + _GAP_S
+            start = clock if item.kind == "afterglow" or not requests else clock + _GAP_S
             clock = start + item.n_frames * interval_ms / 1000.0
         scene = acquisition.scenes.get(item.scene) if item.scene else None
         thickness: dict[str, NDArray[np.float32]] | None = None
@@ -236,8 +242,11 @@ def read_session(acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = F
             after_calibration=after,
             open_signal_DN=levels.get(item.name),
             previous=tuple(replace(before, previous=()) for before in requests[-_REMEMBERED:]),
+            pause_stated=clocked or item.kind == "afterglow",
         )
         requests.append(request)
+        if item.name in silent:
+            continue
         result.append(
             SessionSeries(
                 series=item,

@@ -49,12 +49,14 @@ Transfer = Callable[[FloatArray, FloatArray], FloatArray]
 class LagLaw:
     """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,).
 
-    pause_share: of what is released in a pause between series, the share that the next series' first exposure reads.
+    pause_share: of what is released in a pause between series, the share that the next series' first exposure reads. idle_s: length
+    of the pauses that a session does not state.
     """
 
     trapped: tuple[float, ...]
     time_s: tuple[float, ...]
     pause_share: float
+    idle_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

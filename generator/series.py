@@ -73,7 +73,8 @@ class SeriesRequest:
     remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
     open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
     material of the scene that is the product; scene_kind (`wedge`, `slab`, `edge`, `disc`, `product`);
-    displacement_px: how far along rows and columns the scene is known to lie from where its thickness maps have it.
+    displacement_px: how far along rows and columns the scene is known to lie from where its thickness maps have it;
+    pause_stated: start_s says how long nothing was exposed before the series.
     """
 
     kind: str
@@ -96,6 +97,7 @@ class SeriesRequest:
     product_material: str | None = None
     scene_kind: str | None = None
     displacement_px: tuple[float, float] = (0.0, 0.0)
+    pause_stated: bool = True
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -139,7 +141,7 @@ def session_conditions(requests: Sequence[SeriesRequest], *, readout_ms: float |
     """
     if not requests:
         return {}
-    ends = [item.start_s + item.frames * item.exposures_per_frame * item.interval_s(readout_ms) for item in requests]
+    ends = [item.start_s + _length_s(item, readout_ms) for item in requests]
     darks = [item for item in requests if item.kind == "dark"]
     longest = max(item.exposure_ms for item in darks or requests)
     found = {"session_s": max(1.0, *ends), "longest_exposure_ms": max(longest, 0.01)}
@@ -151,8 +153,9 @@ def session_conditions(requests: Sequence[SeriesRequest], *, readout_ms: float |
     if calibrating:
         found["calibrated_s"] = max(sum(calibrating) / len(calibrating), 0.0)
     for number, item in enumerate(requests):
-        if number and item.kind == "afterglow" and requests[number - 1].beam_on:
-            found["after_s"] = max(ends[number - 1] - requests[number - 1].start_s, 1e-3)
+        before = (*requests[:number], *item.previous)[-1:]
+        if item.kind == "afterglow" and before and before[0].beam_on:
+            found["after_s"] = max(_length_s(before[0], readout_ms), 1e-3)
             break
     return found
 
@@ -185,6 +188,11 @@ def beam_conditions(
     if not found:
         return {}
     return {"reference_keV": math.exp(sum(map(math.log, found.values())) / len(found))}
+
+
+def _length_s(request: SeriesRequest, readout_ms: float | None) -> float:
+    """Of a series, from its first exposure's begin to its last one's end."""
+    return request.frames * request.exposures_per_frame * request.interval_s(readout_ms)
 
 
 def with_conditions(effect: AppliedEffect, conditions: Mapping[str, float]) -> AppliedEffect:
@@ -610,6 +618,11 @@ def _decays(law: LagLaw, interval_s: float) -> FloatArray:
     return np.exp(-interval_s / np.asarray(law.time_s, dtype=np.float64))
 
 
+def _pause_s(law: LagLaw, request: SeriesRequest, clock_s: float) -> float:
+    """From clock_s, when the exposures before ended, to the begin of the series."""
+    return request.start_s - clock_s if request.pause_stated else law.idle_s
+
+
 def _paused(law: LagLaw, trapped: FloatArray, pause_s: float) -> tuple[FloatArray, FloatArray]:
     """Charge in the traps (trap, row, column) after a pause, and what the next exposure reads of that released in it."""
     left = trapped * _decays(law, max(pause_s, 0.0))[:, None, None]
@@ -627,7 +640,7 @@ def _trapped_before(
         interval = earlier.interval_s(twin.instrument.readout_ms)
         exposures = earlier.frames * earlier.exposures_per_frame
         if clock is not None:
-            trapped, _ = _paused(law, trapped, earlier.start_s - clock)
+            trapped, _ = _paused(law, trapped, _pause_s(law, earlier, clock))
         decay = _decays(law, interval)[:, None, None]
         left = decay**exposures
         trapped = trapped * left
@@ -637,7 +650,7 @@ def _trapped_before(
         clock = earlier.start_s + exposures * interval
     if clock is None:
         return trapped, np.zeros((1, 1))
-    return _paused(law, trapped, request.start_s - clock)
+    return _paused(law, trapped, _pause_s(law, request, clock))
 
 
 def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
@@ -864,7 +877,7 @@ def sample_series(
         if carried.trapped_DN is None:
             trapped, found = _trapped_before(twin, request, state.lag, choice, cache)
         else:
-            trapped, found = _paused(state.lag, carried.trapped_DN, request.start_s - carried.time_s)
+            trapped, found = _paused(state.lag, carried.trapped_DN, _pause_s(state.lag, request, carried.time_s))
         share = np.asarray(state.lag.trapped)[:, None, None]
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
     bad = new_bad_pixels(state, shape)

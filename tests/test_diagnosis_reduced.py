@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -11,9 +13,12 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.assemble import build_problem
 from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.diagnose import _clears
 from raytwin.diagnosis.origin import made_of
+from raytwin.diagnosis.plausibility import Suspect, check_plausibility
 from raytwin.diagnosis.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS
+from raytwin.generator.series import session_conditions
 from raytwin.generator.twin_io import read_twin
 
 FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"
@@ -428,3 +433,64 @@ def test_beam_off_frames_follow_straight_after_the_exposure_where_no_times_are_s
         starts = {item.name: item.request.start_s for item in read_session(acquisition)}
     assert starts["after"] == pytest.approx(starts["flat"] + 0.4)
     assert starts["later"] > starts["after"] + 0.4 + 0.5
+
+
+def test_pauses_that_no_session_states_are_sought_with_a_lag_and_those_it_states_are_not(line, tmp_path):
+    timeless = tmp_path / "timeless.h5"
+    shutil.copy(line / "session.h5", timeless)
+    with h5py.File(timeless, "r+") as file:
+        for node in file["series"].values():
+            del node["time_s"]
+
+    def lags(path):
+        wanted = [item for item in catalogue_variants() if item.effect in ("image_lag", "row_noise")]
+        with open_acquisition(path) as acquisition:
+            stated = {item.request.pause_stated for item in read_session(acquisition) if item.series.kind == "flat"}
+            problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=wanted)
+        assert any(item.effect == "row_noise" for item in problem.variants)
+        return stated, [item for item in problem.variants if item.effect == "image_lag"]
+
+    (known, plain), (unknown, asking) = lags(line / "session.h5"), lags(timeless)
+    assert (known, unknown) == ({True}, {False})
+    assert {item.name for item in plain[0].fitted} == {item.name for item in asking[0].fitted} - {"idle_s"}
+    assert len(asking) == 2 * len(plain)
+    assert {item.parameters["idle_s"] for item in asking} == {1.0, 20.0}
+
+
+@pytest.mark.parametrize("bright_DN", [4100, 9000])
+def test_a_saturated_series_is_not_judged_but_has_left_its_charge(tmp_path, bright_DN):
+    rng = np.random.default_rng(3)
+    with write_acquisition(tmp_path / "bright.h5") as writer:
+        for name, kind, level in (
+            ("dark", "dark", 100),
+            ("dim", "flat", 2000),
+            ("bright", "flat", bright_DN),
+            ("after", "afterglow", 120),
+        ):
+            frames = np.minimum(rng.normal(level, 20.0, (6, 32, 32)), 4095).astype(np.uint16)
+            beam = {"kV": 60.0, "current_mA": level / 2000.0} if kind == "flat" else {}
+            writer.add_series(name, kind=kind, frames=frames, exposure_ms=100.0, **beam)
+    with open_acquisition(tmp_path / "bright.h5") as acquisition:
+        found = check_plausibility(acquisition, calibrating=frozenset(("dark", "dim", "bright")))
+        assert (set(found.unusable), found.saturated) == ({"bright"}, {"bright"})
+        kept = tuple(item for item in acquisition.series if item.name != "bright")
+        bright = [item for item in acquisition.series if item.name == "bright"]
+        with_it = read_session(replace(acquisition, series=kept), exposed=bright)
+        without_it = read_session(replace(acquisition, series=kept))
+    assert [item.name for item in with_it] == [item.name for item in without_it] == ["dark", "dim", "after"]
+    loads = [item.request.previous[-1].setting.tube_load_mAs for item in (with_it[-1], without_it[-1])]
+    assert loads == pytest.approx([bright_DN / 2e4, 0.1])
+    assert session_conditions([with_it[-1].request])["after_s"] == pytest.approx(0.6)
+
+
+def test_an_explanation_clears_a_label_that_its_effect_makes_look_wrong():
+    like_scatter = Suspect(series=("wedge",), text="paths too long", evidence=100.0, or_effects=("object_scatter",))
+    swapped = Suspect(series=("wedge",), text="kV exchanged", evidence=100.0)
+
+    def clears(suspect, verdict, *named):
+        return _clears(SimpleNamespace(verdict=verdict, named=named), suspect)
+
+    assert clears(like_scatter, "explained", "image_lag", "object_scatter")
+    assert not clears(like_scatter, "explained", "image_lag")
+    assert not clears(like_scatter, "unknown_effect")
+    assert not clears(swapped, "explained", "object_scatter")

@@ -411,6 +411,23 @@ def test_memory_is_handed_from_series_to_series(series_line):
     assert abs((seen - expected.mean_DN).mean()) < 4 * 12.0 / math.sqrt(seen.size) + 1e-3 * expected.signal_DN.mean()
 
 
+@pytest.mark.parametrize("pause_stated", [True, False])
+def test_traps_empty_in_pauses_that_are_stated_and_else_for_as_long_as_the_law_says(series_line, pause_stated):
+    exposed = request(frames=60)
+    after = request(
+        "dark", setting=None, frames=1, start_s=60 * 0.022 + 2.0, previous=(exposed,), pause_stated=pause_stated
+    )
+
+    def left(idle_s):
+        lag = AppliedEffect(
+            id="image_lag", parameters={"strength": 5.0, "release_s": 1.0, "spread": 1.0, "idle_s": idle_s}
+        )
+        return float(expected_series(series_line, after, effects=(lag,)).signal_DN.mean())
+
+    assert left(2.0) > 1.0
+    assert left(3.0) / left(2.0) == pytest.approx(1.0 if pause_stated else math.exp(-1.0), rel=1e-9)
+
+
 # ------------------------------------------------------------------------------------------------ twin file
 
 

@@ -2,13 +2,15 @@
 
 The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
 the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
-NIST). A panel of Gd2O2S that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no
-pixel is cut by an edge), a Gaussian spread, 104 x 136 pixels of 0.2 mm, no times. Its effects are laws of its own: scatter and
+NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no pixel is
+cut by an edge), a Gaussian spread, no times; three lines of other pixels, distances, beams and scintillators (`LINES`).
+Its effects are laws of its own: scatter and
 tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
 gain; K photons are caught under two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced
 objects have shifted path lengths.
 
     python validation/second_simulator.py --seed 1 --json build/second_simulator.json
+    python validation/second_simulator.py --line coarse
     python validation/second_simulator.py --only none kv_error tiles veiling_glare+kv_error
 """
 
@@ -18,6 +20,7 @@ import json
 import math
 import tempfile
 import zlib
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -30,16 +33,137 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.diagnosis.diagnose import diagnose
 
-ROWS, COLUMNS, PIXEL_MM = 104, 136, 0.2
-SHAPE = (ROWS, COLUMNS)
-NEAR_MM, FAR_MM, DETECTOR_MM = 480.0, 360.0, 700.0
-SPREAD_PX, READ_DN, DARK_DN, HIGHEST_DN = 0.55, 6.0, 300.0, 16383
-DN_PER_KEV, SCALE, OPTICAL = 0.012, 7e-4, 1.05
-LAG_S, PAUSE_S, READOUT_MS = 0.2, 6.0, 5.0
-DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3}
+DARK_SLOPE_DN_PER_MS, OPTICAL = 0.02, 1.05
+DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3, "Gd2O2S": 4.38, "CsI": 4.51}
 NAMES = {"Al": "Al", "Pb": "Pb", "H2O": "water"}
-CURRENT_MA = {50.0: 6.0, 100.0: 1.0}
-K_EDGE_KEV, K_LINE_KEV = 50.24, 42.8  # of gadolinium
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineOf:
+    """A line: pixels, distances, panel and beams.
+
+    Fields: shape (rows, columns); pixel_mm; near_mm, far_mm (of objects from the source), detector_mm; spread_px; read_DN; dark_DN;
+    bits; DN_per_keV; photons: scale of SpekPy's; scintillator: material and mm; edge_keV, line_keV: its K edge and K line; lag_s;
+    pause_s (between series); readout_ms; current_mA by kV, copper_times: of it behind copper; anode_deg; beryllium_mm; wedge_mm,
+    water_mm, lead_mm: a step, the slab, the edge.
+    """
+
+    shape: tuple[int, int]
+    pixel_mm: float
+    near_mm: float
+    far_mm: float
+    detector_mm: float
+    spread_px: float
+    read_DN: float
+    dark_DN: float
+    bits: int
+    DN_per_keV: float
+    photons: float
+    scintillator: tuple[str, float]
+    edge_keV: float
+    line_keV: float
+    lag_s: float
+    pause_s: float
+    readout_ms: float
+    current_mA: dict[float, float]
+    copper_times: float
+    anode_deg: float
+    beryllium_mm: float
+    wedge_mm: float
+    water_mm: float
+    lead_mm: float
+
+    @property
+    def highest_DN(self) -> int:
+        """The largest number that the ADC gives."""
+        return 2**self.bits - 1
+
+    @property
+    def tile_px(self) -> tuple[int, int]:
+        """A sixteenth of the panel."""
+        return self.shape[0] // 4, self.shape[1] // 4
+
+
+LINES = {
+    "usual": LineOf(
+        shape=(104, 136),
+        pixel_mm=0.2,
+        near_mm=480.0,
+        far_mm=360.0,
+        detector_mm=700.0,
+        spread_px=0.55,
+        read_DN=6.0,
+        dark_DN=300.0,
+        bits=14,
+        DN_per_keV=0.012,
+        photons=7e-4,
+        scintillator=("Gd2O2S", 0.18),
+        edge_keV=50.24,
+        line_keV=42.8,
+        lag_s=0.2,
+        pause_s=6.0,
+        readout_ms=5.0,
+        current_mA={50.0: 6.0, 100.0: 1.0},
+        copper_times=2.0,
+        anode_deg=16.0,
+        beryllium_mm=2.5,
+        wedge_mm=1.5,
+        water_mm=20.0,
+        lead_mm=3.0,
+    ),
+    "coarse": LineOf(
+        shape=(120, 104),
+        pixel_mm=0.4,
+        near_mm=1000.0,
+        far_mm=850.0,
+        detector_mm=1300.0,
+        spread_px=0.4,
+        read_DN=4.0,
+        dark_DN=500.0,
+        bits=16,
+        DN_per_keV=0.038,
+        photons=7e-4,
+        scintillator=("CsI", 0.5),
+        edge_keV=34.5,
+        line_keV=29.5,
+        lag_s=0.5,
+        pause_s=8.0,
+        readout_ms=10.0,
+        current_mA={40.0: 8.0, 80.0: 1.5},
+        copper_times=2.0,
+        anode_deg=12.0,
+        beryllium_mm=1.0,
+        wedge_mm=2.0,
+        water_mm=25.0,
+        lead_mm=1.5,
+    ),
+    "hard": LineOf(
+        shape=(128, 128),
+        pixel_mm=0.127,
+        near_mm=300.0,
+        far_mm=200.0,
+        detector_mm=420.0,
+        spread_px=0.9,
+        read_DN=12.0,
+        dark_DN=1500.0,
+        bits=16,
+        DN_per_keV=0.095,
+        photons=7e-4,
+        scintillator=("Gd2O2S", 0.2),
+        edge_keV=50.24,
+        line_keV=42.8,
+        lag_s=0.1,
+        pause_s=4.0,
+        readout_ms=20.0,
+        current_mA={60.0: 2.0, 140.0: 0.3},
+        copper_times=1.0,
+        anode_deg=12.0,
+        beryllium_mm=1.0,
+        wedge_mm=2.0,
+        water_mm=25.0,
+        lead_mm=1.5,
+    ),
+}
 ALWAYS = (
     "object_scatter",
     "veiling_glare",
@@ -91,66 +215,73 @@ PAIRS = (
     "nonlinearity+motion_blur",
 )
 UNKNOWN = ("tiles", "wandering_tiles")
-TILE_PX = (26, 34)
 
 
-def attenuation_per_mm(material: str, energies_keV: np.ndarray, density: float | None = None) -> np.ndarray:
+def attenuation_per_mm(material: str, energies_keV: np.ndarray) -> np.ndarray:
     """Linear attenuation, 1/mm."""
-    rho = DENSITY[material] if density is None else density
-    return rho / 10.0 * np.array([xraylib.CS_Total_CP(material, float(energy)) for energy in energies_keV])
+    return (
+        DENSITY[material] / 10.0 * np.array([xraylib.CS_Total_CP(material, float(energy)) for energy in energies_keV])
+    )
 
 
 @lru_cache(maxsize=64)
-def spectrum(kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Energies, keV, and photons a pixel and mAs that the panel absorbs."""
+def spectrum(name: str, kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Energies, keV, and photons a pixel and mAs that the panel of a line absorbs."""
     import spekpy
 
-    beam = spekpy.Spek(kvp=kV, th=16.0, dk=1.0, physics="kqp", mu_data_source="nist", z=100.0)
-    beam.filter("Be", 2.5).filter("Al", aluminium_mm)
+    of = LINES[name]
+    beam = spekpy.Spek(kvp=kV, th=of.anode_deg, dk=1.0, physics="kqp", mu_data_source="nist", z=100.0)
+    beam.filter("Be", of.beryllium_mm).filter("Al", aluminium_mm)
     if copper_mm:
         beam.filter("Cu", copper_mm)
     energies, photons = beam.get_spectrum(edges=False)
-    stopped = 1.0 - np.exp(-0.18 * attenuation_per_mm("Gd2O2S", energies, 4.38))
-    return np.asarray(energies), np.asarray(photons) * SCALE * stopped
+    material, thickness_mm = of.scintillator
+    stopped = 1.0 - np.exp(-thickness_mm * attenuation_per_mm(material, energies))
+    return np.asarray(energies), np.asarray(photons) * of.photons * stopped
 
 
 class Line:
     """A line with its effects, drawn from a generator; what charge the panel still holds goes from series to series."""
 
-    def __init__(self, effects: tuple[str, ...], rng: np.random.Generator) -> None:
-        self.rng = rng
+    def __init__(self, name: str, effects: tuple[str, ...], rng: np.random.Generator) -> None:
+        self.name, self.of, self.rng = name, LINES[name], rng
         self.effects = {name.removesuffix("_later"): CASES[name][0] for name in effects if name != "none"}
         self.always = {name.removesuffix("_later") for name in effects if name in ALWAYS}
-        self.gain = 1.0 + 0.02 * rng.standard_normal(SHAPE) + 0.36 * gaussian_filter(rng.standard_normal(SHAPE), 12)
-        self.dark_DN = DARK_DN + 8.0 * rng.standard_normal(SHAPE)
+        self.gain = (
+            1.0
+            + 0.02 * rng.standard_normal(self.of.shape)
+            + 0.36 * gaussian_filter(rng.standard_normal(self.of.shape), 12)
+        )
+        self.dark_DN = self.of.dark_DN + 8.0 * rng.standard_normal(self.of.shape)
         self.aluminium_mm = 2.1 + 0.2 * rng.standard_normal()
         self.kV_share = 1.0 + 0.004 * rng.standard_normal()
-        y, x = np.mgrid[:ROWS, :COLUMNS]
-        apart_mm2 = ((y - ROWS / 2) ** 2 + (x - COLUMNS / 2) ** 2) * PIXEL_MM**2
-        self.illumination = (1.0 + apart_mm2 / DETECTOR_MM**2) ** -1.5
-        self.charge_DN = np.zeros(SHAPE)
-        self.changed_gain = np.ones(SHAPE)
+        y, x = np.indices(self.of.shape)
+        apart_mm2 = ((y - self.of.shape[0] / 2) ** 2 + (x - self.of.shape[1] / 2) ** 2) * self.of.pixel_mm**2
+        self.illumination = (1.0 + apart_mm2 / self.of.detector_mm**2) ** -1.5
+        self.charge_DN = np.zeros(self.of.shape)
+        self.changed_gain = np.ones(self.of.shape)
         if "gain_map_error" in self.effects:
-            self.changed_gain += self.effects["gain_map_error"] / 100.0 * rng.standard_normal(SHAPE)
-        for name in UNKNOWN:
-            if name in self.effects:
-                self.changed_gain += self.effects[name] / 100.0 * np.kron(rng.standard_normal((4, 4)), np.ones(TILE_PX))
+            self.changed_gain += self.effects["gain_map_error"] / 100.0 * rng.standard_normal(self.of.shape)
+        for one in UNKNOWN:
+            if one in self.effects:
+                tiles = np.kron(rng.standard_normal((4, 4)), np.ones(self.of.tile_px))
+                self.changed_gain += self.effects[one] / 100.0 * tiles
         if "bad_pixels" in self.effects:
-            count = round(self.effects["bad_pixels"] / 100.0 * ROWS * COLUMNS)
-            self.changed_gain.flat[rng.choice(ROWS * COLUMNS, count, replace=False)] = 0.0
+            count = round(self.effects["bad_pixels"] / 100.0 * self.of.shape[0] * self.of.shape[1])
+            self.changed_gain.flat[rng.choice(self.of.shape[0] * self.of.shape[1], count, replace=False)] = 0.0
         self.direction = rng.uniform(0.0, 2.0 * math.pi)
 
     def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
         """Energies, keV, and photons (row, column, energy) that the panel absorbs of an exposure of the open field."""
         voltage = kV * self.kV_share * (1.0 + on.get("kv_error", 0.0) / 100.0)
-        energies, photons = spectrum(voltage, self.aluminium_mm + on.get("filtration_error", 0.0), copper_mm)
+        energies, photons = spectrum(self.name, voltage, self.aluminium_mm + on.get("filtration_error", 0.0), copper_mm)
         arriving = photons * mAs * self.illumination[..., None]
         if "heel" in on:
             tungsten = attenuation_per_mm("W", energies)
             signal = photons * energies
             # so much more tungsten from one side to the other as takes away that share of the beam
             thick_mm = on["heel"] / 100.0 * float(signal.sum()) / float(signal @ tungsten)
-            along = (np.arange(COLUMNS) / (COLUMNS - 1) - 0.5)[None, :, None]
+            along = (np.arange(self.of.shape[1]) / (self.of.shape[1] - 1) - 0.5)[None, :, None]
             arriving = arriving * np.exp(-along * thick_mm * tungsten)
         return energies, arriving
 
@@ -166,8 +297,8 @@ class Line:
     ) -> tuple:
         """Mean and variance of one exposure before the spread of light, DN and DN^2, and K photons and what they leave."""
         energies, arriving = self.open_light(kV, mAs, copper_mm, on)
-        open_DN = DN_PER_KEV * (arriving @ energies)
-        depth = np.zeros((*SHAPE, 1))
+        open_DN = self.of.DN_per_keV * (arriving @ energies)
+        depth = np.zeros((*self.of.shape, 1))
         apart_px = [on.get("misregistration", 0.0) * turn(self.direction) for turn in (math.cos, math.sin)]
         for material, stated_mm in scene.items():
             thickness_mm = shift(stated_mm, apart_px, order=1, mode="nearest")
@@ -176,27 +307,27 @@ class Line:
         arriving = arriving * np.exp(-depth)
         remote = None
         if "k_fluorescence" in on:
-            share = np.where(energies > K_EDGE_KEV, on["k_fluorescence"] / 100.0, 0.0)
+            share = np.where(energies > self.of.edge_keV, on["k_fluorescence"] / 100.0, 0.0)
             caught = arriving @ share
-            remote = caught, (arriving @ (share * (energies - K_LINE_KEV))) / np.maximum(caught, 1e-30)
+            remote = caught, (arriving @ (share * (energies - self.of.line_keV))) / np.maximum(caught, 1e-30)
             arriving = arriving * (1.0 - share)
-        signal = DN_PER_KEV * (arriving @ energies)
-        variance = OPTICAL * DN_PER_KEV**2 * (arriving @ energies**2)
+        signal = self.of.DN_per_keV * (arriving @ energies)
+        variance = OPTICAL * self.of.DN_per_keV**2 * (arriving @ energies**2)
         if scene and "object_scatter" in on:
             source = np.pad(signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0)), 200)
-            wide = gaussian_filter(source, 18.0 / PIXEL_MM)[200:-200, 200:-200]
+            wide = gaussian_filter(source, 18.0 / self.of.pixel_mm)[200:-200, 200:-200]
             added = on["object_scatter"] / 100.0 * wide / 0.38 * (0.55 if far else 1.0)
             signal, variance = signal + added, variance * (1.0 + added / signal)
         if scene and "focal_spot" in on:
-            magnified = DETECTOR_MM / (FAR_MM if far else NEAR_MM) - 1.0
-            width_px = on["focal_spot"] * magnified / PIXEL_MM / math.sqrt(8.0 * math.log(2.0))
+            magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
+            width_px = on["focal_spot"] * magnified / self.of.pixel_mm / math.sqrt(8.0 * math.log(2.0))
             signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
         if scene and "motion_blur" in on:
             places = np.linspace(-0.5, 0.5, 9) * on["motion_blur"] * exposure_ms / 50.0
             signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         if "veiling_glare" in on:
             share = on["veiling_glare"] / 100.0
-            wide = [gaussian_filter(signal, length_mm / PIXEL_MM) for length_mm in (4.0, 12.0)]
+            wide = [gaussian_filter(signal, length_mm / self.of.pixel_mm) for length_mm in (4.0, 12.0)]
             signal = (1.0 - share) * signal + 0.5 * share * (wide[0] + wide[1])
         return signal, variance, remote
 
@@ -204,22 +335,29 @@ class Line:
         """Frames (n, row, column), DN; lit: mean and variance, None without a beam."""
         on = self.on(after)
         if kind != "afterglow":
-            self.charge_DN = self.charge_DN * math.exp(-PAUSE_S / LAG_S)
-        released = 1.0 - math.exp(-(exposure_ms + READOUT_MS) / 1000.0 / LAG_S)
+            self.charge_DN = self.charge_DN * math.exp(-self.of.pause_s / self.of.lag_s)
+        released = 1.0 - math.exp(-(exposure_ms + self.of.readout_ms) / 1000.0 / self.of.lag_s)
         lag = self.effects.get("image_lag", 0.0) / 100.0
         shown = []
         for _ in range(count):
-            level = np.zeros(SHAPE) if lit is None else self._exposure(*lit, on, after)
+            level = np.zeros(self.of.shape) if lit is None else self._exposure(*lit, on, after)
             held = level * (1.0 - lag) + released * self.charge_DN
             self.charge_DN = (1.0 - released) * self.charge_DN + lag * level
             level = held if "image_lag" in on else level
-            level = level + self.dark_DN + 0.02 * exposure_ms + on.get("dark_drift", 0.0) * exposure_ms / 160.0
-            level = level + READ_DN * self.rng.standard_normal(SHAPE)
-            level = level + READ_DN * on.get("row_noise", 0.0) * self.rng.standard_normal((ROWS, 1))
+            level = (
+                level
+                + self.dark_DN
+                + DARK_SLOPE_DN_PER_MS * exposure_ms
+                + on.get("dark_drift", 0.0) * exposure_ms / 160.0
+            )
+            level = level + self.of.read_DN * self.rng.standard_normal(self.of.shape)
+            level = level + self.of.read_DN * on.get("row_noise", 0.0) * self.rng.standard_normal((self.of.shape[0], 1))
             if "wandering_tiles" in on:
-                level = level + 3.0 * np.kron(self.rng.standard_normal((4, 4)), np.ones(TILE_PX))
+                level = level + 3.0 * np.kron(self.rng.standard_normal((4, 4)), np.ones(self.of.tile_px))
             step = on.get("quantisation", 1.0)
-            shown.append(np.clip(np.floor(level / step) * step if step > 1.0 else np.round(level), 0, HIGHEST_DN))
+            shown.append(
+                np.clip(np.floor(level / step) * step if step > 1.0 else np.round(level), 0, self.of.highest_DN)
+            )
         return np.array(shown, dtype=np.uint16)
 
     def on(self, after: bool) -> dict[str, float]:
@@ -229,57 +367,67 @@ class Line:
     def _exposure(
         self, signal: np.ndarray, variance: np.ndarray, remote: tuple | None, on: dict, after: bool
     ) -> np.ndarray:
-        quanta = np.sqrt(variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)) * self.rng.standard_normal(SHAPE)
-        level = gaussian_filter(signal, SPREAD_PX) + gaussian_filter(quanta, SPREAD_PX, mode="wrap")
+        quanta = np.sqrt(variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)) * self.rng.standard_normal(
+            self.of.shape
+        )
+        level = gaussian_filter(signal, self.of.spread_px) + gaussian_filter(quanta, self.of.spread_px, mode="wrap")
         if remote is not None:
-            photons = remote[0] + np.sqrt(remote[0]) * self.rng.standard_normal(SHAPE)
-            away = 0.5 * sum(gaussian_filter(photons, sigma_mm / PIXEL_MM) for sigma_mm in (0.12, 0.3))
-            level = level + gaussian_filter(DN_PER_KEV * (photons * remote[1] + K_LINE_KEV * away), SPREAD_PX)
+            photons = remote[0] + np.sqrt(remote[0]) * self.rng.standard_normal(self.of.shape)
+            away = 0.5 * sum(gaussian_filter(photons, sigma_mm / self.of.pixel_mm) for sigma_mm in (0.12, 0.3))
+            level = level + gaussian_filter(
+                self.of.DN_per_keV * (photons * remote[1] + self.of.line_keV * away), self.of.spread_px
+            )
         if "mtf_tail" in on:
             share = on["mtf_tail"] / 100.0
             level = (1.0 - share) * level + share * gaussian_filter(level, 2.5)
-        level = level * (1.0 - on.get("nonlinearity", 0.0) / 100.0 * level / (0.5 * HIGHEST_DN))
+        level = level * (1.0 - on.get("nonlinearity", 0.0) / 100.0 * level / (0.5 * self.of.highest_DN))
         level = level * self.gain * (self.changed_gain if after else 1.0)
         return level * (1.0 + on.get("output_drift", 0.0) / 100.0 * self.rng.standard_normal())
 
 
-def scenes() -> dict[str, tuple[str, dict[str, np.ndarray]]]:
+def scenes(of: LineOf) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
     """Kind and path lengths, mm, of what stands in the beam."""
-    y, x = np.mgrid[:ROWS, :COLUMNS]
-    wedge = np.where((y > 15) & (y < 90), np.clip((x - 8) // 16, 0, 7) * 1.5, 0.0)
-    edge = np.where(x + 0.06 * y > 70, 3.0, 0.0)
+    y, x = np.indices(of.shape)
+    rows, columns = of.shape
+    inside = (y > 15 / 104 * rows) & (y < 90 / 104 * rows)
+    wedge = np.where(inside, np.clip((x - 8) * 136 // (16 * columns), 0, 7) * of.wedge_mm, 0.0)
+    edge = np.where(x + 0.06 * y > 70 / 136 * columns, of.lead_mm, 0.0)
     found = {"wedge": ("wedge", {"Al": wedge})}
     for place in ("near", "far"):
-        found[f"slab_{place}"] = ("slab", {"H2O": np.full(SHAPE, 20.0)})
+        found[f"slab_{place}"] = ("slab", {"H2O": np.full(of.shape, of.water_mm)})
         found[f"edge_{place}"] = ("edge", {"Pb": edge})
+    radius_px = 38 / 136 * columns
     for number in range(1, 4):
-        round_px = 38.0**2 - ((y - 52) ** 2 + (x - 60 - 4 * number) ** 2) * 0.6
-        found[f"product{number}"] = ("product", {"H2O": 0.6 * np.sqrt(np.clip(round_px, 0.0, None))})
+        round_px2 = radius_px**2 - ((y - rows / 2) ** 2 + (x - 60 / 136 * columns - 4 * number) ** 2) * 0.6
+        water_mm = 1.14 * of.water_mm / radius_px * np.sqrt(np.clip(round_px2, 0.0, None))
+        found[f"product{number}"] = ("product", {"H2O": water_mm})
     return found
 
 
-def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int) -> None:
-    """A session with calibrating and later series, and its effects, joined by `+`."""
-    line = Line(tuple(effect.split("+")), rng)
+def make_session(path: Path, name: str, effect: str, rng: np.random.Generator, frames: int) -> None:
+    """A session of a line with calibrating and later series, and its effects, joined by `+`."""
+    line = Line(name, tuple(effect.split("+")), rng)
+    of = line.of
+    scintillator = "{}:{:g}".format(*of.scintillator)
     instrument = Instrument(
         anode="W",
-        anode_angle_deg=16.0,
-        inherent_filtration=filters_from_text("Be:2.5"),
-        source_object_mm=NEAR_MM,
-        source_detector_mm=DETECTOR_MM,
-        pixel_mm=PIXEL_MM,
+        anode_angle_deg=of.anode_deg,
+        inherent_filtration=filters_from_text(f"Be:{of.beryllium_mm:g}"),
+        source_object_mm=of.near_mm,
+        source_detector_mm=of.detector_mm,
+        pixel_mm=of.pixel_mm,
         detector="area",
         counting=False,
-        scintillator=filters_from_text("Gd2O2S:0.18"),
-        bits=14,
-        readout_ms=READOUT_MS,
+        scintillator=filters_from_text(scintillator),
+        bits=of.bits,
+        readout_ms=of.readout_ms,
     )
-    known = scenes()
+    known, highest_kV = scenes(of), max(of.current_mA)
     with write_acquisition(path, instrument) as writer:
 
         def add(name, kind, exposure_ms, *, kV=None, copper_mm=0.0, scene="", after=False):
             lit = None
-            current_mA = None if kV is None else CURRENT_MA[kV] * (2.0 if copper_mm else 1.0)
+            current_mA = None if kV is None else of.current_mA[kV] * (of.copper_times if copper_mm else 1.0)
             if kV is not None:
                 thickness_mm = known[scene][1] if scene else {}
                 mAs = current_mA * exposure_ms / 1000.0
@@ -292,8 +440,8 @@ def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int)
                 current_mA=current_mA,
                 exposure_ms=exposure_ms,
                 filters=None if kV is None else filters_from_text(f"Cu:{copper_mm}" if copper_mm else ""),
-                frame_interval_ms=exposure_ms + READOUT_MS,
-                source_object_mm=FAR_MM if scene.endswith("far") else NEAR_MM if scene else None,
+                frame_interval_ms=exposure_ms + of.readout_ms,
+                source_object_mm=of.far_mm if scene.endswith("far") else of.near_mm if scene else None,
                 scene=scene,
                 role="evaluation" if after else "calibration",
             )
@@ -302,43 +450,43 @@ def make_session(path: Path, effect: str, rng: np.random.Generator, frames: int)
             writer.add_scene(scene, kind=kind, thickness_mm={NAMES[key]: map_ for key, map_ in thickness_mm.items()})
         for exposure_ms in (40.0, 160.0):
             add(f"dark_{exposure_ms:g}", "dark", exposure_ms)
-        for kV in CURRENT_MA:
+        for kV in of.current_mA:
             for exposure_ms in (20.0, 40.0, 80.0, 160.0):
                 add(f"flat_{kV:g}_{exposure_ms:g}", "flat", exposure_ms, kV=kV)
             add(f"flat_{kV:g}_copper", "flat", 160.0, kV=kV, copper_mm=0.1)
         add("afterglow", "afterglow", 160.0, after=True)
         add("dark_later", "dark", 160.0, after=True)
-        for kV in CURRENT_MA:
+        for kV in of.current_mA:
             for exposure_ms in (160.0, 40.0):
                 add(f"flat_{kV:g}_{exposure_ms:g}_later", "flat", exposure_ms, kV=kV, after=True)
             add(f"flat_{kV:g}_copper_later", "flat", 160.0, kV=kV, copper_mm=0.1, after=True)
             for scene in known:
                 add(f"{scene}_{kV:g}", "object", 160.0, kV=kV, scene=scene, after=True)
         for scene in ("product1", "edge_near"):
-            add(f"{scene}_100_40", "object", 40.0, kV=100.0, scene=scene, after=True)
+            add(f"{scene}_{highest_kV:g}_40", "object", 40.0, kV=highest_kV, scene=scene, after=True)
         add("dark_last", "dark", 160.0, after=True)
 
 
-def judged(effect: str, seed: int, frames: int) -> dict:
+def judged(name: str, effect: str, seed: int, frames: int) -> dict:
     """What the diagnosis says of one session."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.h5"
-        make_session(path, effect, np.random.default_rng([seed, zlib.crc32(effect.encode())]), frames)
+        make_session(path, name, effect, np.random.default_rng([seed, zlib.crc32(effect.encode())]), frames)
         with open_acquisition(path) as acquisition:
             found = diagnose(acquisition, rng=np.random.default_rng(seed))
     names = effect.split("+")
-    wanted = sorted(name.removesuffix("_later") for name in names if name not in ("none", *UNKNOWN))
+    wanted = sorted(one.removesuffix("_later") for one in names if one not in ("none", *UNKNOWN))
     verdict = {"none": "no_gap", **dict.fromkeys(UNKNOWN, "unknown_effect")}.get(effect, "explained")
     strengths = {item.effect: list(item.strength) for item in found.causes}
     return {
         "effect": effect,
-        "planted": [CASES[name][0] for name in names],
+        "planted": [CASES[one][0] for one in names],
         "verdict": found.verdict,
         "named": list(found.named),
         "right": found.verdict == verdict and sorted(found.named) == wanted,
         "strengths": {
             one: strengths[one]
-            for one in (name.removesuffix("_later") for name in names if CASES[name][1])
+            for one in (part.removesuffix("_later") for part in names if CASES[part][1])
             if one in found.named
         },
     }
@@ -347,6 +495,7 @@ def judged(effect: str, seed: int, frames: int) -> dict:
 def run() -> None:
     """The table on the terminal, and the rows as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--line", choices=LINES, default="usual", help="which line (default usual)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=20, help="of a series (default 20)")
     parser.add_argument(
@@ -356,7 +505,7 @@ def run() -> None:
     options = parser.parse_args()
     rows = []
     for effect in options.only:
-        row = judged(effect, options.seed, options.frames)
+        row = judged(options.line, effect, options.seed, options.frames)
         rows.append(row)
         told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())
         named = ", ".join(row["named"]) or row["verdict"]

@@ -32,6 +32,7 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
         trapped=tuple(part * trapped for part in parts),
         time_s=times,
         pause_share=parameters["pause_share"],
+        idle_s=parameters["idle_s"],
     )
     return replace(state, lag=law)
 
@@ -93,6 +94,16 @@ IMAGE_LAG = Effect(
             high=1e5,
             default=5.0,
             source="length of the exposure after which `strength` is seen",
+            log=True,
+            fitted=False,
+        ),
+        Parameter(
+            name="idle_s",
+            unit="s",
+            low=0.1,
+            high=300.0,
+            default=1.0,
+            source="pause before each series of a session that states no times; diagnoses of such sessions fit it",
             log=True,
             fitted=False,
         ),

@@ -254,14 +254,16 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
 
     with _opened(arguments) as acquisition, tqdm(disable=None, bar_format="{desc}") as bar:
         session = prepare_session(acquisition, twin=twin, rng=np.random.default_rng(arguments.seed))
-        if session.suspects:
-            raise mislabelled(acquisition, session.suspects)
+        suspects = tuple(item for item in session.suspects if not item.or_effects)
+        if suspects:
+            raise mislabelled(acquisition, suspects)
         unseen = {**already_there(session.twin.effects), **(UNSEEN if session.factor > 1 else {})}
         problem = build_problem(
             session.acquisition,
             session.twin,
             variants=catalogue_variants(without=(*arguments.without, *unseen), side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
+            exposed=session.exposed,
             side=session.factor,
             progress=bar.set_description_str,
         )

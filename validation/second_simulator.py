@@ -389,7 +389,7 @@ def scenes(of: LineOf) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
     """Kind and path lengths, mm, of what stands in the beam."""
     y, x = np.indices(of.shape)
     rows, columns = of.shape
-    inside = (y > 15 / 104 * rows) & (y < 90 / 104 * rows)
+    inside = (104 * y > 15 * rows) & (104 * y < 90 * rows)
     wedge = np.where(inside, np.clip((x - 8) * 136 // (16 * columns), 0, 7) * of.wedge_mm, 0.0)
     edge = np.where(x + 0.06 * y > 70 / 136 * columns, of.lead_mm, 0.0)
     found = {"wedge": ("wedge", {"Al": wedge})}

@@ -377,7 +377,7 @@ def judge(
             )
         )
     causes.sort(key=lambda item: -item.probability)
-    z = _leave_one_out_z(problem, nuisances)
+    z = nuisances.given_others(problem.residual)
     threshold = _threshold(problem, nuisances, rng)
     places = [
         Place(
@@ -481,11 +481,6 @@ def _next_measurement(
         "separation": found.separation,
         "separation_then": found.separation_then,
     }
-
-
-def _leave_one_out_z(problem: Problem, nuisances: LocalNuisances) -> NDArray[np.float64]:
-    """z of each probe given all others: (C^-1 r)_i / sqrt((C^-1)_ii)."""
-    return np.asarray(nuisances.solve(problem.residual) / np.sqrt(np.maximum(nuisances.precision, 1e-12)))
 
 
 def _threshold(problem: Problem, nuisances: LocalNuisances, rng: np.random.Generator) -> float:

@@ -167,11 +167,10 @@ def plot_by_axis(diagnosis: Diagnosis) -> bytes:
 
 def plot_places(diagnosis: Diagnosis) -> bytes:
     """Every probe's z over the series in time order, coloured by axis, with the threshold of chance."""
-    from .diagnose import _leave_one_out_z
     from .local_nuisances import LocalNuisances
 
     problem = diagnosis.problem
-    z = _leave_one_out_z(problem, LocalNuisances(problem.factors, problem.blocks))
+    z = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)
     figure, grid = _figure(9.0, 4.4)
     axis = grid[0, 0]
     axes_names = list(dict.fromkeys(name.axis for name in problem.names))

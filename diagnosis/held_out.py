@@ -17,6 +17,9 @@ from .local_nuisances import LocalNuisances
 from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it
+_UNTOLD = (
+    3.0  # the same of a probe once nuisances are fitted on all series: what half of them foretell badly is no gap yet
+)
 _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
 _DRAWS = 300
 _UNSEEN = 3.0  # standard deviations of a probe
@@ -157,7 +160,8 @@ def held_out(
         found = shrinkage_of(before, values[known], floor, series, rng)
         if found is not None:
             shares[effect] = found
-    shown = np.abs(before) > _SHOWN
+    untold = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)[known]
+    shown = (np.abs(before) > _SHOWN) & (np.abs(untold) > _UNTOLD)
     left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
     gap = Gap(
         before=_rms(before),

@@ -43,6 +43,10 @@ class LocalNuisances:
         """C^-1 of each of the vectors (vector, probe): what the nuisances leave of them."""
         return np.asarray(vectors - (self.factors @ self._solved(self.factors.T @ vectors.T)).T)
 
+    def given_others(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Each probe (probe,) as the others do not tell it, in standard deviations: (C^-1 r)_i / sqrt((C^-1)_ii)."""
+        return np.asarray(self.solve(vector) / np.sqrt(np.maximum(self.precision, 1e-12)))
+
     @property
     def variance(self) -> NDArray[np.float64]:
         """Variance (factor,) of nuisances once the probes are seen, prior variance 1."""

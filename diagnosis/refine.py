@@ -23,7 +23,7 @@ from .nuisances import Nuisances
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
-_LEAST_EVIDENCE = 0.0  # of the best on the grid over none: below it there is nothing to come closer to
+_LEAST_EVIDENCE = 1.0  # of the best on the grid over none: below it no refined law could be named
 _REACH = 0.6  # share of the best evidence from which an effect is refined
 _REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone
@@ -282,6 +282,8 @@ def _refined(
                 parameters = dict(start)
                 for item in part:
                     parameters[item.name] = _moved(item, start[item.name], share * steps.get(item.name, 0.0))
+                if parameters == best.parameters:
+                    continue  # at the ends of their ranges
                 candidate = tried(near(parameters, trial))
                 if candidate is not None and candidate.log_evidence > here.log_evidence:
                     here, strength = candidate, candidate.best

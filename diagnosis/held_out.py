@@ -17,9 +17,8 @@ from .local_nuisances import LocalNuisances
 from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it
-_UNTOLD = (
-    3.0  # the same of a probe once nuisances are fitted on all series: what half of them foretell badly is no gap yet
-)
+# the same of a probe once nuisances are fitted on all series: what half of them foretell badly is no gap yet
+_UNTOLD = 3.0
 _CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
 _DRAWS = 300
 _UNSEEN = 3.0  # standard deviations of a probe
@@ -29,7 +28,8 @@ _UNSEEN = 3.0  # standard deviations of a probe
 class Gap:
     """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
 
-    left: what is left of a typical probe that showed the gap (median of |after| over |before|); None: too few showed it.
+    left: what is left of a typical probe that showed the gap and that no nuisance tells (median of |after| over |before|); None: too few
+    showed it.
     contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
     """
 

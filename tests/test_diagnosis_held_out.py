@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.held_out import folds_of
+from raytwin.diagnosis.held_out import folds_of, held_out
+from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
 
 
 def problem(*rows, calibrating=0):
@@ -53,3 +54,23 @@ def test_either_half_has_calibrating_and_later_flats_of_both_exposures():
 def test_two_exposures_that_occur_once_are_one_in_either_half():
     once = [("flat", None, 60.0, 20.0), ("flat", None, 60.0, 80.0)]
     np.testing.assert_array_equal(folds_of(problem(*once)), [0, 1])
+
+
+@pytest.mark.parametrize(("alternating", "left"), [(False, None), (True, 1.0)])
+def test_what_nuisances_tell_once_they_see_it_is_no_gap_that_an_explanation_leaves(alternating, left):
+    flats = problem(*[("flat", None, 60.0, 20.0)] * 4)
+    probes, series = 20, len(flats.views)
+    size = probes * series
+    series_of = np.repeat(np.arange(series), probes)
+    departs = 14.0 * (series_of == 1)
+    if alternating:
+        departs *= np.where(np.arange(size) % 2, 1.0, -1.0)
+    flats.residual = np.random.default_rng(1).standard_normal(size) + departs
+    flats.factors = 2.0 * (series_of == 1)[:, None]  # of the second series alone, and pulled by 7 of its sds
+    flats.blocks, flats.parts, flats.series_of = series_of, series_of, series_of
+    flats.noise = np.ones(size)
+    flats.names = [SimpleNamespace(axis="level")] * size
+    nobody = Hypothesis(effects=(UNKNOWN,), probability=1.0, log_evidence=0.0)
+    gap, _, _ = held_out(flats, nobody, np.random.default_rng(0))
+    assert gap.before > 2.0
+    assert gap.left == left

@@ -28,8 +28,8 @@ _UNSEEN = 3.0  # standard deviations of a probe
 class Gap:
     """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
 
-    left: what is left of a typical probe that showed the gap and that no nuisance tells (median of |after| over |before|); None: too few
-    showed it.
+    left: what is left of a typical probe that showed the gap and that no nuisance tells (median of |after| over |before|); None:
+    too few showed it.
     contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
     """
 

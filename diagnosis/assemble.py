@@ -25,7 +25,7 @@ from .known_effects import lasting
 from .known_laws import beside_known, without_each
 from .nuisance_columns import Columns
 from .placing import place_scenes
-from .probes import ProbeName, expected_scalars
+from .probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName, expected_scalars
 from .responses import Asked, Moved, SeriesModel, SessionModel, session_model
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
@@ -35,6 +35,7 @@ from .usable import SeenSeries, look_at_all, stated_series, summarise_all
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
+_PLACES = "places of scenes"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -388,7 +389,15 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
             for axis, series in of_probes
         ]
     )
-    places, place_names = _numbered([f"{axis} of {series.kind} {series.scene}".strip() for axis, series in of_probes])
+    places, place_names = _numbered(
+        [
+            # a few probes a scene, lost among its others
+            _PLACES
+            if name.statistic in (ALONG_ROWS, ALONG_COLUMNS)
+            else f"{axis} of {series.kind} {series.scene}".strip()
+            for name, (axis, series) in zip(names, of_probes, strict=True)
+        ]
+    )
     sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
     problem = Problem(
         residual=np.concatenate([block.residual for block in blocks]),

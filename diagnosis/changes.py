@@ -262,7 +262,7 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
         return list(variants)
     result = []
     for variant in variants:
-        if variant.effect != "image_lag":
+        if variant.effect != "image_lag" or _PAUSE.name in variant.parameters:
             result.append(variant)
             continue
         for idle_s in _PAUSES_S:

@@ -14,9 +14,12 @@ from raytwin.cli import main
 from raytwin.diagnosis.assemble import build_problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose import _clears
+from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.plausibility import Suspect, check_plausibility
 from raytwin.diagnosis.session import measured_levels, read_session
+from raytwin.diagnosis.unknown import unknown_evidence
+from raytwin.diagnosis.whitening import Whitening
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.series import session_conditions
 from raytwin.generator.twin_io import read_twin
@@ -72,6 +75,26 @@ def test_lines_move_later_means_by_chance_and_places_of_scenes_follow_no_law(lin
             steps = curve.jitter[along_columns & ~calibrates]
             assert np.median(steps) < 1e-3 * np.median(curve.jitter[level & ~calibrates]) or share == 1.0
     assert seen == {(share, since) for share in (0.0, 1.0) for since in ("always", "calibration")}
+
+
+def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+    found = np.array([name.statistic.startswith("displacement along") for name in problem.names])
+    (number,) = set(problem.parts[found])
+    assert problem.part_names[number] == "places of scenes"
+    np.testing.assert_array_equal(problem.parts == number, found)
+    whitening = Whitening(problem.factors, problem.blocks)
+    shared = Nuisances(whitening.factors)
+
+    def unknown(displaced_sds):
+        residual = whitening.apply((displaced_sds * found)[None, :])[0]
+        return unknown_evidence(residual, shared, problem.parts, problem.part_names)
+
+    assert unknown(0.0)[0] < 0.0
+    evidence, place = unknown(8.0)
+    assert evidence > 10.0
+    assert place == "places of scenes"
 
 
 def only(*kinds):

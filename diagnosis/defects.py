@@ -48,7 +48,9 @@ def new_outliers(
         outlying |= np.abs(residual - centre) > _OUTLYING * max(spread, 1e-9)
         if look.frames > 9:
             ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), 1e-12)
-            outlying |= (ratio > max(_largest_ratio(look.frames), 2.5)) & good
+            limit = max(_largest_ratio(look.frames), 2.5)
+            if bool(np.any(ratio[good] > limit)):
+                outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good
     if not any(item.series.kind in ("dark", "flat") and not item.calibrates for item in kept):
         outlying |= _out_in_every_object(kept, expected, looks, maps)
     outlying &= good
@@ -83,6 +85,13 @@ def _out_in_every_object(
             times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
         found |= times >= _NEARLY_ALWAYS * len(members)
     return found
+
+
+def _of_lines(ratio: NDArray[np.floating], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Median of a map (row, column) of 1 as a rule along each pixel's row or column, the larger: noise that a line has in common."""
+    known = np.where(good, np.asarray(ratio, dtype=np.float64), 1.0)
+    rows, columns = (np.median(known, axis=axis, keepdims=True) for axis in (1, 0))
+    return np.asarray(np.maximum(rows, columns))
 
 
 @lru_cache(maxsize=64)

@@ -193,3 +193,27 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
     assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps))] == [dead, hot]
     # three products are too few to tell a defect from what they have in common
     assert not new_outliers(kept[:6], expected, looks, maps).any()
+
+
+def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
+    rng = np.random.default_rng(6)
+    frames = 5.0 * rng.standard_normal((12, *SHAPE))
+    frames[:, 44] += 20.0 * rng.standard_normal((12, 1))  # a line that jumps as a whole
+    noisy = (70, 33)
+    frames[:, *noisy] *= 6.0
+    pairs = np.mean(np.diff(frames, axis=0) ** 2, axis=0) / 2.0
+    dark = SimpleNamespace(kind="dark", exposure_ms=100.0, corrected=frozenset())
+    item = SimpleNamespace(name="dark", series=dark, request=SimpleNamespace(beam_on=False), calibrates=False)
+    looks = {"dark": SimpleNamespace(frames=12, mean_DN=np.full(SHAPE, 100.0), pair_variance_DN2=pairs)}
+    looks["dark"].mean_DN += rng.standard_normal(SHAPE)
+    maps = CalibratedMaps(
+        darks=SimpleNamespace(under=lambda item: np.full(SHAPE, 100.0)),
+        gain=np.ones(SHAPE),
+        shares={},
+        gain_quantum=0.0,
+        gain_white=0.0,
+        good=ALL,
+        frames={},
+    )
+    assert np.median(pairs[44]) > 8.0 * np.median(pairs)
+    assert [tuple(place) for place in np.argwhere(new_outliers([item], {}, looks, maps))] == [noisy]

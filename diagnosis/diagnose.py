@@ -340,14 +340,14 @@ def judge(
         if len({effect for item in tied for effect in item.effects}) < 2:
             verdict = "explained"
     tell("held-out data")
-    gap, by_axis, shares = held_out(problem, leading, rng)
+    gap, by_axis, shares = held_out(problem, leading, nuisances, rng)
     if leading.effects and leading.effects != (UNKNOWN,) and is_refused(problem, gap, leading):
         # the best of the wrong ones
         verdict = "unknown_effect"
         hypotheses = vetoed(hypotheses)
         leading = hypotheses[0]
         tied = []
-        gap, by_axis, shares = held_out(problem, leading, rng)
+        gap, by_axis, shares = held_out(problem, leading, nuisances, rng)
     # what the fit can no longer doubt may still be wrong in kind
     hypotheses = with_doubt(hypotheses)
     leading = next(item for item in hypotheses if item.effects == leading.effects)

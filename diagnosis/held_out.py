@@ -123,9 +123,12 @@ def noise_alone(problem: Problem, fit: NDArray[np.bool_]) -> NDArray[np.float64]
 
 
 def held_out(
-    problem: Problem, leading: Hypothesis, rng: np.random.Generator
+    problem: Problem, leading: Hypothesis, nuisances: LocalNuisances, rng: np.random.Generator
 ) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
-    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
+    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect.
+
+    nuisances: of the problem.
+    """
     folds = folds_of(problem)[problem.series_of]
     size = len(problem.residual)
     before, after = np.full(size, np.nan), np.full(size, np.nan)
@@ -160,7 +163,7 @@ def held_out(
         found = shrinkage_of(before, values[known], floor, series, rng)
         if found is not None:
             shares[effect] = found
-    untold = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)[known]
+    untold = nuisances.given_others(problem.residual)[known]
     shown = (np.abs(before) > _SHOWN) & (np.abs(untold) > _UNTOLD)
     left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
     gap = Gap(

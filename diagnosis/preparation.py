@@ -1,7 +1,7 @@
 """What happens to a session before its gap is looked for: series that cannot be used, labels in doubt, the twin."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,7 +96,7 @@ def prepare_session(
         try:
             twin = calibrated_twin(acquisition, rng=rng, progress=progress)
         except (InputError, FitError) as error:
-            raise _not_calibrated(acquisition, suspects, error) from error
+            raise _not_calibrated(acquisition, suspects, left_out, error) from error
         suspects = suspects or _without_spectrum(acquisition, twin)
     return PreparedSession(
         acquisition=acquisition,
@@ -173,7 +173,9 @@ def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[Acqu
     return replace(acquisition, series=kept), left_out
 
 
-def _not_calibrated(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...], error: RaytwinError) -> InputError:
+def _not_calibrated(
+    acquisition: AcquisitionFile, suspects: tuple[Suspect, ...], left_out: Sequence[str], error: RaytwinError
+) -> InputError:
     """Why a session cannot calibrate its own twin, and what could be said with one from elsewhere."""
     if suspects:
         return mislabelled(acquisition, suspects)
@@ -184,16 +186,18 @@ def _not_calibrated(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...],
         f"or give --twin, calibrated from another session of this line: with it this session ({have} series,"
         f" {several} of them of two frames or more) can be compared as far as it goes"
     )
+    others = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
+    without = f" (not used: {left_out[0]}{others})" if left_out else ""
     if isinstance(error, InputError):
         return InputError(
             error.argument,
-            received=error.received,
+            received=f"{error.received}{without}",
             expected=error.expected,
             remedy=f"{error.remedy}; {remedy}" if error.remedy else remedy,
         )
     return InputError(
         f"acquisition {acquisition.path}",
-        received=str(error),
+        received=f"{error}{without}",
         expected="flats and darks that calibrate a twin",
         remedy=remedy,
     )

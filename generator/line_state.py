@@ -56,7 +56,7 @@ class LagLaw:
     trapped: tuple[float, ...]
     time_s: tuple[float, ...]
     pause_share: float
-    idle_s: float = 1.0
+    idle_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

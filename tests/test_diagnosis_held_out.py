@@ -7,6 +7,7 @@ import pytest
 
 from raytwin.diagnosis.held_out import folds_of, held_out
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.local_nuisances import LocalNuisances
 
 
 def problem(*rows, calibrating=0):
@@ -71,6 +72,6 @@ def test_what_nuisances_tell_once_they_see_it_is_no_gap_that_an_explanation_leav
     flats.noise = np.ones(size)
     flats.names = [SimpleNamespace(axis="level")] * size
     nobody = Hypothesis(effects=(UNKNOWN,), probability=1.0, log_evidence=0.0)
-    gap, _, _ = held_out(flats, nobody, np.random.default_rng(0))
+    gap, _, _ = held_out(flats, nobody, LocalNuisances(flats.factors, flats.blocks), np.random.default_rng(0))
     assert gap.before > 2.0
     assert gap.left == left

@@ -364,6 +364,18 @@ def test_levels_that_no_single_tube_load_explains_are_each_their_own(line, tmp_p
     assert "product1_40kV_25ms" not in levels
 
 
+def test_a_session_of_saturated_flats_says_so(diagnosed):
+    def saturate(file):
+        for node in file["series"].values():
+            if node.attrs["kind"] in ("flat", "object"):
+                node["frames"][...] = 65535
+
+    code, _, lines = diagnosed(saturate)
+    assert code == 2
+    assert len(lines) == 1
+    assert "every pixel of every frame is 65535 DN and" in lines[0]
+
+
 def test_series_without_light_is_left_out_and_the_rest_is_judged(diagnosed):
     def change(file):
         file["series"][f"{FLAT_40}_2"]["frames"][...] = 0

@@ -1,4 +1,4 @@
-"""Evidence of one effect with its inner parameters fixed, its strength integrated over the plausible range."""
+"""Evidence of one effect with its inner parameters fixed, its strength integrated out."""
 
 import math
 from collections.abc import Sequence
@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import Curve, log_strength_nodes
+from .curves import Curve
 from .inexact_laws import LAW_ERRORS, LEAST_FACTOR, credible, law_factors, own_variance, with_law
 from .nuisances import Nuisances
 
-_CHANCE_NODES = 121
+_CHANCE_NODES = 161
+_IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
 _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
 
 
@@ -45,7 +46,7 @@ def fit_curve(
     places: NDArray[np.intp] | None = None,
     law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
 ) -> CurveFit:
-    """Evidence of one curve over none, its strength integrated over the log-uniform plausible range.
+    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `_log_integral`.
 
     The law's inaccuracy is a random factor a group and a part of each probe's own, both in proportion to what the
     nuisances leave of the response at the best strength (found in rounds) and to what is seen in each of `places` (groups
@@ -71,7 +72,7 @@ def fit_curve(
         return weights @ model[0] - 0.5 * quadratic, quadratic
 
     sharp = terms(nuisances, nodes, residual)
-    coarse = np.unique(np.concatenate([log_strength_nodes(curve.low, curve.high), [curve.low, curve.high]]))
+    coarse = curve.log_strengths()
     strengths = coarse
     value, quadratic = likelihood(strengths, sharp)
     at = int(np.argmax(value))
@@ -128,9 +129,7 @@ def _fit_chance(residual: NDArray[np.float64], curve: Curve, nuisances: Nuisance
     spread = curve.spread.T
     values, vectors = np.linalg.eigh(nuisances.inner(spread, spread))
     along = vectors.T @ nuisances.inner(spread, residual[None, :])[:, 0]
-    strengths = np.unique(
-        np.concatenate([log_strength_nodes(curve.low, curve.high, _CHANCE_NODES), [curve.low, curve.high]])
-    )
+    strengths = curve.log_strengths(_CHANCE_NODES)
     grown = np.multiply.outer(strengths**2, np.maximum(values, 0.0))
     quadratic = np.sum(along**2 * strengths[:, None] ** 2 / (1.0 + grown), axis=1)
     likelihood = 0.5 * (quadratic - np.sum(np.log1p(grown), axis=1))
@@ -153,11 +152,20 @@ def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArr
 def _log_integral(
     strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64], low: float, high: float
 ) -> float:
-    """log of the mean likelihood under a log-uniform prior from low to high."""
+    """log of the mean likelihood under a prior that is even in the logarithm of the strength.
+
+    Most of it from low to high, _IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.
+    """
+    x = np.log(strengths)
     inside = (strengths >= 0.999999 * low) & (strengths <= 1.000001 * high)
-    x, y = np.log(strengths[inside]), log_likelihood[inside]
-    top = float(y.max())
-    return top + math.log(max(float(np.trapezoid(np.exp(y - top), x)), 1e-300) / (x[-1] - x[0]))
+    widths = np.diff(x)
+    plausible = inside[:-1] & inside[1:]
+    top = float(log_likelihood.max())
+    areas = 0.5 * (np.exp(log_likelihood[:-1] - top) + np.exp(log_likelihood[1:] - top)) * widths
+    total = 0.0
+    for part, share in ((plausible, 1.0 - _IMPLAUSIBLE), (~plausible, _IMPLAUSIBLE)):
+        total += share * float(areas[part].sum()) / max(float(widths[part].sum()), 1e-12)
+    return top + math.log(max(total, 1e-300))
 
 
 def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
@@ -167,7 +175,7 @@ def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
     nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
     total = np.full(len(nodes), -np.inf)
     for fit in likely:
-        value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood)
+        value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood, left=-np.inf, right=-np.inf)
         total = np.logaddexp(total, value)
     return interval_under(nodes, total)
 

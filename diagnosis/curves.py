@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from . import _pair_loops
 
 LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
-STRENGTH_NODES = 25
+STRENGTH_NODES = 37
+_WEAKER = 30.0  # times below its plausible range that an effect is tried
+_STRONGER, _BEYOND_NODES = (
+    2.5,
+    1.5,
+)  # times above it where the response grows in proportion; else above the last that was asked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +44,18 @@ class Curve:
     exact: NDArray[np.bool_] | None = None
 
     @property
+    def reach(self) -> tuple[float, float]:
+        """Strengths between which the curve is tried: beyond the plausible range on both sides."""
+        if len(self.strengths) == 1:
+            return self.low / _WEAKER, _STRONGER * self.high
+        return self.low / _WEAKER, _BEYOND_NODES * max(self.high, float(self.strengths[-1]))
+
+    def log_strengths(self, count: int = STRENGTH_NODES) -> NDArray[np.float64]:
+        """Strengths at which integrals are taken: evenly in the logarithm over the reach, and the ends of the plausible range."""
+        ends = np.array([self.low, self.high])
+        return np.unique(np.concatenate([np.geomspace(*self.reach, count), ends]))
+
+    @property
     def by_chance_alone(self) -> bool:
         """Whether the effect moves no probe by a known amount, but some by chance."""
         return self.spread is not None and not bool(np.any(np.abs(self.responses) > LEAST_RESPONSE))
@@ -64,8 +81,3 @@ class Curve:
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
     return np.asarray(_pair_loops.node_weights(nodes, strengths))
-
-
-def log_strength_nodes(low: float, high: float, count: int = STRENGTH_NODES) -> NDArray[np.float64]:
-    """Strengths at which integrals are taken, evenly in the logarithm, from a third of `low` to 1.5 `high`."""
-    return np.geomspace(low / 3.0, 1.5 * high, count)

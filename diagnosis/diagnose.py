@@ -421,6 +421,7 @@ def judge(
         named=tuple(named),
         problem=problem,
         warnings=tuple(problem.skipped),
+        notes=_beyond_plausible(leading),
         not_tested=_out_of_reach(problem, whitened, shared),
         strained=_strained(problem, leading, nuisances),
     )
@@ -433,6 +434,20 @@ def _by_effect(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
         for effect in hypothesis.effects:
             result[effect] = result.get(effect, 0.0) + hypothesis.probability
     return result
+
+
+def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
+    """What to say of effects that are weaker or stronger than their plausible range."""
+    notes = []
+    for effect, curve in leading.variants.items():
+        known, value = EFFECTS[effect].strength, leading.strengths[effect][0]
+        if not curve.low <= value <= curve.high:
+            side = "weaker" if value < curve.low else "stronger"
+            notes.append(
+                f"{effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
+                " strength was given little weight beforehand"
+            )
+    return tuple(notes)
 
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:

@@ -40,6 +40,7 @@ _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
 _LAW_ERROR = 0.1
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
+_UP_TO = (0.75, 1.0)  # where more cannot be asked: the spectrum ends a tenth above the stated voltage
 
 
 class Responder(Protocol):
@@ -250,22 +251,31 @@ def _refined(
         like = fit.curve
         return item.curve(seen.apply(responses), spread=like.spread, jitter=like.jitter, exact=like.exact)
 
-    def tried(item: Variant) -> CurveFit | None:
+    def answered(parameters: Mapping[str, float]) -> tuple[Variant, NDArray[np.float64]] | None:
+        for shares in (_NEAR, _UP_TO):
+            item = near(parameters, shares)
+            answer = respond([item])
+            if 0 in answer:
+                return item, answer[0]
+        return None
+
+    def tried(parameters: Mapping[str, float]) -> CurveFit | None:
+        if not in_proportion:
+            found = answered(parameters)
+            return None if found is None else seen.fit_scaled(curve_of(*found))
+        item = near(parameters, (1.0,))
         answer = respond([item])
-        if 0 not in answer:
-            return None
-        return seen.fit_scaled(curve_of(item, answer[0]))
+        return seen.fit_scaled(curve_of(item, answer[0])) if 0 in answer else None
 
     inner = [
         item for item in variant.fitted if item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
     ]
     # one strength tells the others where the response grows in proportion
     in_proportion = variant.effect in ONE_STRENGTH
-    trial = (1.0,) if in_proportion else _NEAR
     # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
     # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
     shares = (1.0, 0.3, 0.1) if in_proportion else (1.0, _FURTHER, 0.3, 0.1)
-    here = tried(near(best.parameters, trial))
+    here = tried(best.parameters)
     if here is None:
         return None
     strength = here.best
@@ -286,7 +296,7 @@ def _refined(
                     parameters[item.name] = _moved(item, start[item.name], share * steps.get(item.name, 0.0))
                 if parameters == best.parameters:
                     continue  # at the ends of their ranges
-                candidate = tried(near(parameters, trial))
+                candidate = tried(parameters)
                 if candidate is not None and candidate.log_evidence > here.log_evidence:
                     here, strength = candidate, candidate.best
                     best = replace(best, parameters=parameters)
@@ -297,20 +307,17 @@ def _refined(
                 slopes = None
             else:
                 break
-    final = near(best.parameters, _NEAR)
-    answer = respond([final])
+    final = answered(best.parameters)
     for _ in range(_CENTRINGS):
-        if 0 not in answer:
+        if final is None:
             return None
         # a response that saturates is known near its nodes only: they are laid where the strength turns out to be
-        curve = curve_of(final, answer[0])
-        found = min(max(seen.fit_scaled(curve).best, variant.low), variant.high)
+        found = seen.fit_scaled(curve_of(*final)).best
         if abs(math.log(found / strength)) < _CENTRED:
             break
         strength = found
-        final = near(best.parameters, _NEAR)
-        answer = respond([final])
-    return (final, answer[0]) if 0 in answer else None
+        final = answered(best.parameters)
+    return final
 
 
 def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:

@@ -73,7 +73,7 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     for other in hypothesis.effects:
         if other != effect:
             left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
-    lowest, highest = curve.low / 3.0, 1.5 * curve.high
+    lowest, highest = curve.reach
     if len(curve.strengths) > 1:
         # a refined curve is known about its nodes: far from them its cubics may come back to what was measured
         lowest = max(lowest, float(curve.strengths.min()) / _BEYOND_NODES)

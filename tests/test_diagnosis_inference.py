@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis import inference
-from raytwin.diagnosis.curve_fits import CurveFit, fit_curve, interval_of
+from raytwin.diagnosis.changes import Variant
+from raytwin.diagnosis.curve_fits import CurveFit, _log_integral, fit_curve, interval_of
 from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.diagnose import _strained
+from raytwin.diagnosis.diagnose import _beyond_plausible, _strained
 from raytwin.diagnosis.inexact_laws import group_factors
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from raytwin.diagnosis.local_nuisances import LocalNuisances, local_columns
@@ -23,7 +24,7 @@ from raytwin.diagnosis.pairs import (
     Doubts,
     _pair_integral,
 )
-from raytwin.diagnosis.refine import _in_turn, _Slopes, _to_refine
+from raytwin.diagnosis.refine import _in_turn, _refined, _Seen, _Slopes, _to_refine
 from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.veto import DOUBT, with_doubt
 from raytwin.diagnosis.whitening import Whitening
@@ -682,3 +683,106 @@ def test_reach_is_sought_before_shape_and_the_stronger_of_a_leading_pair_alone_a
     # a pair behind a single effect: what led alone is asked once more, beside the other
     asked = [(effect, [(curve.effect, at) for curve, at in beside]) for effect, beside in _to_refine([alone, pair])]
     assert asked == [("strong", []), ("strong", [("weak", 1.0)]), ("weak", [("strong", 9.0)])]
+
+
+def test_effects_weaker_and_stronger_than_is_plausible_are_found_and_told():
+    rng = np.random.default_rng(41)
+    # seen from a hundredth of a unit on; plausible from 1 to 50
+    response = 100.0 * rng.standard_normal(PROBES) / np.sqrt(PROBES)
+    nuisances = Nuisances(np.zeros((PROBES, 1)))
+    grows = one_node("a", response, low=1.0, high=50.0)
+    bends = Curve(
+        effect="b",
+        variant="",
+        parameters={},
+        low=1.0,
+        high=50.0,
+        strengths=np.array([20.0, 50.0]),
+        responses=np.outer([20.0, 45.0], response),
+    )
+    for curve, strength in ((grows, 0.1), (grows, 110.0), (bends, 0.1), (bends, 70.0)):
+        residual = curve.response(strength) + rng.standard_normal(PROBES)
+        fit = fit_curve(residual, curve, nuisances, GROUPS, law_errors=())
+        assert fit.best == pytest.approx(strength, rel=0.25)
+        _, low, high = interval_of([fit])
+        assert low < strength < high
+        # 0.1 lies ten standard deviations from none; a strength that is plausible costs less
+        plausible = fit_curve(
+            residual, replace(curve, low=strength / 7.0, high=7.0 * strength), nuisances, GROUPS, law_errors=()
+        )
+        assert 20.0 < fit.log_evidence < plausible.log_evidence < fit.log_evidence + 6.0
+    # noise alone is no evidence of a strength that cannot be seen
+    fit = fit_curve(rng.standard_normal(PROBES), grows, nuisances, GROUPS, law_errors=())
+    assert fit.log_evidence < -3.0
+
+
+def test_the_prior_beyond_the_plausible_range_takes_a_hundredth_of_the_probability():
+    curve = one_node("a", np.full(PROBES, 1e-9), low=1.0, high=50.0)
+    fit = fit_curve(np.zeros(PROBES), curve, Nuisances(np.zeros((PROBES, 1))), GROUPS, law_errors=())
+    assert fit.log_evidence == pytest.approx(0.0, abs=1e-6)
+    assert fit.strengths[0] == pytest.approx(1.0 / 30.0)
+    assert fit.strengths[-1] == pytest.approx(125.0)
+    inside = (fit.strengths >= 1.0) & (fit.strengths <= 50.0)
+    for seen, share in ((inside, 0.99), (~inside, 0.01)):
+        # flat there, far less elsewhere; between nodes it falls within one step
+        evidence = _log_integral(fit.strengths, np.where(seen, 0.0, -500.0), 1.0, 50.0)
+        assert evidence == pytest.approx(np.log(share), abs=0.15)
+
+
+def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
+    rng = np.random.default_rng(43)
+    response = rng.standard_normal(PROBES)
+    grid = Curve(
+        effect="kv_error",
+        variant="",
+        parameters={},
+        low=0.5,
+        high=5.0,
+        strengths=np.array([3.0, 5.0]),
+        responses=np.outer([3.0, 5.0], response),
+    )
+    variant = Variant(
+        effect="kv_error",
+        name="",
+        parameters={},
+        sign=1.0,
+        since="calibration",
+        low=0.5,
+        high=5.0,
+        strengths=(3.0, 5.0),
+    )
+    seen = _Seen(
+        residual=9.0 * response + 0.1 * rng.standard_normal(PROBES),
+        nuisances=Nuisances(np.zeros((PROBES, 1))),
+        groups=GROUPS,
+        places=None,
+        whitener=SimpleNamespace(apply=np.asarray),
+    )
+    asked = []
+
+    def respond(variants):
+        asked.append(variants[0].strengths)
+        # the spectrum ends at 10 %
+        return {0: np.outer(variants[0].strengths, response)} if max(variants[0].strengths) < 10.0 else {}
+
+    fit = seen.fit(grid)
+    assert fit.best == pytest.approx(7.5)  # as far as the grid is believed
+    found = _refined(variant, fit, seen, respond)
+    assert found is not None
+    assert max(found[0].strengths) == pytest.approx(9.0, rel=0.03)
+    assert any(max(strengths) > 10.0 for strengths in asked)
+    assert _refined(variant, fit, seen, lambda variants: {}) is None
+
+
+@pytest.mark.parametrize(("strength", "told"), [(0.1, "weaker"), (3.0, ""), (9.0, "stronger")])
+def test_a_strength_beyond_its_plausible_range_is_told(strength, told):
+    curve = one_node("veiling_glare", np.ones(PROBES), low=0.5, high=5.0)
+    named = Hypothesis(
+        effects=("veiling_glare",),
+        probability=1.0,
+        log_evidence=0.0,
+        strengths={"veiling_glare": (strength, strength, strength)},
+        variants={"veiling_glare": curve},
+    )
+    notes = _beyond_plausible(named)
+    assert [f"veiling_glare is {told} than" in note and "0.5 to 5 %" in note for note in notes] == [True] * bool(told)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..generator.rounding import variance_before_rounding
 from ..generator.series import ExpectedSeries
+from ._projection_loops import weigh_template
 from .fixed_pattern import Pattern
 from .lost_bits import rounded_kurtosis
 from .noise_correlation import autocovariance, correlation_sum
@@ -658,23 +659,18 @@ class MapProjection:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
         sharper, root = np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0))
-        correlated = _Correlation(np.asarray(autocovariance_table, dtype=np.float64))
+        kernels = _separated(np.asarray(autocovariance_table, dtype=np.float64))
+        white = np.ascontiguousarray(white_DN2, dtype=np.float64)
         used: list[Template] = []
-        rows, spread = (np.empty((len(templates), mask.size)) for _ in range(2))
+        rows, spread = (np.empty((len(templates), *mask.shape)) for _ in range(2))
         for template in templates:
-            image = template.image * sharper
-            norm = math.sqrt(float(np.vdot(image, image)))
-            if not (norm > _LEAST_NORM and math.isfinite(norm)):
-                continue
-            image *= sharper / norm
-            rows[len(used)] = image.ravel()  # 0 outside the mask, as the weights are
-            covered = correlated(image * root)
-            covered *= root
-            image *= white_DN2
-            covered += image
-            spread[len(used)] = covered.ravel()
-            used.append(template)
-        left = rows[: len(used)] @ spread[: len(used)].T
+            # rows are 0 outside the mask, as the weights are
+            image = np.ascontiguousarray(template.image)
+            norm = weigh_template(image, sharper, root, white, *kernels, rows[len(used)], spread[len(used)])
+            if norm > _LEAST_NORM and math.isfinite(norm):
+                used.append(template)
+        rows, spread = (one[: len(used)].reshape(len(used), mask.size) for one in (rows, spread))
+        left = rows @ spread.T
         own = np.diag(left).copy()
         chosen: list[int] = []
         columns: list[NDArray[np.float64]] = []
@@ -696,7 +692,8 @@ class MapProjection:
             from scipy.linalg import solve_triangular
 
             lower = np.tril(np.stack(columns, axis=1)[chosen])
-            self._rows[:] = solve_triangular(lower, rows[chosen], lower=True, check_finite=False)
+            inverse = solve_triangular(lower, np.eye(len(chosen)), lower=True, check_finite=False)
+            np.matmul(inverse.astype(np.float32), rows[chosen].astype(np.float32), out=self._rows)
         self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
 
     def __len__(self) -> int:
@@ -733,26 +730,16 @@ class MapProjection:
         return list(self._names)
 
 
-class _Correlation:
-    """Convolution of maps (row, column) with the autocovariance of which a table (lag, lag) is a quarter; 0 outside.
+def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, of which the table is a quarter.
 
-    As a sum of products of a kernel for rows and one for columns: a spread that no effect has changed is one such product.
+    A spread that no effect has changed is one such product.
     """
-
-    def __init__(self, table: NDArray[np.float64]) -> None:
-        across, sizes, along = np.linalg.svd(table)
-        self._parts = [
-            tuple(np.concatenate([half[:0:-1], half]) for half in (across[:, number] * sizes[number], along[number]))
-            for number in np.flatnonzero(sizes > 1e-12 * sizes[0])
-        ]
-
-    def __call__(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
-        from scipy.ndimage import correlate1d
-
-        result = np.zeros(image.shape)
-        for rows, columns in self._parts:
-            result += correlate1d(correlate1d(image, rows, axis=0, mode="constant"), columns, axis=1, mode="constant")
-        return result
+    across, sizes, along = np.linalg.svd(table)
+    parts = np.flatnonzero(sizes > 1e-12 * sizes[0])
+    halves = (across[:, parts] * sizes[parts]).T, along[parts]
+    rows, columns = (np.concatenate([half[:, :0:-1], half], axis=1) for half in halves)
+    return rows, columns
 
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:

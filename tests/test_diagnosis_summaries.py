@@ -316,12 +316,14 @@ def test_codes_are_counted_between_the_percentiles_of_the_numbers(step):
     assert _codes(values) == (len(np.unique(inside)), int(inside.max()) - int(inside.min()) + 1)
 
 
-def _projection(rng, shape=(24, 20), templates=6):
+def _projection(rng, shape=(24, 20), templates=6, products=1):
     images = [rng.standard_normal(shape) * 3.0**k for k in range(templates)]
     images.append(images[0] + images[1])  # says nothing new
     images.append(np.zeros(shape))
     half = np.array([1.0, 0.3, 0.05, 0.0])
     table = np.outer(half, half)
+    if products == 2:
+        table[0, 2] += 0.04  # alike along rows and not along columns
     mask = rng.random(shape) > 0.1
     quantum, white = 2.0 + rng.random(shape), 0.5 + rng.random(shape)
     named = [Template(axis="level", name=str(number), unit="1", image=image) for number, image in enumerate(images)]
@@ -329,8 +331,10 @@ def _projection(rng, shape=(24, 20), templates=6):
     return projection, mask, quantum, white, table
 
 
-def test_map_probes_have_unit_noise_and_do_not_depend_on_each_other():
-    projection, mask, quantum, white, table = _projection(np.random.default_rng(4))
+@pytest.mark.parametrize("products", [1, 2])
+def test_map_probes_have_unit_noise_and_do_not_depend_on_each_other(products):
+    projection, mask, quantum, white, table = _projection(np.random.default_rng(4), products=products)
+    assert np.linalg.matrix_rank(table) == products
     assert [name.location for name in projection.names()] == [str(number) for number in range(6)]
     rows, columns = mask.shape
     y, x = (index.ravel() for index in np.indices(mask.shape))

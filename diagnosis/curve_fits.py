@@ -13,7 +13,7 @@ from .inexact_laws import LAW_ERRORS, LEAST_FACTOR, credible, law_factors, own_v
 from .nuisances import Nuisances
 
 _CHANCE_NODES = 161
-_IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
+IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
 _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
 
 
@@ -154,7 +154,7 @@ def _log_integral(
 ) -> float:
     """log of the mean likelihood under a prior that is even in the logarithm of the strength.
 
-    Most of it from low to high, _IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.
+    Most of it from low to high, IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.
     """
     x = np.log(strengths)
     inside = (strengths >= 0.999999 * low) & (strengths <= 1.000001 * high)
@@ -163,7 +163,7 @@ def _log_integral(
     top = float(log_likelihood.max())
     areas = 0.5 * (np.exp(log_likelihood[:-1] - top) + np.exp(log_likelihood[1:] - top)) * widths
     total = 0.0
-    for part, share in ((plausible, 1.0 - _IMPLAUSIBLE), (~plausible, _IMPLAUSIBLE)):
+    for part, share in ((plausible, 1.0 - IMPLAUSIBLE), (~plausible, IMPLAUSIBLE)):
         total += share * float(areas[part].sum()) / max(float(widths[part].sum()), 1e-12)
     return top + math.log(max(total, 1e-300))
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._pair_loops import pair_integral, pair_likelihood
-from .curve_fits import CurveFit, fit_curve, interval_under, log_mean_exp
+from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, interval_under, log_mean_exp
 from .curves import Curve
 from .inexact_laws import LEAST_FACTOR, credible, law_factors, own_variance, with_law
 from .nuisances import Nuisances
@@ -119,7 +119,7 @@ def weigh_pairs(
         for second, single in singles.items():
             if second != first:
                 # of two that lead both orders are tried: what one alone is best with need not be so beside the other
-                starts.append(_start_pair(singles[first], single.fits, states=states, table=table))
+                starts.append(_start_pair(singles[first], single, states=states, table=table))
     overlaps = _overlaps(starts, singles, observed.nuisances, table)
     doubt = _SecondDoubted(observed, singles, doubts)
     ahead = [
@@ -243,10 +243,14 @@ def _states_of(leading: CurveFit, observed: Observed, table: _NodeTable) -> list
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PairStart:
-    """An effect's best variant with the best variant of another: grid of strengths, log evidence over none (variants averaged)."""
+    """An effect's best variant with the best variant of another: grid of strengths, log evidence over none (variants averaged).
+
+    stronger: the one that alone has more evidence; moves: length of what the second one does, nuisances aside.
+    """
 
     first: Curve
     second: Curve
+    stronger: str
     grid: "_PairGrid"
     log_evidence: float
     moves: float
@@ -267,20 +271,21 @@ class _PairStart:
         return _by_effect(self.first, self.second, self.grid.below)
 
 
-def _start_pair(
-    first: Single, seconds: Sequence[CurveFit], *, states: Sequence[_State], table: _NodeTable
-) -> _PairStart:
+def _start_pair(first: Single, second: Single, *, states: Sequence[_State], table: _NodeTable) -> _PairStart:
     """The other's variants weighed beside the first's best one, which stands for all of them, with the first's law only inexact."""
     a = first.best.curve
     tried: list[tuple[float, _PairGrid, CurveFit]] = []
-    for second in seconds:
-        rows = table.rows(a, second.curve)
+    stronger = (first if first.log_evidence >= second.log_evidence else second).best.curve.effect
+    for fit in second.fits:
+        rows = table.rows(a, fit.curve)
         grids = [
-            _pair_integral(a, second.curve, (state.linear[rows], state.gram[np.ix_(rows, rows)]), state.shift)
+            _pair_integral(
+                a, fit.curve, (state.linear[rows], state.gram[np.ix_(rows, rows)]), state.shift, stronger=stronger
+            )
             for state in states
         ]
         grid = max(grids, key=lambda item: item.log_integral)
-        tried.append((grid.log_integral, grid, second))
+        tried.append((grid.log_integral, grid, fit))
     mean = float(log_mean_exp(np.array([item[0] for item in tried])))
     _, grid, chosen = max(tried, key=lambda item: item[0])
     b = chosen.curve
@@ -288,7 +293,7 @@ def _start_pair(
     weights_b = b.weights(np.array([grid.best[1]]))[0]
     moves = math.sqrt(max(float(weights_b @ states[0].gram[np.ix_(rows, rows)] @ weights_b), 0.0))
     others = first.log_evidence - first.best.log_evidence
-    return _PairStart(first=a, second=b, grid=grid, log_evidence=others + mean, moves=moves)
+    return _PairStart(first=a, second=b, stronger=stronger, grid=grid, log_evidence=others + mean, moves=moves)
 
 
 def _overlaps(
@@ -337,7 +342,8 @@ def _finish_pair(
                 own = own_variance(a, start[0], effective_a, law_error)
                 own = own + own_variance(b, start[1], effective_b, law_error)
                 moved, moved_nodes, wide, shift = with_law(residual, nodes, nuisances, extra, own)
-                again = _pair_integral(a, b, _pair_terms(wide, moved_nodes, moved), shift + math.log(probability))
+                terms = _pair_terms(wide, moved_nodes, moved)
+                again = _pair_integral(a, b, terms, shift + math.log(probability), stronger=pair.stronger)
                 if again.log_integral > best[0]:
                     best = (again.log_integral, again)
                 moved_on = max(abs(math.log(x / y)) for x, y in zip(again.best, start, strict=True))
@@ -385,28 +391,59 @@ def _pair_terms(
 
 
 def _pair_integral(
-    a: Curve, b: Curve, terms: tuple[NDArray[np.float64], NDArray[np.float64]], shift: float
+    a: Curve, b: Curve, terms: tuple[NDArray[np.float64], NDArray[np.float64]], shift: float, *, stronger: str
 ) -> _PairGrid:
-    """Mean likelihood of two effects on a grid of both strengths that closes in on the best."""
+    """Mean likelihood of two effects on a grid of both strengths that closes in on the best.
+
+    Where a strength comes to lie at an end of its plausible range it is sought beyond, with little prior. Less of the weaker
+    effect than is plausible gets its strength so, but no evidence: that is how it stands for what the stronger one's law leaves.
+    """
     nodes = a.strengths, b.strengths
-    ranges = (math.log(a.low), math.log(a.high)), (math.log(b.low), math.log(b.high))
-    value, at_a, at_b, grid = pair_integral(*nodes, *terms, *ranges, _PAIR_NODES)
-    if not math.isfinite(value):
-        raise ValueError(f"the likelihood of {a.effect} and {b.effect} is no number")
-    result = _PairGrid(log_integral=value + shift, first=np.exp(at_a), second=np.exp(at_b), log_likelihood=grid + shift)
+
+    def over(range_a: tuple[float, float], range_b: tuple[float, float]) -> _PairGrid:
+        logs = [(math.log(low), math.log(high)) for low, high in (range_a, range_b)]
+        value, at_a, at_b, grid = pair_integral(*nodes, *terms, *logs, _PAIR_NODES)
+        if not math.isfinite(value):
+            raise ValueError(f"the likelihood of {a.effect} and {b.effect} is no number")
+        return _PairGrid(
+            log_integral=value + shift, first=np.exp(at_a), second=np.exp(at_b), log_likelihood=grid + shift
+        )
 
     def likelihood(of_a: NDArray[np.float64], of_b: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(pair_likelihood(*nodes, *terms, of_a, of_b))
 
+    result = over((a.low, a.high), (b.low, b.high))
     best, top = result.best, float(result.log_likelihood.max()) - shift
     less_a, less_b = (
-        curve.low * _BELOW if at < 1.001 * curve.low else None for curve, at in zip((a, b), best, strict=True)
+        curve.low * _BELOW if _at_ends(curve, at)[0] else None for curve, at in zip((a, b), best, strict=True)
     )
     below = (
         0.0 if less_a is None else float(likelihood(less_a, np.array([best[1]])).max()) - top,
         0.0 if less_b is None else float(likelihood(np.array([best[0]]), less_b).max()) - top,
     )
-    return replace(result, below=below)
+    ranges = [_reached(curve, at) for curve, at in zip((a, b), best, strict=True)]
+    counted = [
+        (low if curve.effect == stronger else max(low, curve.low), high)
+        for curve, (low, high) in zip((a, b), ranges, strict=True)
+    ]
+    value = result.log_integral
+    if counted != [(a.low, a.high), (b.low, b.high)]:
+        result = over(*counted)
+        value = float(np.logaddexp(math.log1p(-IMPLAUSIBLE) + value, math.log(IMPLAUSIBLE) + result.log_integral))
+    if ranges != counted:
+        result = over(*ranges)
+    return replace(result, log_integral=value, below=below)
+
+
+def _at_ends(curve: Curve, strength: float) -> tuple[bool, bool]:
+    """Whether a strength lies at the lower and at the upper end of the plausible range."""
+    return strength < 1.001 * curve.low, strength > 0.999 * curve.high
+
+
+def _reached(curve: Curve, strength: float) -> tuple[float, float]:
+    """The plausible range of a strength, or what is tried beyond the end that it lies at."""
+    low, high = _at_ends(curve, strength)
+    return curve.reach[0] if low else curve.low, curve.reach[1] if high else curve.high
 
 
 class _Apart:

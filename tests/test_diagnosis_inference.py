@@ -152,7 +152,9 @@ def test_the_likelihood_of_two_effects_is_integrated_where_it_lies_and_no_number
     one, other = (one_node(name, 5.0 * shape, low=0.1, high=10.0) for name, shape in zip("ab", shapes, strict=True))
     residual = 5.0 * shapes[0] * 2.0 + 5.0 * shapes[1] * 0.7 + noise(rng, factors)
     nodes = np.concatenate([one.responses, other.responses])
-    found = _pair_integral(one, other, (nodes @ nuisances.solve(residual), nuisances.inner(nodes, nodes)), 3.0)
+    found = _pair_integral(
+        one, other, (nodes @ nuisances.solve(residual), nuisances.inner(nodes, nodes)), 3.0, stronger=one.effect
+    )
     assert found.best == pytest.approx((2.0, 0.7), abs=0.05)
     gram, linear = nuisances.inner(nodes, nodes), nodes @ nuisances.solve(residual)
     best = np.linalg.solve(gram, linear)
@@ -160,7 +162,7 @@ def test_the_likelihood_of_two_effects_is_integrated_where_it_lies_and_no_number
     log_volume = np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(gram)[1] - np.log(best).sum() - 2 * np.log(np.log(100.0))
     assert found.log_integral == pytest.approx(3.0 + 0.5 * float(linear @ best) + log_volume, abs=0.05)
     with pytest.raises(ValueError, match="of a and b is no number"):
-        _pair_integral(one, other, (np.full(2, np.nan), gram), 0.0)
+        _pair_integral(one, other, (np.full(2, np.nan), gram), 0.0, stronger="a")
 
 
 def test_whitening_local_nuisances_leaves_the_likelihood_as_it_was(setup):
@@ -786,3 +788,24 @@ def test_a_strength_beyond_its_plausible_range_is_told(strength, told):
     )
     notes = _beyond_plausible(named)
     assert [f"veiling_glare is {told} than" in note and "0.5 to 5 %" in note for note in notes] == [True] * bool(told)
+
+
+@pytest.mark.parametrize("second", [0.2, 3.0, 90.0])
+@pytest.mark.parametrize("first", [0.2, 8.0, 110.0])
+def test_the_strengths_of_a_pair_are_read_beyond_what_is_plausible(first, second):
+    rng = np.random.default_rng(44)
+    # what one does the other does not
+    responses = np.zeros((2, PROBES))
+    responses[0, :300], responses[1, 300:] = 2.0 * rng.standard_normal((2, 300))
+    made = [one_node("a", 3.0 * responses[0], low=1.0), one_node("b", responses[1], low=1.0)]
+    residual = 3.0 * first * responses[0] + second * responses[1] + rng.standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), made)
+    pair = next(item for item in found if item.effects == ("a", "b"))
+    for effect, truth in (("a", first), ("b", second)):
+        value, low, high = pair.strengths[effect]
+        assert value == pytest.approx(truth, rel=0.3)
+        assert low < truth < high
+    # less of the second than is plausible is no evidence of it, more is
+    strong, weak = (first, second) if 3.0 * first > second else (second, first)
+    alone = next(item for item in found if item.effects == (("a",) if strong == first else ("b",)))
+    assert (pair.log_evidence > alone.log_evidence + 5.0) == (weak > 1.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.diagnosis import veto
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
@@ -19,7 +20,7 @@ from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguish
 from raytwin.diagnosis.probes import ALONG_ROWS
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.series_block import jitter_of
-from raytwin.diagnosis.veto import leaves_too_much, misfit_of
+from raytwin.diagnosis.veto import Misfit, is_refused, leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects.effect import spread_transfer
 from raytwin.generator.effects.registration import parts_px
@@ -314,6 +315,16 @@ def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a
 ):
     gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
     assert leaves_too_much(gap, explanation(strength=strength)) is vetoed
+
+
+@pytest.mark.parametrize(
+    ("strength", "unfit", "refused"),
+    [(10.0, 0.08, False), (120.0, 0.08, True), (120.0, 0.02, False), (0.5, 0.08, False), (10.0, 0.12, True)],
+)
+def test_an_effect_stronger_than_is_plausible_must_leave_less(strength, unfit, refused, monkeypatch):
+    monkeypatch.setattr(veto, "misfit_of", lambda problem, leading: Misfit(left=unfit, pulled=0.0))
+    gap = Gap(before=30.0, after=1.0, floor=0.6, shrinks_by=None, left=0.05)
+    assert is_refused(None, gap, explanation(strength=strength)) is refused
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,8 @@ from . import _pair_loops
 LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
 STRENGTH_NODES = 37
 _WEAKER = 30.0  # times below its plausible range that an effect is tried
-_STRONGER, _BEYOND_NODES = (
-    2.5,
-    1.5,
-)  # times above it where the response grows in proportion; else above the last that was asked
+_STRONGER = 2.5  # times above it where the response grows in proportion to the strength
+_BEYOND_NODES = 1.5  # times above the last strength that was asked, elsewhere
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

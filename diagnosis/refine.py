@@ -23,9 +23,8 @@ from .nuisances import Nuisances
 
 REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
 _MOST_EFFECTS = 4
-_LEAST_EVIDENCE = (
-    1.0  # of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
-)
+# of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
+_LEAST_EVIDENCE = 1.0
 _REACH = 0.6  # share of the best evidence from which an effect is refined
 _REACH_CHANCE = 30.0  # log evidence below that
 _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect alone

@@ -26,8 +26,8 @@ _MOST_CONTRADICTED = 0.15
 # of all squares that an explanation may leave beyond what nuisances, laws and noise usually take: of sixty right ones one left
 # 0.09 and the others below 0.05, seams of tiles named gain map and bad pixels 0.13 to 0.16
 _MOST_UNFIT = 0.11
-# the same where an effect is stronger than is plausible: of glare, lag, filters and drifts of twice that none left 0.001, a tail of
-# 34 % named glare of 8 % once tails were withheld 0.12
+# the same where an effect is stronger than is plausible: of seven such alone, and glare of 8 % beside lag, none left 0.001; a tail
+# of 34 %, tails withheld, led to glare of 8.5 % and a focal spot of 0.004 mm, which left 0.12
 _MOST_UNFIT_BEYOND = 0.05
 _USUALLY_LEFT = 0.6  # of a probe's square where nothing is wrong: floors make it more than counting noise
 # what an effect does by chance, rms over what is expected: right gain maps and output drifts 0.4 to 0.8, tiles and their seams
@@ -45,9 +45,11 @@ _VETO = 0.9  # of the effects' probability that goes to an unknown effect when t
 
 def is_refused(problem: Problem, gap: Gap, leading: Hypothesis) -> bool:
     """Whether what an explanation leaves of the gap speaks against it, on held-out series or on all probes."""
+    if leaves_too_much(gap, leading):
+        return True
     misfit = misfit_of(problem, leading)
     too_strong = any(leading.strengths[effect][0] > curve.high for effect, curve in leading.variants.items())
-    return leaves_too_much(gap, leading) or misfit.refused or (too_strong and misfit.left > _MOST_UNFIT_BEYOND)
+    return misfit.refused or (too_strong and misfit.left > _MOST_UNFIT_BEYOND)
 
 
 def leaves_too_much(gap: Gap, leading: Hypothesis) -> bool:

@@ -55,6 +55,20 @@ def curves(rng, effects=8, variants=2, low=0.5, high=100.0):
     return tuple(result)
 
 
+def in_nodes(effect, responses, nodes, *, low, high, **more):
+    """An effect known at several strengths; responses: (strength, probe)."""
+    return Curve(
+        effect=effect,
+        variant="",
+        parameters={},
+        low=low,
+        high=high,
+        strengths=np.asarray(nodes, dtype=float),
+        responses=np.asarray(responses),
+        **more,
+    )
+
+
 def one_node(effect, response, *, variant="", low=0.5, high=50.0, **more):
     """An effect known at strength 1 alone."""
     return Curve(
@@ -377,16 +391,7 @@ def test_a_refined_curve_is_not_believed_far_from_the_strengths_that_were_asked(
     nodes = np.array([4.5, 6.0, 8.0])
     # the same at 6 and, if the parabola went on, at 20, where noise happens to fit better
     responses = np.stack([30.0 * (nodes - nodes**2 / 26.0), 0.01 * nodes], axis=1)
-    curve = Curve(
-        effect="a",
-        variant="",
-        parameters={},
-        low=1.0,
-        high=64.0,
-        strengths=nodes,
-        responses=responses,
-        exact=np.ones(2, dtype=bool),
-    )
+    curve = in_nodes("a", responses, nodes, low=1.0, high=64.0, exact=np.ones(2, dtype=bool))
     named = Hypothesis(
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (6.0, 5.9, 6.1)}, variants={"a": curve}
     )
@@ -693,15 +698,7 @@ def test_effects_weaker_and_stronger_than_is_plausible_are_found_and_told():
     response = 100.0 * rng.standard_normal(PROBES) / np.sqrt(PROBES)
     nuisances = Nuisances(np.zeros((PROBES, 1)))
     grows = one_node("a", response, low=1.0, high=50.0)
-    bends = Curve(
-        effect="b",
-        variant="",
-        parameters={},
-        low=1.0,
-        high=50.0,
-        strengths=np.array([20.0, 50.0]),
-        responses=np.outer([20.0, 45.0], response),
-    )
+    bends = in_nodes("b", np.outer([20.0, 45.0], response), [20.0, 50.0], low=1.0, high=50.0)
     for curve, strength in ((grows, 0.1), (grows, 110.0), (bends, 0.1), (bends, 70.0)):
         residual = curve.response(strength) + rng.standard_normal(PROBES)
         fit = fit_curve(residual, curve, nuisances, GROUPS, law_errors=())
@@ -734,15 +731,7 @@ def test_the_prior_beyond_the_plausible_range_takes_a_hundredth_of_the_probabili
 def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
     rng = np.random.default_rng(43)
     response = rng.standard_normal(PROBES)
-    grid = Curve(
-        effect="kv_error",
-        variant="",
-        parameters={},
-        low=0.5,
-        high=5.0,
-        strengths=np.array([3.0, 5.0]),
-        responses=np.outer([3.0, 5.0], response),
-    )
+    grid = in_nodes("kv_error", np.outer([3.0, 5.0], response), [3.0, 5.0], low=0.5, high=5.0)
     variant = Variant(
         effect="kv_error",
         name="",

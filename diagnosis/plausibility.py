@@ -48,6 +48,8 @@ _MOST_SUSPECTS = 10
 _PRICE_OF_A_SETTING = 2.0  # natural logarithm, of more than one word being wrong
 _MOST_CHANGES = 4
 _INHERENT_MM_AL = 1.0  # where nothing is declared
+# as far as calibration's prior plausibly goes
+_INHERENT_MAY_BE_MM_AL = tuple(0.25 * step for step in range(13))
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
 _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
@@ -444,23 +446,23 @@ class _Maps:
         self._thickness: dict[str, dict[str, FloatArray]] = {}
         self._points: dict[str, tuple[FloatArray, NDArray[np.intp]]] = {}
 
-    def weights(self, label: _Label) -> FloatArray | None:
+    def weights(self, label: _Label, inherent_mm_Al: float = _INHERENT_MM_AL) -> FloatArray | None:
         """(3, energy) of a beam, or None where the label does not say enough."""
         if self.model is None or label.kV is None:
             return None
-        key = (label.kV, label.filters)
+        key = (label.kV, label.filters, inherent_mm_Al)
         if key not in self._weights:
             parameters = self.model.default_parameters()
-            parameters[self.model.names.index("inherent_filtration_mm_Al")] = _INHERENT_MM_AL
+            parameters[self.model.names.index("inherent_filtration_mm_Al")] = inherent_mm_Al
             try:
                 self._weights[key] = self.model.moment_weights(parameters, OpenBeam(kV=label.kV, filters=label.filters))
             except InputError:
                 self._weights[key] = None
         return self._weights[key]
 
-    def log_level(self, label: _Label) -> float:
+    def log_level(self, label: _Label, inherent_mm_Al: float = _INHERENT_MM_AL) -> float:
         """Logarithm of the level but for a constant."""
-        weights = self.weights(label)
+        weights = self.weights(label, inherent_mm_Al)
         rate = 0.0 if weights is None else math.log(max(float(weights[0].sum()), 1e-300))
         return rate + label.log_load - 2.0 * math.log(label.distance_mm)
 
@@ -486,15 +488,17 @@ class _Maps:
             }
         return self._thickness[scene]
 
-    def depth(self, scene: str, label: _Label, factor: float = 1.0) -> FloatArray | None:
+    def depth(
+        self, scene: str, label: _Label, factor: float = 1.0, inherent_mm_Al: float = _INHERENT_MM_AL
+    ) -> FloatArray | None:
         """-log T (row, column) of a scene with its path lengths times a factor, or None where it is unknown."""
-        key = (scene, label.kV, label.filters, factor)
+        key = (scene, label.kV, label.filters, factor, inherent_mm_Al)
         if key not in self._depths:
-            self._depths[key] = self._depth(scene, label, factor)
+            self._depths[key] = self._depth(scene, label, factor, inherent_mm_Al)
         return self._depths[key]
 
-    def _depth(self, scene: str, label: _Label, factor: float) -> FloatArray | None:
-        maps, weights = self.thickness(scene), self.weights(label)
+    def _depth(self, scene: str, label: _Label, factor: float, inherent_mm_Al: float) -> FloatArray | None:
+        maps, weights = self.thickness(scene), self.weights(label, inherent_mm_Al)
         if not maps or weights is None or self.model is None:
             return None
         try:
@@ -567,15 +571,40 @@ def _wrong_maps(judged: Sequence[_Reading], maps: _Maps) -> list[Suspect]:
         if item.series.kind == "object" and maps.thickness(item.series.scene):
             placements.setdefault(item.series.scene, []).append(item)
     found: list[Suspect] = []
-    scales: dict[str, list[float]] = {}
+    scales: dict[str, list[list[float]]] = {}
+    inherent_mm_Al = _inherent_mm_Al([item for item in judged if item.series.kind == "flat"], maps)
     for scene, members in placements.items():
         text = _unlike(scene, members, maps, list(placements))
         if text:
             found.append(Suspect(series=tuple(item.name for item in members), text=text, evidence=200.0))
             continue
-        scales[scene] = [value for item in members for value in _scales_of_map(item, maps)]
-    found += _scaled(scales, placements)
-    return found
+        scales[scene] = [
+            [value for item in members for value in _scales_of_map(item, maps, mm_Al)] for mm_Al in inherent_mm_Al
+        ]
+    return found + _scaled(scales, placements)
+
+
+def _inherent_mm_Al(flats: Sequence[_Reading], maps: _Maps) -> tuple[float, ...]:
+    """Inherent filtration as flats behind two filters at one voltage have it; where there are none what is usual, and its extremes.
+
+    The median over all such flats: one of them may be mislabelled.
+    """
+    levels = {
+        item.name: np.array([maps.log_level(item.label, mm_Al) for mm_Al in _INHERENT_MAY_BE_MM_AL])
+        for item in flats
+        if item.label.load is not None and item.level_DN > 0 and maps.weights(item.label) is not None
+    }
+    known = [item for item in flats if item.name in levels]
+    seen = []
+    for number, one in enumerate(known):
+        for other in known[:number]:
+            if one.label.kV == other.label.kV and one.label.filters != other.label.filters:
+                measured = math.log(one.level_DN / other.level_DN)
+                off = np.abs(levels[one.name] - levels[other.name] - measured)
+                seen.append(_INHERENT_MAY_BE_MM_AL[int(np.argmin(off))])
+    if seen:
+        return (float(np.median(seen)),)
+    return (_INHERENT_MM_AL, _INHERENT_MAY_BE_MM_AL[0], _INHERENT_MAY_BE_MM_AL[-1])
 
 
 def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequence[str]) -> str:
@@ -623,9 +652,9 @@ def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequen
     return ""
 
 
-def _scales_of_map(item: _Reading, maps: _Maps) -> list[float]:
+def _scales_of_map(item: _Reading, maps: _Maps, inherent_mm_Al: float) -> list[float]:
     """Logarithm of the factor on a scene's path lengths with which its shadow fits, in its thinner and its thicker half."""
-    depth = maps.depth(item.series.scene, item.label)
+    depth = maps.depth(item.series.scene, item.label, inherent_mm_Al=inherent_mm_Al)
     if depth is None:
         return []
     measured = _measured_depth(item, depth, None)
@@ -640,7 +669,7 @@ def _scales_of_map(item: _Reading, maps: _Maps) -> list[float]:
             continue
 
         def left(place: int, half: NDArray[np.bool_] = half) -> float:
-            other = maps.depth(item.series.scene, item.label, math.exp(_LOG_FACTORS[place]))
+            other = maps.depth(item.series.scene, item.label, math.exp(_LOG_FACTORS[place]), inherent_mm_Al)
             # edges lie where they lie: the median of the differences
             return math.nan if other is None else float(np.median(measured[half] - other[half]))
 
@@ -653,18 +682,25 @@ def _scales_of_map(item: _Reading, maps: _Maps) -> list[float]:
     return found
 
 
-def _scaled(scales: Mapping[str, Sequence[float]], placements: Mapping[str, Sequence[_Reading]]) -> list[Suspect]:
+def _scaled(
+    scales: Mapping[str, Sequence[Sequence[float]]], placements: Mapping[str, Sequence[_Reading]]
+) -> list[Suspect]:
     """Scenes whose path lengths want one and the same factor at every voltage, far from 1.
 
     Where all scenes at one distance want such a factor and none at another one does, it is no fault of their maps: scatter
-    falls with the gap.
+    falls with the gap. Nor where none fits and another inherent filtration that may be would do instead.
+
+    Args:
+        scales: logarithms of the factors by scene, with the inherent filtration that is taken, and with others that may be.
+        placements: series of each scene.
     """
     wanted: dict[float | None, list[float]] = {}
-    for scene, values in scales.items():
+    for scene, (values, *_) in scales.items():
         if values:
             wanted.setdefault(placements[scene][0].series.source_object_mm, []).append(float(np.median(values)))
+    one_fits = any(abs(value) < 0.5 * _SCALE_OFF for group in wanted.values() for value in group)
     found = []
-    for scene, values in scales.items():
+    for scene, (values, *others) in scales.items():
         members = placements[scene]
         voltages = {item.label.kV for item in members}
         if len(values) < 4 or len(voltages) < 2 or max(values) - min(values) > _SCALE_AGREES:
@@ -678,7 +714,11 @@ def _scaled(scales: Mapping[str, Sequence[float]], placements: Mapping[str, Sequ
             and len(like_it) > 1
             and not any(any(group) for at, group in like_it.items() if at != here)
         )
-        if abs(middle) > _SCALE_OFF and not of_the_gap:
+        # a soft beam takes a harder one for shorter paths
+        of_the_beam = not one_fits and any(
+            math.copysign(1.0, middle) * float(np.median(other)) < _SCALE_OFF for other in others
+        )
+        if abs(middle) > _SCALE_OFF and not (of_the_gap or of_the_beam):
             found.append(
                 Suspect(
                     series=tuple(item.name for item in members),

@@ -9,7 +9,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _scaled, _without_common, check_plausibility
+from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _inherent_mm_Al, _scaled, _without_common, check_plausibility
 from raytwin.diagnosis.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
@@ -176,8 +176,11 @@ def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field(
         assert np.mean(values**2) == pytest.approx(wanted, rel=4.0 * np.sqrt(2.0 / values.size) + 2.0 / 4800)
 
 
-def factors_of(**wanted):
-    """Suspects among scenes of two series each, 40 and 90 kV, at a distance (mm) with a factor on their path lengths."""
+def factors_of(*, harder=None, **wanted):
+    """Suspects among scenes of two series each, 40 and 90 kV, at a distance (mm) with a factor on their path lengths.
+
+    harder: the factors with another inherent filtration that may be.
+    """
     placements = {
         scene: [
             SimpleNamespace(
@@ -189,11 +192,45 @@ def factors_of(**wanted):
         ]
         for scene, (distance, _) in wanted.items()
     }
-    scales = {scene: 4 * [float(np.log(factor))] for scene, (_, factor) in wanted.items()}
+    scales = {scene: [4 * [float(np.log(factor))]] for scene, (_, factor) in wanted.items()}
+    for scene, factor in (harder or {}).items():
+        scales[scene].append(4 * [float(np.log(factor))])
     found = _scaled(scales, placements)
     # light that did not come straight makes paths look shorter, never longer
     assert all((suspect.or_effects != ()) == (wanted[suspect.series[0][:7]][1] < 1.0) for suspect in found)
     return [name for suspect in found for name in suspect.series]
+
+
+def test_inherent_filtration_is_what_flats_behind_two_filters_have():
+    def flat(name, kV, filters, level_DN):
+        label = SimpleNamespace(kV=kV, filters=filters, load=("current_mA", 1.0))
+        return SimpleNamespace(name=name, label=label, level_DN=level_DN)
+
+    # copper takes less of a beam that aluminium has hardened
+    def log_level(label, inherent_mm_Al):
+        return -0.2 * inherent_mm_Al - (2.0 - 0.4 * inherent_mm_Al if label.filters else 0.0)
+
+    maps = SimpleNamespace(log_level=log_level, weights=lambda label: 1)
+    bare, behind = flat("bare", 40.0, (), 100.0), flat("behind", 40.0, ("Cu:0.1",), 100.0 * np.exp(-2.0 + 0.4 * 2.25))
+    assert _inherent_mm_Al([bare, behind], maps) == (2.25,)
+    # two of three pairs agree: the third flat was behind another filter than is said
+    mislabelled = flat("mislabelled", 60.0, ("Cu:0.1",), 90.0)
+    beside = [flat("bare_60", 60.0, (), 100.0), flat("behind_60", 60.0, ("Cu:0.1",), 100.0 * np.exp(-2.0 + 0.4 * 2.25))]
+    assert _inherent_mm_Al([bare, behind, *beside, mislabelled], maps) == (2.25,)
+    # nothing to tell it by: what is usual, and what may be
+    alone = _inherent_mm_Al([bare, flat("other", 60.0, ("Cu:0.1",), 10.0)], maps)
+    assert alone[0] == 1.0
+    assert (min(alone), max(alone)) == (0.0, 3.0)
+
+
+def test_paths_that_a_harder_beam_would_make_right_are_no_fault_of_the_maps():
+    scene = {"wedge_a": (700.0, 0.76)}
+    assert len(factors_of(**scene)) == 2
+    assert factors_of(harder={"wedge_a": 1.1}, **scene) == []
+    assert len(factors_of(harder={"wedge_a": 0.78}, **scene)) == 2
+    # another scene fits as it is
+    both = {**scene, "wedge_b": (500.0, 1.0)}
+    assert factors_of(harder={"wedge_a": 1.1, "wedge_b": 1.4}, **both) == ["wedge_a_40kV", "wedge_a_90kV"]
 
 
 def test_what_all_scenes_at_one_gap_want_is_no_fault_of_their_maps():

@@ -3,7 +3,7 @@
 The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
 the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
 NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no pixel is
-cut by an edge), a Gaussian spread, no times; three lines of other pixels, distances, beams and scintillators (`LINES`).
+cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators (`LINES`).
 Its effects are laws of its own: scatter and
 tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
 gain; K photons are caught under two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced
@@ -163,6 +163,58 @@ LINES = {
         water_mm=25.0,
         lead_mm=1.5,
     ),
+    "soft": LineOf(
+        shape=(96, 160),
+        pixel_mm=0.075,
+        near_mm=360.0,
+        far_mm=250.0,
+        detector_mm=420.0,
+        spread_px=0.75,
+        read_DN=1.5,
+        dark_DN=80.0,
+        bits=12,
+        DN_per_keV=0.0055,
+        photons=7e-4,
+        scintillator=("CsI", 0.15),
+        edge_keV=34.5,
+        line_keV=29.5,
+        lag_s=0.05,
+        pause_s=2.0,
+        readout_ms=2.0,
+        current_mA={30.0: 20.0, 60.0: 2.0},
+        copper_times=1.0,
+        anode_deg=20.0,
+        beryllium_mm=0.5,
+        wedge_mm=0.5,
+        water_mm=10.0,
+        lead_mm=0.5,
+    ),
+    "three": LineOf(
+        shape=(112, 144),
+        pixel_mm=0.15,
+        near_mm=600.0,
+        far_mm=400.0,
+        detector_mm=900.0,
+        spread_px=0.6,
+        read_DN=3.0,
+        dark_DN=200.0,
+        bits=14,
+        DN_per_keV=0.0065,
+        photons=7e-4,
+        scintillator=("Gd2O2S", 0.3),
+        edge_keV=50.24,
+        line_keV=42.8,
+        lag_s=1.0,
+        pause_s=15.0,
+        readout_ms=30.0,
+        current_mA={60.0: 5.0, 90.0: 2.0, 120.0: 1.0},
+        copper_times=2.0,
+        anode_deg=10.0,
+        beryllium_mm=0.8,
+        wedge_mm=2.5,
+        water_mm=40.0,
+        lead_mm=2.0,
+    ),
 }
 ALWAYS = (
     "object_scatter",
@@ -230,14 +282,20 @@ def spectrum(name: str, kV: float, aluminium_mm: float, copper_mm: float) -> tup
     import spekpy
 
     of = LINES[name]
-    beam = spekpy.Spek(kvp=kV, th=of.anode_deg, dk=1.0, physics="kqp", mu_data_source="nist", z=100.0)
+    # ten bins a keV: with one the end of the spectrum moves in steps of a bin when the voltage does
+    beam = spekpy.Spek(kvp=kV, th=of.anode_deg, dk=0.1, physics="kqp", mu_data_source="nist", z=100.0)
     beam.filter("Be", of.beryllium_mm).filter("Al", aluminium_mm)
     if copper_mm:
         beam.filter("Cu", copper_mm)
     energies, photons = beam.get_spectrum(edges=False)
     material, thickness_mm = of.scintillator
     stopped = 1.0 - np.exp(-thickness_mm * attenuation_per_mm(material, energies))
-    return np.asarray(energies), np.asarray(photons) * of.photons * stopped
+    # a number in each bin, density times 0.1 keV; one mean energy a keV behind objects
+    absorbed = 0.1 * np.asarray(photons) * of.photons * stopped
+    whole = np.floor(energies).astype(int)
+    sums = np.bincount(whole, absorbed)
+    seen = sums > 0
+    return np.bincount(whole, absorbed * energies)[seen] / sums[seen], sums[seen]
 
 
 class Line:

@@ -30,6 +30,7 @@ _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
 _LEAST_FREEDOM = 5.0  # of a variance whose logarithm is still near enough a Gaussian number
 _LEAST_OUTLIERS, _LEAST_FRAMES = 5, 6  # pixels, and frames of each, that show what lasts from frame to frame
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
+_LEAST_PAIRS = 64  # of neighbours whose correlation is nearly a Gaussian number
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 _LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
@@ -506,12 +507,16 @@ def measured_scalars(
                 "log_variance",
             )
             for index, (dr, dc) in enumerate(LAGS):
+                # pixels of a label that lies in stripes may have few neighbours
+                pairs = int(summary.label_pairs[label, index])
+                if pairs < _LEAST_PAIRS:
+                    continue
                 add(
                     "texture",
                     f"correlation {name} ({dr},{dc})",
                     "1",
                     float(summary.label_autocovariance_DN2[label, index]) / variance,
-                    math.sqrt(1.3 * shared / (freedom * pixels)),
+                    math.sqrt(1.3 * shared / (freedom * pairs)),
                     "correlation",
                 )
         total = float(np.mean(summary.pair_variance_DN2[good]))

@@ -27,7 +27,7 @@ class SeriesSummary:
     """Statistics of the n frames of one series; DN throughout.
 
     Fields: frames; mean_DN (row, column); pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
-    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS, label_pixels (label,): averages over
+    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS, label_pixels (label,), label_pairs (label, lag): averages over
     the pixels of each noise label; row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the
     means of rows, columns and blocks of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one
     and two frames apart; kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,);
@@ -42,6 +42,7 @@ class SeriesSummary:
     label_variance_DN2: NDArray[np.float64]
     label_autocovariance_DN2: NDArray[np.float64]
     label_pixels: NDArray[np.int64]
+    label_pairs: NDArray[np.int64]
     row_variance_DN2: float
     column_variance_DN2: float
     block_variance_DN2: float
@@ -264,12 +265,9 @@ def summarise_series(
     frames, n_pairs, pair_variance = variances.frames, variances.n_steps, variances.of_pairs
     counts = np.array([mask.sum() for mask in masks])
     of_labels = np.array([pair_variance[mask].mean() if mask.any() else np.nan for mask in masks])
+    pixel_pairs = np.array([[selected[label].sum() for _, _, selected in pairs_of_lag] for label in range(n_labels)])
     with np.errstate(invalid="ignore", divide="ignore"):
-        covariance = (
-            label_covariance
-            / max(n_pairs, 1)
-            / np.array([[selected[label].sum() for _, _, selected in pairs_of_lag] for label in range(n_labels)])
-        )
+        covariance = label_covariance / max(n_pairs, 1) / pixel_pairs
     distinct = span = 0
     if codes is not None and code_parts:
         distinct, span = _codes(np.concatenate(code_parts))
@@ -282,6 +280,7 @@ def summarise_series(
         label_variance_DN2=of_labels,
         label_autocovariance_DN2=covariance,
         label_pixels=counts,
+        label_pairs=pixel_pairs,
         row_variance_DN2=row_sum / one,
         column_variance_DN2=column_sum / one,
         block_variance_DN2=block_sum / one,

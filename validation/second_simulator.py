@@ -16,6 +16,7 @@ objects have shifted path lengths.
 
 import argparse
 import contextlib
+import copy
 import json
 import math
 import tempfile
@@ -276,15 +277,22 @@ def attenuation_per_mm(material: str, energies_keV: np.ndarray) -> np.ndarray:
     )
 
 
+@lru_cache(maxsize=16)
+def emitted(anode_deg: float, kV: float):
+    """SpekPy's beam of a tube, ten seconds' work.
+
+    Ten bins a keV: with one the end of the spectrum moves in steps of a bin when the voltage does.
+    """
+    import spekpy
+
+    return spekpy.Spek(kvp=kV, th=anode_deg, dk=0.1, physics="kqp", mu_data_source="nist", z=100.0)
+
+
 @lru_cache(maxsize=64)
 def spectrum(name: str, kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """Energies, keV, and photons a pixel and mAs that the panel of a line absorbs."""
-    import spekpy
-
     of = LINES[name]
-    # ten bins a keV: with one the end of the spectrum moves in steps of a bin when the voltage does
-    beam = spekpy.Spek(kvp=kV, th=of.anode_deg, dk=0.1, physics="kqp", mu_data_source="nist", z=100.0)
-    beam.filter("Be", of.beryllium_mm).filter("Al", aluminium_mm)
+    beam = copy.deepcopy(emitted(of.anode_deg, kV)).filter("Be", of.beryllium_mm).filter("Al", aluminium_mm)
     if copper_mm:
         beam.filter("Cu", copper_mm)
     energies, photons = beam.get_spectrum(edges=False)

@@ -21,10 +21,10 @@ demo: $(READY)
 	$(BIN)/raytwin demo -o demo
 
 test: $(READY) check
-	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow'
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -q -n 2 -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
 
 # answers against the virtual lab's truth; minutes (`--help` of each script has its options)
 validation: $(READY)

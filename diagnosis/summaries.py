@@ -27,12 +27,13 @@ class SeriesSummary:
     """Statistics of the n frames of one series; DN throughout.
 
     Fields: frames; mean_DN (row, column); pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
-    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS, label_pixels (label,), label_pairs (label, lag): averages over
-    the pixels of each noise label; row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the
-    means of rows, columns and blocks of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one
-    and two frames apart; kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,);
-    tile_mean_DN (n, TIME_TILES, TIME_TILES); distinct_codes, code_range: how many whole numbers occur between the 1st and
-    99th percentile, and how many there are from the first to the last of them; highest_DN, saturated_share.
+    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS: averages over the pixels of each noise
+    label, of which there are label_pixels (label,), and over its label_pairs (label, lag) of neighbours;
+    row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the means of rows, columns and blocks
+    of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
+    kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); tile_mean_DN (n, TIME_TILES,
+    TIME_TILES); distinct_codes, code_range: how many whole numbers occur between the 1st and 99th percentile, and how
+    many there are from the first to the last of them; highest_DN, saturated_share.
     """
 
     frames: int

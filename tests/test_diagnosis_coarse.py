@@ -128,6 +128,7 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
     assert "at least 16 rows and columns" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypatch):
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "6", "--products", "1"]

@@ -54,6 +54,7 @@ def test_a_session_of_flats_and_products_lacks_all_that_isolates_effects(diagnos
     assert {"kV", "filter", "exposure_ms", "scene", "source_object_mm"} <= set(told)
 
 
+@pytest.mark.slow
 def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of_the_panel(diagnosis):
     first, second = explanation(diagnosis, "focal_spot"), explanation(diagnosis, "mtf_tail")
     found = best_measurement(diagnosis.problem, first, second, rng=np.random.default_rng(3))

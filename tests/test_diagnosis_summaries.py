@@ -19,6 +19,7 @@ from raytwin.diagnosis.probes import (
     Template,
     _log_variance_of_steps,
     _MovingPicture,
+    measured_scalars,
 )
 from raytwin.diagnosis.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
@@ -446,17 +447,14 @@ def test_a_beam_of_another_level_displaces_nothing(brighter):
     assert abs(found.column_px) < 0.004
 
 
-def test_quanta_of_an_area_whose_pixels_are_brighter_are_noisier_by_the_square_of_their_gain():
-    gain = np.ones(SHAPE)
-    gain[:, : SHAPE[1] // 2] = 1.1
-    labels = np.zeros(SHAPE, dtype=np.int64)
-    labels[:, SHAPE[1] // 2 :] = 1
-    fields = {
+def fields_of_context(labels, names):
+    """What says what the scalar probes of an object's series refer to, with labels (row, column) and their names."""
+    return {
         "kind": "object",
-        "frames": 10,
+        "frames": FRAMES,
         "good": np.ones(SHAPE, bool),
         "labels": labels,
-        "label_names": ("left", "right"),
+        "label_names": names,
         "reference_signal_DN": 1000.0,
         "previous_signal_DN": None,
         "calibrates": False,
@@ -466,6 +464,38 @@ def test_quanta_of_an_area_whose_pixels_are_brighter_are_noisier_by_the_square_o
         "dark_DN": 0.0,
         "counts_all_outliers": False,
     }
+
+
+def test_correlations_are_as_uncertain_as_the_neighbours_of_one_label_are_few():
+    # stripes: next to each other, pixels of one label lie in the first five columns alone
+    labels = np.tile(np.arange(SHAPE[1]) % 2, (SHAPE[0], 1))
+    labels[:, :4] = 0
+    white = SimpleNamespace(
+        quantum_variance_DN2=np.zeros((1, 1)),
+        white_variance_DN2=np.full((1, 1), 100.0),
+        noise_autocovariance=np.pad([[1.0]], (0, 3)),
+    )
+    context = ScalarContext(**fields_of_context(labels, ("even", "odd")))
+    found = {}
+    for seed in range(40):
+        summary = summarise_series([flat_frames(np.random.default_rng(seed))], good=np.ones(SHAPE, bool), labels=labels)
+        for one in measured_scalars(
+            summary, white, context, dark_mean_DN=0.0, pattern=None, outliers=None, all_outliers=0, memory=None
+        ):
+            if one.name.startswith("correlation"):
+                found.setdefault(one.name, []).append(one.value / one.sampling_sd)
+    assert summary.label_pairs[:, LAGS.index((0, 1))].tolist() == [4 * SHAPE[0], 0]
+    assert "correlation odd (0,1)" not in found
+    for name in ("correlation even (0,1)", "correlation even (1,0)", "correlation odd (1,0)"):
+        assert 0.7 < np.std(found[name]) < 1.35
+
+
+def test_quanta_of_an_area_whose_pixels_are_brighter_are_noisier_by_the_square_of_their_gain():
+    gain = np.ones(SHAPE)
+    gain[:, : SHAPE[1] // 2] = 1.1
+    labels = np.zeros(SHAPE, dtype=np.int64)
+    labels[:, SHAPE[1] // 2 :] = 1
+    fields = fields_of_context(labels, ("left", "right"))
     assert ScalarContext(**fields).label_gain.tolist() == [1.0, 1.0]
     left, right = ScalarContext(**fields, gain=gain).label_gain
     assert left / right == pytest.approx(1.21)

@@ -112,6 +112,7 @@ def test_scatter_is_proportional_to_a_thin_slab_and_falls_with_the_gap():
     assert sums[0] < sums[1] < sums[2]
 
 
+@pytest.mark.slow
 def test_more_collisions_only_add_and_count_for_more_in_thick_objects():
     thin, thick = (scattered_by({"water": length}) for length in (5.0, 60.0))
     assert thin[1].sum() / thin[0].sum() < thick[1].sum() / thick[0].sum()

@@ -1,12 +1,13 @@
 """Repeated looks: crossed random effects, scaling, clusters, bootstrap; and the false-alarm rate beside them."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from raytwin.errors import FitError, InputError
-from raytwin.pod import LINKS, bootstrap_pod, check_trials, curve_with_band, false_alarm_rate, fit_many, fit_pod
+from raytwin.pod import LINKS, PodFit, bootstrap_pod, check_trials, curve_with_band, false_alarm_rate, fit_many, fit_pod
 from raytwin.pod._laplace import Laplace
 from raytwin.pod.bootstrap import bootstrap_weights
 from raytwin.pod.crossed import averaged_eta, averaged_pod, fit_mixed
@@ -306,15 +307,20 @@ def test_false_alarms_that_come_by_image_count_less():
         false_alarm_rate([0, 2])
 
 
-def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> None:
-    """With identical networks the images' spread has no finite estimate: the a90 stays where misses end, and it is said."""
+@lru_cache(maxsize=1)
+def fit_of_identical_networks() -> tuple[PodFit, PodFit]:
+    """A crossed fit of three networks with the same hits, and the fit of one of them alone; half a minute's work."""
     rng = np.random.default_rng(5)
     size = np.sort(rng.uniform(0.02, 0.15, 70))
     seen = rng.random(70) < -np.expm1(-np.exp(-3.0 + 60.0 * size))
-    network = np.repeat(np.arange(3), 70)
-    image = np.tile(np.arange(70), 3)
+    network, image = np.repeat(np.arange(3), 70), np.tile(np.arange(70), 3)
     fit = fit_pod(np.tile(size, 3), np.tile(seen, 3), repeats="crossed", network=network, image=image)
-    once = fit_pod(size, seen)
+    return fit, fit_pod(size, seen)
+
+
+def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> None:
+    """With identical networks the images' spread has no finite estimate: the a90 stays where misses end, and it is said."""
+    fit, once = fit_of_identical_networks()
     assert fit.repeats == "cluster"
     assert any("no finite estimate" in note for note in fit.warnings)
     assert fit.a90 == pytest.approx(once.a90, rel=1e-6)
@@ -324,11 +330,7 @@ def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> N
 
 def test_the_band_of_a_clustered_fall_back_follows_the_clustered_curve() -> None:
     """Its POD rises through 90 % at its a90, and the band holds it."""
-    rng = np.random.default_rng(5)
-    size = np.sort(rng.uniform(0.02, 0.15, 70))
-    seen = rng.random(70) < -np.expm1(-np.exp(-3.0 + 60.0 * size))
-    network, image = np.repeat(np.arange(3), 70), np.tile(np.arange(70), 3)
-    fit = fit_pod(np.tile(size, 3), np.tile(seen, 3), repeats="crossed", network=network, image=image)
+    fit, _ = fit_of_identical_networks()
     assert fit.repeats == "cluster"
     assert fit.crossed is None
     assert fit.a90 is not None

@@ -51,8 +51,11 @@ _ROUND_DRAWS = 1024
 _FINAL_DRAWS = 2048
 _ROUNDS = 12
 _KEPT = 512
-_LEAST_EFFECTIVE = 40.0  # draws that must count
-_MORE_ROUNDS, _MORE_DRAWS = 8, 8192  # where fewer do after those rounds
+_LEAST_EFFECTIVE = 200.0  # draws that must count, or walkers go on
+_WALKERS = 1024
+_STEP_EFFECTIVE = 0.5  # share of the walkers that must count as the likelihood's power rises
+_SWEEPS, _MOST_SWEEPS = 5, 80  # at a power, and at the whole likelihood
+_FORGOTTEN = 0.3  # correlation with where they were: from there on walkers are draws of their own
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
 _BELOW_END = 0.85  # of kV in keV: up to here a measured spectrum corrects the model
 _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepancy's size
@@ -558,19 +561,15 @@ class _Posterior:
         """Best set (parameter,), equally likely draws (draw, parameter), their discrepancies, effective sample size.
 
         Importance sampling from the prior to the posterior by way of flattened posteriors (likelihood to the power of
-        a rising temper), each proposed from the one before.
+        a rising temper), each proposed from the one before; where its own covariance does not describe the posterior,
+        by walkers (`_walked`).
         """
         u = rng.standard_normal((2 * _ROUND_DRAWS, self.dimensions))
         log_ratio = np.zeros(len(u))  # prior over proposal
         temper, effective = 0.0, 0.0
         weight = np.full(len(u), 1.0 / len(u))
         likelihood = self.log_likelihood(u)
-        for number in range(_ROUNDS + _MORE_ROUNDS):
-            if number >= _ROUNDS:
-                # a posterior that its own covariance does not describe: more draws, for as long as too few count
-                weight, effective = _weights(likelihood + log_ratio)
-                if effective >= _LEAST_EFFECTIVE:
-                    break
+        for _ in range(_ROUNDS):
             temper = _next_temper(likelihood, log_ratio, last=temper, least=0.1 * len(u))
             weight, effective = _weights(temper * likelihood + log_ratio)
             if temper >= 1.0 and effective > _ENOUGH:
@@ -581,20 +580,20 @@ class _Posterior:
             # few effective draws make a covariance too narrow in some direction
             covariance = covariance * (1.0 + 2.0 * len(mean) / max(effective, 1.0)) + 1e-8 * np.eye(len(mean))
             draws = _FINAL_DRAWS if temper >= 0.3 else _ROUND_DRAWS
-            if number >= _ROUNDS:
-                draws = _MORE_DRAWS
             u, log_proposal = _mixture_draws(mean, covariance, draws, rng)
             log_ratio = -0.5 * np.sum(u**2, axis=1) - 0.5 * u.shape[1] * math.log(2 * math.pi) - log_proposal
             likelihood = self.log_likelihood(u)
         else:
             weight, effective = _weights(likelihood + log_ratio)
         if effective < _LEAST_EFFECTIVE:
+            u, likelihood, effective = self._walked(u, likelihood, log_ratio, rng)
+            weight = np.full(len(u), 1.0 / len(u))
+        if effective < _LEAST_EFFECTIVE:
             raise FitError(
                 f"the posterior of the spectrum could not be drawn (effective sample size {effective:.0f});"
                 " the levels contradict each other or the declared instrument"
             )
-        positions = (np.arange(_KEPT) + rng.random()) / _KEPT  # systematic resampling
-        chosen = np.minimum(np.searchsorted(np.cumsum(weight), positions), len(u) - 1)
+        chosen = _resampled(weight, _KEPT, rng)
         with np.errstate(invalid="ignore"):
             density = likelihood - 0.5 * np.sum(u**2, axis=1)
         best = self._climb(u[int(np.argmax(density))])
@@ -605,6 +604,56 @@ class _Posterior:
             self.discrepancies(kept),
             effective,
         )
+
+    def _walked(
+        self,
+        u: NDArray[np.float64],
+        likelihood: NDArray[np.float64],
+        log_ratio: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Walkers (walker, dimension) drawn from the posterior, their log likelihood, and how many independent draws they are worth.
+
+        Sequential Monte Carlo (Del Moral, Doucet, Jasra 2006, doi:10.1111/j.1467-9868.2006.00553.x): from weighted draws to
+        flattened posteriors of rising power, by resampling, and at each by Metropolis steps along differences of other walkers
+        (ter Braak 2006, doi:10.1007/s11222-006-8769-1), until they have forgotten where they were.
+
+        Args:
+            u, likelihood, log_ratio: draws (draw, dimension), their log likelihood, and log of prior over proposal (draw,).
+            rng: source of randomness.
+        """
+        temper = _next_temper(likelihood, log_ratio, last=0.0, least=_STEP_EFFECTIVE * min(_WALKERS, len(u)))
+        weight, _ = _weights(np.where(np.isfinite(likelihood), temper * likelihood + log_ratio, -np.inf))
+        chosen = _resampled(weight, _WALKERS, rng)
+        u, likelihood = u[chosen], likelihood[chosen]
+        while True:
+            before = u
+            for sweep in range(_SWEEPS if temper < 1.0 else _MOST_SWEEPS):
+                u, likelihood = self._swept(u, likelihood, temper, rng)
+                if temper >= 1.0 and sweep % _SWEEPS == _SWEEPS - 1 and _remembered(before, u) < _FORGOTTEN:
+                    break
+            if temper >= 1.0:
+                return u, likelihood, len(u) * (1.0 - _remembered(before, u) ** 2)
+            temper, last = _raised(likelihood, temper), temper
+            chosen = _resampled(_weights((temper - last) * likelihood)[0], len(u), rng)
+            u, likelihood = u[chosen], likelihood[chosen]
+
+    def _swept(
+        self, u: NDArray[np.float64], likelihood: NDArray[np.float64], temper: float, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """All walkers after one Metropolis step each: one half along differences of the other half, then the other."""
+        u, likelihood = u.copy(), likelihood.copy()
+        order = rng.permutation(len(u))
+        for moving, still in ((order[::2], order[1::2]), (order[1::2], order[::2])):
+            first, second = (u[still[rng.integers(len(still), size=len(moving))]] for _ in range(2))
+            # long steps reach other ends of a bent posterior, short ones are taken in narrow ones
+            scale = 2.38 / math.sqrt(2.0 * u.shape[1]) * rng.choice([0.1, 0.3, 1.0, 2.0], size=(len(moving), 1))
+            proposed = u[moving] + scale * (first - second) + 1e-5 * rng.standard_normal(first.shape)
+            there = self.log_likelihood(proposed)
+            gain = temper * (there - likelihood[moving]) - 0.5 * np.sum(proposed**2 - u[moving] ** 2, axis=1)
+            taken = np.log(rng.random(len(moving))) < gain
+            u[moving[taken]], likelihood[moving[taken]] = proposed[taken], there[taken]
+        return u, likelihood
 
     def _climb(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """The most probable shapes (dimension,) near a draw, by Newton's steps on numerical derivatives."""
@@ -667,6 +716,19 @@ def _weights(logarithms: NDArray[np.float64]) -> tuple[NDArray[np.float64], floa
     return weight, 1.0 / float(np.sum(weight**2))
 
 
+def _resampled(weight: NDArray[np.float64], count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Indices (count,) of draws of normalised `weight` (draw,), systematically."""
+    positions = (np.arange(count) + rng.random()) / count
+    return np.minimum(np.searchsorted(np.cumsum(weight), positions), len(weight) - 1)
+
+
+def _remembered(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+    """Largest correlation, over dimensions, of where walkers (walker, dimension) are with where they were."""
+    first, second = before - before.mean(axis=0), after - after.mean(axis=0)
+    scale = np.sqrt(np.sum(first**2, axis=0) * np.sum(second**2, axis=0))
+    return float(np.max(np.sum(first * second, axis=0) / np.maximum(scale, 1e-300)))
+
+
 def _next_temper(
     likelihood: NDArray[np.float64], log_ratio: NDArray[np.float64], *, last: float, least: float
 ) -> float:
@@ -679,6 +741,21 @@ def _next_temper(
         if effective[-1] >= least:
             return float(power)
     return float(powers[int(np.argmax(effective))])
+
+
+def _raised(likelihood: NDArray[np.float64], last: float) -> float:
+    """The largest power (to 1) of the likelihood that leaves enough of the equal draws from its power `last`."""
+
+    def enough(power: float) -> bool:
+        return _weights((power - last) * likelihood)[1] >= _STEP_EFFECTIVE * len(likelihood)
+
+    low, high = last, 1.0
+    if enough(high):
+        return high
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return high
 
 
 def _mixture_draws(

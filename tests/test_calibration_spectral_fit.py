@@ -360,17 +360,48 @@ def test_measured_spectra_fix_the_filtration_and_what_follows_from_it():
     assert abs(np.median(draws) - exact) < 0.015
 
 
-def test_a_posterior_that_is_hard_to_draw_is_drawn_on(model, monkeypatch):
+def test_a_posterior_that_is_hard_to_draw_is_drawn_by_walkers(model, monkeypatch):
     truth = typical(model, inherent_filtration_mm_Al=1.4, kV_error=-0.006)
     levels = levels_of(model, truth, BEAMS)
+    easy = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(5))
     monkeypatch.setattr(spectral_fit, "_ROUNDS", 1)
     monkeypatch.setattr(spectral_fit, "_ROUND_DRAWS", 64)
     fit = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
-    assert fit.effective_draws >= 40
+    assert fit.effective_draws >= 200
     assert fit.chi_square < 0.5
-    monkeypatch.setattr(spectral_fit, "_MORE_ROUNDS", 0)
+    for name in ("inherent_filtration_mm_Al", "log_output", "log_DN_per_keV", "kV_error"):
+        one, other = (found.posterior.samples[:, found.posterior.names.index(name)] for found in (easy, fit))
+        assert np.mean(other) == pytest.approx(np.mean(one), abs=0.25 * np.std(one))
+        assert np.std(other) == pytest.approx(np.std(one), rel=0.2)
+    # walkers that stay where they are are draws of nothing
+    monkeypatch.setattr(spectral_fit, "_MOST_SWEEPS", 0)
     with pytest.raises(FitError, match="could not be drawn"):
         fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(6))
+
+
+def test_walkers_follow_a_bent_posterior():
+    class Bent(spectral_fit._Posterior):
+        def __init__(self):
+            pass
+
+        def log_likelihood(self, u):
+            inside = u[:, 0] > -1.0
+            return np.where(inside, -0.5 * ((u[:, 1] - u[:, 0] ** 2) / 0.03) ** 2, -np.inf)
+
+    rng = np.random.default_rng(8)
+    u = rng.standard_normal((2048, 2))
+    bent = Bent()
+    walkers, likelihood, effective = bent._walked(u, bent.log_likelihood(u), np.zeros(2048), rng)
+    assert effective > 500
+    assert likelihood == pytest.approx(bent.log_likelihood(walkers))
+    # along the bend: exp(-x^2 / 2 - x^4 / 2) beyond -1
+    x = np.linspace(-1.0, 4.0, 20001)
+    density = np.exp(-0.5 * x**2 - 0.5 * x**4)
+    mean = np.sum(x * density) / density.sum()
+    square = np.sum(x**2 * density) / density.sum()
+    assert walkers[:, 0].mean() == pytest.approx(mean, abs=0.08)
+    assert (walkers[:, 0] ** 2).mean() == pytest.approx(square, abs=0.06)
+    assert np.std(walkers[:, 1] - walkers[:, 0] ** 2) == pytest.approx(0.03, rel=0.15)
 
 
 def test_what_cannot_be_fitted_is_said():

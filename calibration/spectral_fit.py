@@ -55,6 +55,7 @@ _LEAST_EFFECTIVE = 200.0  # draws that must count, or walkers go on
 _WALKERS = 1024
 _STEP_EFFECTIVE = 0.5  # share of the walkers that must count as the likelihood's power rises
 _SWEEPS, _MOST_SWEEPS = 5, 80  # at a power, and at the whole likelihood
+_MOST_POWERS = 100
 _FORGOTTEN = 0.3  # correlation with where they were: from there on walkers are draws of their own
 _ENOUGH = 600.0  # effective draws; the linear parameters are drawn anew for each of those kept
 _BELOW_END = 0.85  # of kV in keV: up to here a measured spectrum corrects the model
@@ -626,7 +627,7 @@ class _Posterior:
         weight, _ = _weights(np.where(np.isfinite(likelihood), temper * likelihood + log_ratio, -np.inf))
         chosen = _resampled(weight, _WALKERS, rng)
         u, likelihood = u[chosen], likelihood[chosen]
-        while True:
+        for _ in range(_MOST_POWERS):
             before = u
             for sweep in range(_SWEEPS if temper < 1.0 else _MOST_SWEEPS):
                 u, likelihood = self._swept(u, likelihood, temper, rng)
@@ -637,6 +638,7 @@ class _Posterior:
             temper, last = _raised(likelihood, temper), temper
             chosen = _resampled(_weights((temper - last) * likelihood)[0], len(u), rng)
             u, likelihood = u[chosen], likelihood[chosen]
+        return u, likelihood, 0.0
 
     def _swept(
         self, u: NDArray[np.float64], likelihood: NDArray[np.float64], temper: float, rng: np.random.Generator

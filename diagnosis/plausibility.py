@@ -48,8 +48,8 @@ _MOST_SUSPECTS = 10
 _PRICE_OF_A_SETTING = 2.0  # natural logarithm, of more than one word being wrong
 _MOST_CHANGES = 4
 _INHERENT_MM_AL = 1.0  # where nothing is declared
-# as far as calibration's prior plausibly goes
-_INHERENT_MAY_BE_MM_AL = tuple(0.25 * step for step in range(13))
+_INHERENT_MAY_BE_MM_AL = (0.0, 3.0)  # as far as calibration's prior plausibly goes
+_INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)  # where flats tell
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
 _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
@@ -590,7 +590,7 @@ def _inherent_mm_Al(flats: Sequence[_Reading], maps: _Maps) -> tuple[float, ...]
     The median over all such flats: one of them may be mislabelled.
     """
     levels = {
-        item.name: np.array([maps.log_level(item.label, mm_Al) for mm_Al in _INHERENT_MAY_BE_MM_AL])
+        item.name: np.array([maps.log_level(item.label, mm_Al) for mm_Al in _INHERENT_TRIED_MM_AL])
         for item in flats
         if item.label.load is not None and item.level_DN > 0 and maps.weights(item.label) is not None
     }
@@ -601,10 +601,10 @@ def _inherent_mm_Al(flats: Sequence[_Reading], maps: _Maps) -> tuple[float, ...]
             if one.label.kV == other.label.kV and one.label.filters != other.label.filters:
                 measured = math.log(one.level_DN / other.level_DN)
                 off = np.abs(levels[one.name] - levels[other.name] - measured)
-                seen.append(_INHERENT_MAY_BE_MM_AL[int(np.argmin(off))])
+                seen.append(_INHERENT_TRIED_MM_AL[int(np.argmin(off))])
     if seen:
         return (float(np.median(seen)),)
-    return (_INHERENT_MM_AL, _INHERENT_MAY_BE_MM_AL[0], _INHERENT_MAY_BE_MM_AL[-1])
+    return (_INHERENT_MM_AL, *_INHERENT_MAY_BE_MM_AL)
 
 
 def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequence[str]) -> str:
@@ -716,7 +716,7 @@ def _scaled(
         )
         # a soft beam takes a harder one for shorter paths
         of_the_beam = not one_fits and any(
-            math.copysign(1.0, middle) * float(np.median(other)) < _SCALE_OFF for other in others
+            math.copysign(1.0, middle) * float(np.median(other)) < _SCALE_OFF for other in others if other
         )
         if abs(middle) > _SCALE_OFF and not (of_the_gap or of_the_beam):
             found.append(

@@ -99,6 +99,7 @@ def test_the_commands_give_the_same_twin_for_the_same_seed(session, tmp_path, ca
     assert row["mean_DN"]["high"] - row["mean_DN"]["low"] > predicted["mean_DN"]["high"] - predicted["mean_DN"]["low"]
 
 
+@pytest.mark.slow
 def test_a_fit_is_not_taken_for_a_prediction(session, tmp_path, capsys):
     plain = tmp_path / "plain.h5"
     shutil.copy(session["path"], plain)

@@ -62,6 +62,7 @@ def test_session_without_effect_is_not_explained_by_one(sessions, capsys):
     assert found["format"] == "raytwin-diagnosis"
 
 
+@pytest.mark.slow
 def test_an_effect_left_out_is_not_named(sessions, capsys):
     capsys.readouterr()
     folder = sessions / "without"

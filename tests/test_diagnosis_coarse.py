@@ -76,6 +76,7 @@ def test_the_far_end_of_a_blur_stays_open_over_as_many_of_the_panel_s_pixels():
     assert open_px == {1: 12, 2: 6, 4: 3}
 
 
+@pytest.mark.slow
 def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path, capsys, monkeypatch):
     from raytwin.generator.twin_io import read_twin
 
@@ -128,7 +129,6 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
     assert "at least 16 rows and columns" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypatch):
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "6", "--products", "1"]

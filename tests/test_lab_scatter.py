@@ -103,6 +103,7 @@ def test_single_scatter_of_a_slab_is_its_integral(thickness_mm, gap_mm):
     assert middle == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_scatter_is_proportional_to_a_thin_slab_and_falls_with_the_gap():
     thin, thicker = (scattered_by({"water": length}).sum() for length in (1.0, 2.0))
     assert thicker / thin == pytest.approx(2.0, rel=0.06)

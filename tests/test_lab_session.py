@@ -145,6 +145,7 @@ def test_strength_0_and_no_effect_give_the_same_bytes(full, tmp_path):
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
 
+@pytest.mark.slow
 def test_all_effects_together_still_make_a_session(tmp_path):
     requests = [EffectRequest(id=name, strength=law.low) for name, law in EFFECTS.items()]
     # Scatter takes a second an object: few of them.

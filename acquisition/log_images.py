@@ -1,4 +1,4 @@
-"""Logarithmic images and the light they stand for: frames of -log(I/I0), with I0 the open field."""
+"""Images divided by the open field I0 and the light they stand for: frames of I/I0, or of -log(I/I0)."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from .acquisition_io import Series
 
+_LARGEST_SHARE = 5.0  # of the open field, in nearly all pixels: detector numbers are larger
+_NOT_DEAD = 0.98  # share of the pixels
 _LEAST_LOG = -5.0  # 150 times the open field: pixels that were dead in the flat
 
 
@@ -21,13 +23,29 @@ def logarithm_of_share(share: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(-np.log(np.maximum(share, np.finfo(np.float32).tiny)), dtype=np.float32)
 
 
-def light_of_log(series: Series, open_DN: float) -> Series:
-    """A series of -log(I/I0) as frames of `open_DN` I/I0, `offset` and `gain` corrected.
+def holds_shares(series: Series) -> bool:
+    """Whether frames with a beam are I/I0 or -log(I/I0) and no detector numbers.
+
+    Logarithms are declared. Frames that went through `gain` may have kept their detector numbers, or be shares of the open field:
+    those are no whole numbers and nowhere far above 1.
+    """
+    if series.kind not in ("flat", "object"):
+        return False
+    if "log" in series.corrected:
+        return True
+    if "gain" not in series.corrected or series.n_frames == 0:
+        return False
+    first = series.read_frames(0, 1)
+    return first.dtype.kind == "f" and float(np.quantile(first, _NOT_DEAD)) < _LARGEST_SHARE
+
+
+def light_of_shares(series: Series, open_DN: float) -> Series:
+    """A series of I/I0 or -log(I/I0) as frames of `open_DN` I/I0, `offset` and `gain` corrected.
 
     It reads from the given series, whose file stays open.
 
     Args:
-        series: whose `corrected` holds `log`.
+        series: one that `holds_shares`.
         open_DN: signal of the open field.
     """
     corrected = (series.corrected - {"log"}) | {"offset", "gain"}
@@ -45,4 +63,5 @@ class _Light:
         self._open_DN = np.float32(open_DN)
 
     def __getitem__(self, part: slice) -> NDArray[np.float32]:
-        return self._open_DN * transmitted_share(self._series.read_frames(part.start, part.stop))
+        frames = self._series.read_frames(part.start, part.stop)
+        return self._open_DN * (transmitted_share(frames) if "log" in self._series.corrected else frames)

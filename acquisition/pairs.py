@@ -13,6 +13,7 @@ from ..errors import InputError
 from .acquisition_io import AcquisitionFile, Scene, Series
 from .contrast import DILATIONS, PRODUCT_THRESHOLD, check_dilations, delta_r
 from .dataset_io import DatasetRow, write_dataset
+from .log_images import holds_shares, logarithm_of_share
 from .setting import Setting
 
 _SAME = 1e-6
@@ -290,6 +291,8 @@ class PairCorrector:
         """
         if "log" in series.corrected:
             image = np.asarray(counts_DN, dtype=np.float32)
+        elif holds_shares(series):
+            image = logarithm_of_share(counts_DN)
         elif "gain" in series.corrected:
             raise InputError(
                 f"series {series.name}",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
-from ..acquisition.log_images import light_of_log
+from ..acquisition.log_images import light_of_shares
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
 from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions, with_conditions
@@ -268,11 +268,11 @@ def _seen_series(
 
 
 def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
-    """Logarithms as light, of the open field that the base twin expects."""
-    if "log" not in item.series.corrected:
+    """Shares of the open field and their logarithms as light, of the open field that the base twin expects."""
+    if not item.shares:
         return item
     opened = model.expect(replace(item.request, kind="flat", thickness_mm=None, scene_kind=None))
-    return replace(item, series=light_of_log(item.series, float(np.mean(opened.signal_DN))))
+    return replace(item, series=light_of_shares(item.series, float(np.mean(opened.signal_DN))))
 
 
 def _thicker_scenes(series: Sequence[SeriesModel]) -> dict[tuple[str, str], dict[str, NDArray[np.floating]]]:

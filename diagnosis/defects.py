@@ -1,5 +1,6 @@
 """Pixels that stand out of the panel and are not known to be bad: they count as outliers and are left out of all else."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
@@ -11,7 +12,7 @@ from .calibrated_maps import CalibratedMaps
 from .even_maps import full_size, signal_map
 from .fixed_pattern import smooth_part
 from .session import SessionSeries
-from .summaries import FirstLook
+from .summaries import LEAST_NOISE_DN2, FirstLook
 
 _OUTLYING = 8.0  # standard deviations from which a pixel stands out
 _LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
@@ -45,9 +46,9 @@ def new_outliers(
         residual = residual - smooth_part(residual, good)
         centre = float(np.median(residual[good]))
         spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
-        outlying |= np.abs(residual - centre) > _OUTLYING * max(spread, 1e-9)
+        outlying |= np.abs(residual - centre) > _OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
         if look.frames > 9:
-            ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), 1e-12)
+            ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), LEAST_NOISE_DN2)
             limit = max(_largest_ratio(look.frames), 2.5)
             if bool(np.any(ratio[good] > limit)):
                 outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good

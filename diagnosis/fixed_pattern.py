@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..generator.series import ExpectedSeries
 from .even_maps import mean_over
 from .noise_correlation import autocovariance, correlation_sum
-from .summaries import BLOCK_PX
+from .summaries import BLOCK_PX, LEAST_NOISE_DN2
 
 OUTLIER_SD = 7.0
 _LEAST_BLOCKS, _LEAST_LINES = 8, 16
@@ -22,7 +22,6 @@ _NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
 _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
 _LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
-_ROUNDING_DN2 = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,20 +54,16 @@ def pattern_noise(
     lines can be judged.
     """
     q = mean_over(model.quantum_variance_DN2, mask) / frames + map_quantum_DN2
-    w = mean_over(model.white_variance_DN2, mask) / frames + map_white_DN2
+    w = max(mean_over(model.white_variance_DN2, mask), LEAST_NOISE_DN2) / frames + map_white_DN2
     # fewer pixels of a line count than it has
     rows, columns = (max(float(mask.mean()) * length, 1.0) for length in mask.shape)
     pixel = q * (1.0 - autocovariance(model, 0, 1)) + w
     block = (q * correlation_sum(model, BLOCK_PX, BLOCK_PX) + w) / BLOCK_PX**2
     return Pattern(
-        pixel_DN2=max(pixel, _ROUNDING_DN2),
-        blocks_DN2=max(block, _ROUNDING_DN2),
-        rows_DN2=max((q * _second_difference(model, mask.shape[1], along=1) + w) / columns, _ROUNDING_DN2)
-        if lines
-        else None,
-        columns_DN2=max((q * _second_difference(model, mask.shape[0], along=0) + w) / rows, _ROUNDING_DN2)
-        if lines
-        else None,
+        pixel_DN2=pixel,
+        blocks_DN2=block,
+        rows_DN2=(q * _second_difference(model, mask.shape[1], along=1) + w) / columns if lines else None,
+        columns_DN2=(q * _second_difference(model, mask.shape[0], along=0) + w) / rows if lines else None,
     )
 
 

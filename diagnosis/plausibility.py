@@ -19,7 +19,7 @@ Validity: needs several series; a session whose labels are all wrong in the same
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.log_images import holds_shares
 from ..acquisition.setting import Filter, text_from_filters
 from ..calibration.spectral_fit import model_for
 from ..errors import InputError
@@ -38,6 +39,7 @@ LEAST_EVIDENCE = 10.0
 _FRAMES = 8  # read of each series
 _FRAMES_OF_NOISE = 5  # that an object's series needs to say something of noise
 _PIXELS = 96  # a side that are looked at
+_LEAST_BRIGHTEST_DN = 30.0  # of frames that are no whole numbers; 8 bits averaged have more, transmissions 1
 _CONSTANT_SD, _OWN_BEAM_SD = 10.0, 3.0  # of the common level; of a beam of unknown kV or load
 _LEVEL_SDS = {"voltage": 0.2, "voltage since": 0.2, "beam since": 0.05, "filters": 0.15, "series": 0.04}
 _GAIN_SDS = {"since": 0.35, "beam": 0.08, "beam since": 0.08, "series": 0.08}
@@ -158,7 +160,7 @@ def check_plausibility(
         progress: called with the name of the stage.
 
     Raises:
-        InputError: frames that cannot be read.
+        InputError: frames that cannot be read, or that are fractions of something and no detector numbers.
     """
     (progress or (lambda stage: None))("labels")
     unusable: dict[str, str] = {}
@@ -168,8 +170,9 @@ def check_plausibility(
     if len(shapes) > 1:
         return Plausibility(suspects=(), unusable={})
     stride = max(1, math.ceil(min(shapes.pop()) / _PIXELS))
+    blank: dict[str, tuple[_Reading, float]] = {}  # and the one number that all their pixels have
     for item in acquisition.series:
-        if "log" in item.corrected:
+        if "log" in item.corrected or holds_shares(item):
             continue
         # the last ones: the first may hold what the exposure before has left
         first = max(0, item.n_frames - _FRAMES)
@@ -177,17 +180,26 @@ def check_plausibility(
         found = _read(item, frames, acquisition, item.name not in calibrating)
         full = 0.0 if item.kind in ("dark", "afterglow") else _share_at_the_top(frames)
         if float(np.ptp(frames)) == 0.0:
-            unusable[item.name] = f"every pixel of every frame is {frames.flat[0]:g} DN"
-            if item.kind in ("flat", "object") and _is_top(float(frames.flat[0]), acquisition.instrument.bits):
-                saturated.add(item.name)
+            blank[item.name] = found, float(frames.flat[0])
         elif full > _SATURATED:
             unusable[item.name] = f"saturated: {100 * full:.2g} % of the pixels stand at {frames.max():.0f} DN"
             saturated.add(item.name)
         else:
             readings.append(found)
+    silent = _silent_darks(acquisition, calibrating, blank)
+    for name, (found, value_DN) in blank.items():
+        top = _is_top(value_DN, acquisition.instrument.bits)
+        if name in silent and not top:
+            readings.append(found)
+            continue
+        unusable[name] = f"every pixel of every frame is {value_DN:g} DN"
+        if top and found.series.kind in ("flat", "object"):
+            saturated.add(name)
+    readings.sort(key=lambda item: item.series.index)
     suspects: list[Suspect] = []
     darks = [item for item in readings if item.series.kind == "dark"]
     lit = [item for item in readings if item.series.kind in ("flat", "object")]
+    _refuse_fractions(lit)
     good = _good_pixels(readings)
     wrong_darks = _lit_darks(darks, lit, good)
     suspects += wrong_darks
@@ -245,6 +257,33 @@ def _is_top(value_DN: float, bits: int | None) -> bool:
     """Whether a number is the largest of an ADC, of 8 bits or more where they are not known."""
     counted = math.log2(value_DN + 1.0) if value_DN > 0.0 else 0.0
     return counted == bits if bits is not None else counted >= 8 and counted.is_integer()
+
+
+def _silent_darks(acquisition: AcquisitionFile, calibrating: Collection[str], blank: Collection[str]) -> set[str]:
+    """Blank series without a beam that are what this detector shows then: one that counts, or a simulated one without electronics.
+
+    One blank dark among others that have noise is a failure to read it.
+    """
+    darks = {item.name for item in acquisition.series if item.kind == "dark"}
+    before = darks & set(calibrating) or darks
+    if not before <= set(blank):
+        return set()
+    return {item.name for item in acquisition.series if item.kind in ("dark", "afterglow") and item.name in blank}
+
+
+def _refuse_fractions(lit: Sequence[_Reading]) -> None:
+    """Raise where frames with a beam hold no detector numbers but, as transmissions do, small fractions."""
+    brightest = max((float(item.mean_DN.max()) for item in lit), default=_LEAST_BRIGHTEST_DN)
+    whole = all(np.issubdtype(item.series.read_frames(0, 1).dtype, np.integer) for item in lit)
+    if whole or brightest >= _LEAST_BRIGHTEST_DN:
+        return
+    factor = 10.0 ** math.ceil(4.0 - math.log10(max(brightest, 1e-30)))
+    raise InputError(
+        "frames",
+        received=f"numbers of {brightest:.3g} at most",
+        expected=f"detector numbers (DN) of {_LEAST_BRIGHTEST_DN:g} and more in flats, as dark and noise are judged in DN",
+        remedy=f"multiply all frames of the file by one factor, darks included, for example {factor:g}",
+    )
 
 
 def _share_at_the_top(frames: FloatArray) -> float:

@@ -23,7 +23,7 @@ from .fixed_pattern import Pattern
 from .lost_bits import rounded_kurtosis
 from .noise_correlation import autocovariance, correlation_sum
 from .registration import gradient
-from .summaries import BLOCK_PX, LAGS, PIECE_FRAMES, SeriesSummary
+from .summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, PIECE_FRAMES, SeriesSummary
 
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 _AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
@@ -32,7 +32,6 @@ _LEAST_OUTLIERS, _LEAST_FRAMES = 5, 6  # pixels, and frames of each, that show w
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
 _LEAST_PAIRS = 64  # of neighbours whose correlation is nearly a Gaussian number
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
-_LEAST_DN2 = 1e-4  # noise below the ADC's step can vanish
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
 ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"  # of a scene
@@ -227,7 +226,7 @@ def expected_scalars(
     mean_w, label_w = areas.means(expected.white_variance_DN2)
     moving = _MovingPicture.of(expected, context)
     moved = moving.pixels()
-    total = max(mean_q * keep + mean_w + row + column + moved, _LEAST_DN2)
+    total = max(mean_q * keep + mean_w + row + column + moved, LEAST_NOISE_DN2)
     profile = frame_profile(expected, areas)
     if context.frames > 2:
         correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
@@ -236,7 +235,7 @@ def expected_scalars(
             # an area whose pixels are brighter than others by their gain is noisier by its square
             q, w = float(label_q[label] * context.label_gain[label]) * keep, float(label_w[label])
             shared = moving.pixels(label)
-            here = max(q + w + row + column + shared, _LEAST_DN2)
+            here = max(q + w + row + column + shared, LEAST_NOISE_DN2)
             variance_name, correlation_names = _noise_names(name)
             values[variance_name] = math.log(here)
             for known, correlation, line in zip(correlation_names, correlations, lines, strict=True):
@@ -267,7 +266,7 @@ def expected_scalars(
             / total
         )
         temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
-        full = max(mean_q + mean_w + row + column + moved, _LEAST_DN2)
+        full = max(mean_q + mean_w + row + column + moved, LEAST_NOISE_DN2)
         for step in (1, 2):
             correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
             values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
@@ -413,7 +412,7 @@ class _MovingPicture:
         for start in range(0, steps.shape[1], PIECE_FRAMES):
             squares = (self.there.T @ steps[:, start : start + PIECE_FRAMES]) ** 2
             second, fourth = squares.mean(axis=1), (squares**2).mean(axis=1)
-            whole = np.maximum(noise + second, _LEAST_DN2)
+            whole = np.maximum(noise + second, LEAST_NOISE_DN2)
             ratio = 3.0 + (fourth - 3.0 * second**2) / whole**2
             # what moves is no chance: a pixel's own variance is known better than that of noise alone
             share = 3.0 / min(steps.shape[1], PIECE_FRAMES)
@@ -488,7 +487,9 @@ def measured_scalars(
 
     mean_q, label_q = context.areas.means(base.quantum_variance_DN2)
     mean_w, label_w = context.areas.means(base.white_variance_DN2)
-    if frames > 2:
+    # a picture that fades without any noise says how fast it fades, which the afterglow's levels say without a law's errors
+    noisy = context.kind != "afterglow" or mean_q + mean_w > LEAST_NOISE_DN2
+    if frames > 2 and noisy:
         freedom = 2.0 * (frames - 1) ** 2 / (3.0 * frames - 4.0)
         for label, name in enumerate(context.label_names):
             variance = float(summary.label_variance_DN2[label])
@@ -502,14 +503,14 @@ def measured_scalars(
                 "noise",
                 f"log_variance {name}",
                 "1",
-                math.log(variance),
+                math.log(max(variance, LEAST_NOISE_DN2)),
                 math.sqrt(2.0 * shared / (freedom * pixels)),
                 "log_variance",
             )
             for index, (dr, dc) in enumerate(LAGS):
                 # pixels of a label that lies in stripes may have few neighbours
                 pairs = int(summary.label_pairs[label, index])
-                if pairs < _LEAST_PAIRS:
+                if pairs < _LEAST_PAIRS or variance < LEAST_NOISE_DN2:
                     continue
                 add(
                     "texture",
@@ -520,7 +521,7 @@ def measured_scalars(
                     "correlation",
                 )
         total = float(np.mean(summary.pair_variance_DN2[good]))
-        if total > 0:
+        if total >= LEAST_NOISE_DN2:
             for axis_name, value, count, lines in (
                 ("row_ratio", summary.row_variance_DN2, columns, rows),
                 ("column_ratio", summary.column_variance_DN2, rows, columns),
@@ -602,23 +603,23 @@ def measured_scalars(
         result.append(codes)
     if pattern is not None and not context.calibrates:
         # in units of the noise: a pattern's rms, which is what a strength means
-        expected = context.pattern_noise
-        for name, found_DN2, noise_DN2, freedom in (
-            ("fixed_pattern", pattern.pixel_DN2, expected.pixel_DN2, n_good),
-            ("fixed_pattern blocks", pattern.blocks_DN2, expected.blocks_DN2, n_good / BLOCK_PX**2),
+        expected, least = context.pattern_noise, LEAST_NOISE_DN2 / frames
+        for name, found_DN2, noise_DN2, pixels in (
+            ("fixed_pattern", pattern.pixel_DN2, expected.pixel_DN2, 1),
+            ("fixed_pattern blocks", pattern.blocks_DN2, expected.blocks_DN2, BLOCK_PX**2),
         ):
             if found_DN2 is not None and noise_DN2 is not None:
-                value = math.sqrt(max(found_DN2, 1e-12) / noise_DN2)
-                sampling = value * math.sqrt(0.75 / freedom)
-                sd = value * math.hypot(math.sqrt(0.75 / freedom), FLOORS[name])
+                value = math.sqrt(max(found_DN2, least / pixels) / noise_DN2)
+                sampling = value * math.sqrt(0.75 * pixels / n_good)
+                sd = math.hypot(sampling, value * FLOORS[name])
                 result.append(Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling))
         # lines may stand out a hundredfold: logarithms; second differences share lines
-        for name, found_DN2, noise_DN2, lines in (
-            (FIXED_ROWS, pattern.rows_DN2, expected.rows_DN2, rows),
-            (FIXED_COLUMNS, pattern.columns_DN2, expected.columns_DN2, columns),
+        for name, found_DN2, noise_DN2, lines, pixels in (
+            (FIXED_ROWS, pattern.rows_DN2, expected.rows_DN2, rows, columns),
+            (FIXED_COLUMNS, pattern.columns_DN2, expected.columns_DN2, columns, rows),
         ):
             if found_DN2 is not None and noise_DN2 is not None:
-                value = 0.5 * math.log(max(found_DN2, 1e-12) / noise_DN2)
+                value = 0.5 * math.log(max(found_DN2, least / pixels) / noise_DN2)
                 add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
     if outliers is not None and not context.calibrates:
         add("tails", OUTLIERS, "sqrt(pixels)", math.sqrt(outliers + 0.375), 0.5, "outliers")

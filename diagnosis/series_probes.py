@@ -26,8 +26,9 @@ from .probes import (
 )
 from .registration import render_variance
 from .responses import Moved, SeriesModel, SessionModel
-from .summaries import SeriesSummary
+from .summaries import LEAST_NOISE_DN2, SeriesSummary
 
+_ABOVE_NOISE = 4.0  # standard deviations of a frame
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
@@ -147,9 +148,13 @@ def mean_frame(
     shape, frames, expected = clean.shape, one.session.series.n_frames, one.expected
     signal = signal_map(expected, shape)
     mask = clean if one.placement is None else inside(clean, one.placement)
-    quantum = full_size(expected.quantum_variance_DN2, shape) / frames + signal**2 * maps.gain_quantum
-    white = full_size(expected.white_variance_DN2, shape) / frames + signal**2 * maps.gain_white
-    white = white + maps.dark_noise(one.session)
+    quantum = full_size(expected.quantum_variance_DN2, shape)
+    white = np.maximum(full_size(expected.white_variance_DN2, shape), LEAST_NOISE_DN2)
+    if one.session.shares:
+        # where noise reaches below 0 a logarithm has cut it off
+        mask = mask & (signal > _ABOVE_NOISE * np.sqrt(quantum + white))
+    quantum = quantum / frames + signal**2 * maps.gain_quantum
+    white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session)
     if one.session.series.kind == "object":
         white = white + render_variance(signal, side=side)
         if one.session.request.scene_kind not in SHARP_SCENES:

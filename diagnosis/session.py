@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.log_images import holds_shares
 from ..calibration.repeated_frames import Beam, beam_of
 from ..errors import InputError
 from ..generator.series import SeriesRequest
@@ -24,6 +25,7 @@ class SessionSeries:
 
     own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
     divided: its frames were divided by an open field measured elsewhere, so that their level says nothing.
+    shares: they are I/I0, or logarithms of it.
     """
 
     series: Series
@@ -32,6 +34,7 @@ class SessionSeries:
     after: bool
     own_noise: bool = False
     divided: bool = False
+    shares: bool = False
 
     @property
     def name(self) -> str:
@@ -255,6 +258,7 @@ def read_session(
                 after=after,
                 own_noise=item.kind != "dark" and beam_of(item) in noiseless,
                 divided=bool(item.corrected & {"gain", "log"}),
+                shares=holds_shares(item),
             )
         )
     return tuple(result)

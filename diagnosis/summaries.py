@@ -16,6 +16,7 @@ from ..errors import InputError
 
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
+LEAST_NOISE_DN2 = 1e-4  # of a pixel: noise below the ADC's step can vanish, and a simulated dark may have none
 TIME_TILES = 4  # tiles a side whose means are kept frame by frame
 PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
 _QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code

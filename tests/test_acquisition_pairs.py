@@ -281,24 +281,26 @@ def test_without_dark_flat_or_mask_the_message_says_what_to_measure(tmp_path):
         assert not (tmp_path / "d.h5").exists()
 
 
-def test_frames_that_are_logarithmic_already_pass_through(tmp_path):
+@pytest.mark.parametrize("held", ["logarithms", "shares"])
+def test_frames_that_are_divided_by_their_open_field_already_pass_through(tmp_path, held):
     low, high, mask = log_images(1)
+    corrected = ("offset", "gain", "log") if held == "logarithms" else ("offset", "gain")
     with write_acquisition(tmp_path / "a.h5") as writer:
         for setting, image in ((LOW, low), (HIGH, high)):
             writer.add_series(
                 f"{setting.kV:g}",
                 kind="object",
-                frames=image[None],
+                frames=image[None] if held == "logarithms" else np.exp(-image[None]),
                 setting=setting,
                 scene="p",
-                corrected=("offset", "gain", "log"),
+                corrected=corrected,
             )
         writer.add_scene("p", kind="product", foreign_object_mask=mask)
     with open_acquisition(tmp_path / "a.h5") as acquisition:
         summary = dataset_from_acquisition(acquisition, tmp_path / "d.h5")
     assert summary.notes == ("no counts: the frames are not raw",)
     with read_dataset(tmp_path / "d.h5") as dataset:
-        np.testing.assert_allclose(dataset.images(0), [low, high], rtol=1e-6)
+        np.testing.assert_allclose(dataset.images(0), [low, high], rtol=1e-6, atol=1e-6)
         assert dataset.rows[0].foreign_object == "unnamed" and not dataset.has_counts
 
 

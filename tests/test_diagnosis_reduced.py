@@ -133,8 +133,8 @@ def averages(file):
         node.attrs["averaged"] = count
 
 
-def divided(line, *, logarithms):
-    """Products of a session as -log(I/I0) or, times what the open field had, as I/I0; nothing else of it."""
+def divided(line, *, held):
+    """Products of a session held as `logarithms` of I/I0, as `shares` I/I0, or as `light`: I/I0 times the open field; alone."""
 
     def change(file):
         with h5py.File(line / "session.h5", "r") as session:
@@ -148,8 +148,9 @@ def divided(line, *, logarithms):
             flat = means[f"flat_{kV}_{exposure}_Cu0.05"] - dark
             share = np.maximum(node["frames"][:] - dark, 1.0) / np.maximum(flat, 1.0)
             del node["frames"]
-            node["frames"] = (-np.log(share) if logarithms else share * np.median(flat)).astype(np.float32)
-            node.attrs["corrected"] = "offset+gain+log" if logarithms else "offset+gain"
+            forms = {"logarithms": -np.log(share), "shares": share, "light": share * np.median(flat)}
+            node["frames"] = forms[held].astype(np.float32)
+            node.attrs["corrected"] = "offset+gain+log" if held == "logarithms" else "offset+gain"
 
     return change
 
@@ -192,11 +193,11 @@ def test_single_frames_with_a_twin_are_judged_and_lines_seen_as_they_stand_in_on
     assert "composition_error" in untested(answer)
 
 
-def test_images_divided_by_their_open_field_are_compared_alike_as_light_and_as_logarithms(diagnosed, line):
+def test_images_divided_by_their_open_field_are_compared_alike_as_light_shares_and_logarithms(diagnosed, line):
     words = ("--twin", str(line / "twin.h5"))
     answers = []
-    for logarithms in (True, False):
-        code, answer, lines = diagnosed(divided(line, logarithms=logarithms), *words)
+    for held in ("logarithms", "light", "shares"):
+        code, answer, lines = diagnosed(divided(line, held=held), *words)
         assert code == 0
         assert not lines
         assert answer["verdict"] == "no_gap"
@@ -204,9 +205,32 @@ def test_images_divided_by_their_open_field_are_compared_alike_as_light_and_as_l
         assert {"output_drift", "filtration_error", "row_noise"} <= untested(answer)
         assert "mtf_tail" not in untested(answer)
         answers.append(answer)
-    first, second = answers
-    assert first["gap"]["before"] == pytest.approx(second["gap"]["before"], rel=0.02)
-    assert first["probability_no_gap"] == pytest.approx(second["probability_no_gap"], abs=0.02)
+    first = answers[0]
+    for other in answers[1:]:
+        assert first["gap"]["before"] == pytest.approx(other["gap"]["before"], rel=0.02)
+        assert first["probability_no_gap"] == pytest.approx(other["probability_no_gap"], abs=0.02)
+
+
+def test_a_session_in_fractions_of_its_brightest_flat_is_refused_with_what_to_do(diagnosed):
+    def change(file):
+        for node in file["series"].values():
+            frames = node["frames"][:] / np.float32(50_000.0)
+            del node["frames"]
+            node["frames"] = frames
+
+    code, _, lines = diagnosed(change)
+    assert code == 2
+    assert len(lines) == 1
+    assert "multiply all frames of the file by one factor, darks included, for example 10000" in lines[0]
+
+
+def test_one_dark_of_zeros_among_others_is_a_failure_to_read_it(diagnosed):
+    def change(file):
+        file["series"]["dark_25ms"]["frames"][...] = 0
+
+    code, answer, _ = diagnosed(change)
+    assert code == 0
+    assert answer["warnings"] == ["dark_25ms: every pixel of every frame is 0 DN"]
 
 
 def test_objects_and_darks_without_flats_are_judged_with_a_twin(diagnosed, line):

@@ -3,7 +3,8 @@
 The simulator shares no code with the twin or the virtual lab but the file format. It does share xraylib's cross sections with
 the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
 NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no pixel is
-cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators (`LINES`).
+cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators (`LINES`), a panel
+whose pixels are all alike and see no farther than themselves (`even`), and one that counts (`counting`: darks of zeros).
 Its effects are laws of its own: scatter and
 tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
 gain; K photons are caught under two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced
@@ -35,7 +36,7 @@ from raytwin.acquisition.setting import filters_from_text
 from raytwin.diagnosis.diagnose import diagnose
 
 DARK_SLOPE_DN_PER_MS, OPTICAL = 0.02, 1.05
-DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3, "Gd2O2S": 4.38, "CsI": 4.51}
+DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3, "Gd2O2S": 4.38, "CsI": 4.51, "CdTe": 5.85}
 NAMES = {"Al": "Al", "Pb": "Pb", "H2O": "water"}
 
 
@@ -46,7 +47,8 @@ class LineOf:
     Fields: shape (rows, columns); pixel_mm; near_mm, far_mm (of objects from the source), detector_mm; spread_px; read_DN; dark_DN;
     bits; DN_per_keV; photons: scale of SpekPy's; scintillator: material and mm; edge_keV, line_keV: its K edge and K line; lag_s;
     pause_s (between series); readout_ms; current_mA by kV, copper_times: of it behind copper; anode_deg; beryllium_mm; wedge_mm,
-    water_mm, lead_mm: a step, the slab, the edge.
+    water_mm, lead_mm: a step, the slab, the edge; counting: numbers of photons instead of their energies, and darks of zeros;
+    even: all pixels alike; declared: whether the scintillator and what filters the beam are.
     """
 
     shape: tuple[int, int]
@@ -73,6 +75,9 @@ class LineOf:
     wedge_mm: float
     water_mm: float
     lead_mm: float
+    counting: bool = False
+    even: bool = False
+    declared: bool = True
 
     @property
     def highest_DN(self) -> int:
@@ -216,6 +221,61 @@ LINES = {
         water_mm=40.0,
         lead_mm=2.0,
     ),
+    "even": LineOf(
+        shape=(96, 112),
+        pixel_mm=0.25,
+        near_mm=700.0,
+        far_mm=500.0,
+        detector_mm=1000.0,
+        spread_px=0.0,
+        read_DN=0.6,
+        dark_DN=10.0,
+        bits=16,
+        DN_per_keV=0.012,
+        photons=7e-4,
+        scintillator=("CsI", 3.0),
+        edge_keV=34.5,
+        line_keV=29.5,
+        lag_s=0.3,
+        pause_s=5.0,
+        readout_ms=0.0,
+        current_mA={70.0: 6.0, 120.0: 2.0},
+        copper_times=1.0,
+        anode_deg=14.0,
+        beryllium_mm=0.0,
+        wedge_mm=2.0,
+        water_mm=30.0,
+        lead_mm=1.0,
+        even=True,
+        declared=False,
+    ),
+    "counting": LineOf(
+        shape=(104, 136),
+        pixel_mm=0.2,
+        near_mm=480.0,
+        far_mm=360.0,
+        detector_mm=700.0,
+        spread_px=0.0,
+        read_DN=0.0,
+        dark_DN=0.0,
+        bits=16,
+        DN_per_keV=1.0,
+        photons=7e-4,
+        scintillator=("CdTe", 1.0),
+        edge_keV=26.7,
+        line_keV=23.0,
+        lag_s=0.2,
+        pause_s=6.0,
+        readout_ms=5.0,
+        current_mA={50.0: 6.0, 100.0: 1.0},
+        copper_times=2.0,
+        anode_deg=16.0,
+        beryllium_mm=2.5,
+        wedge_mm=1.5,
+        water_mm=20.0,
+        lead_mm=3.0,
+        counting=True,
+    ),
 }
 ALWAYS = (
     "object_scatter",
@@ -313,12 +373,11 @@ class Line:
         self.name, self.of, self.rng = name, LINES[name], rng
         self.effects = {name.removesuffix("_later"): CASES[name][0] for name in effects if name != "none"}
         self.always = {name.removesuffix("_later") for name in effects if name in ALWAYS}
-        self.gain = (
-            1.0
-            + 0.02 * rng.standard_normal(self.of.shape)
-            + 0.36 * gaussian_filter(rng.standard_normal(self.of.shape), 12)
-        )
-        self.dark_DN = self.of.dark_DN + 8.0 * rng.standard_normal(self.of.shape)
+        pattern = 0.02 * rng.standard_normal(self.of.shape)
+        pattern = pattern + 0.36 * gaussian_filter(rng.standard_normal(self.of.shape), 12)
+        self.gain = np.ones(self.of.shape) if self.of.even else 1.0 + pattern
+        each_DN = 8.0 * rng.standard_normal(self.of.shape)
+        self.dark_DN = self.of.dark_DN + (0.0 if self.of.even or self.of.counting else each_DN)
         self.aluminium_mm = 2.1 + 0.2 * rng.standard_normal()
         self.kV_share = 1.0 + 0.004 * rng.standard_normal()
         y, x = np.indices(self.of.shape)
@@ -337,6 +396,14 @@ class Line:
             self.changed_gain.flat[rng.choice(self.of.shape[0] * self.of.shape[1], count, replace=False)] = 0.0
         self.direction = rng.uniform(0.0, 2.0 * math.pi)
 
+    def signals(self, arriving: np.ndarray, energies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance, DN and DN^2, of photons (row, column, energy)."""
+        if self.of.counting:
+            counts = arriving.sum(axis=-1)
+            return counts, counts
+        optical = 1.0 if self.of.even else OPTICAL
+        return self.of.DN_per_keV * (arriving @ energies), optical * self.of.DN_per_keV**2 * (arriving @ energies**2)
+
     def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
         """Energies, keV, and photons (row, column, energy) that the panel absorbs of an exposure of the open field."""
         voltage = kV * self.kV_share * (1.0 + on.get("kv_error", 0.0) / 100.0)
@@ -344,7 +411,7 @@ class Line:
         arriving = photons * mAs * self.illumination[..., None]
         if "heel" in on:
             tungsten = attenuation_per_mm("W", energies)
-            signal = photons * energies
+            signal = photons if self.of.counting else photons * energies
             # so much more tungsten from one side to the other as takes away that share of the beam
             thick_mm = on["heel"] / 100.0 * float(signal.sum()) / float(signal @ tungsten)
             along = (np.arange(self.of.shape[1]) / (self.of.shape[1] - 1) - 0.5)[None, :, None]
@@ -363,7 +430,7 @@ class Line:
     ) -> tuple:
         """Mean and variance of one exposure before the spread of light, DN and DN^2, and K photons and what they leave."""
         energies, arriving = self.open_light(kV, mAs, copper_mm, on)
-        open_DN = self.of.DN_per_keV * (arriving @ energies)
+        open_DN, _ = self.signals(arriving, energies)
         depth = np.zeros((*self.of.shape, 1))
         apart_px = [on.get("misregistration", 0.0) * turn(self.direction) for turn in (math.cos, math.sin)]
         for material, stated_mm in scene.items():
@@ -377,8 +444,7 @@ class Line:
             caught = arriving @ share
             remote = caught, (arriving @ (share * (energies - self.of.line_keV))) / np.maximum(caught, 1e-30)
             arriving = arriving * (1.0 - share)
-        signal = self.of.DN_per_keV * (arriving @ energies)
-        variance = OPTICAL * self.of.DN_per_keV**2 * (arriving @ energies**2)
+        signal, variance = self.signals(arriving, energies)
         if scene and "object_scatter" in on:
             source = np.pad(signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0)), 200)
             wide = gaussian_filter(source, 18.0 / self.of.pixel_mm)[200:-200, 200:-200]
@@ -413,7 +479,7 @@ class Line:
             level = (
                 level
                 + self.dark_DN
-                + DARK_SLOPE_DN_PER_MS * exposure_ms
+                + (0.0 if self.of.counting else DARK_SLOPE_DN_PER_MS) * exposure_ms
                 + on.get("dark_drift", 0.0) * exposure_ms / 160.0
             )
             level = level + self.of.read_DN * self.rng.standard_normal(self.of.shape)
@@ -478,15 +544,15 @@ def make_session(path: Path, name: str, effect: str, rng: np.random.Generator, f
     instrument = Instrument(
         anode="W",
         anode_angle_deg=of.anode_deg,
-        inherent_filtration=filters_from_text(f"Be:{of.beryllium_mm:g}"),
+        inherent_filtration=filters_from_text(f"Be:{of.beryllium_mm:g}") if of.declared else (),
         source_object_mm=of.near_mm,
         source_detector_mm=of.detector_mm,
         pixel_mm=of.pixel_mm,
         detector="area",
-        counting=False,
-        scintillator=filters_from_text(scintillator),
+        counting=of.counting,
+        scintillator=filters_from_text(scintillator) if of.declared else (),
         bits=of.bits,
-        readout_ms=of.readout_ms,
+        readout_ms=of.readout_ms if of.declared else None,
     )
     known, highest_kV = scenes(of), max(of.current_mA)
     with write_acquisition(path, instrument) as writer:

@@ -1,0 +1,52 @@
+"""Detectors without a dark level and without electronic noise: panels that count, and simulated ones."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from raytwin.acquisition import open_acquisition
+from raytwin.diagnosis.diagnose import diagnose
+from raytwin.lab.effects import request_from_text
+from raytwin.lab.protocols import run_protocol
+from raytwin.lab.session import GEOMETRIES, session_system
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory):
+    """What is said of a short session of a silent detector with an effect; of each session once."""
+    folder = tmp_path_factory.mktemp("silent")
+    drawn = session_system(2071, rows=48, columns=48, geometry=GEOMETRIES["coarse"])
+    silent = replace(
+        drawn, read_noise_DN=0.0, dark_DN=0.1, dark_spread_DN=0.0, dark_current_DN_per_ms=0.0, hot_pixels=0
+    )
+
+    def run(effect=""):
+        path = folder / f"{effect or 'none'}.h5"
+        effects = (request_from_text(effect),) if effect else ()
+        run_protocol(
+            path, protocol="short", seed=2071, system=silent, geometry="coarse", frames=10, products=1, effects=effects
+        )
+        with h5py.File(path) as file:
+            darks = (node for node in file["series"].values() if node.attrs["kind"] == "dark")
+            assert not min(darks, key=lambda node: node.attrs["index"])["frames"][:].any()
+        with open_acquisition(path) as acquisition:
+            return diagnose(acquisition, rng=np.random.default_rng(1))
+
+    return run
+
+
+def test_darks_of_exact_zeros_are_compared_and_show_no_gap(diagnosed):
+    found = diagnosed()
+    assert found.verdict == "no_gap"
+    assert not found.warnings
+
+
+@pytest.mark.parametrize(
+    ("effect", "low", "high"), [("image_lag=1", 0.7, 1.4), ("output_drift=1", 0.5, 2.0), ("kv_error=2", 1.7, 2.3)]
+)
+def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, low, high):
+    found = diagnosed(effect)
+    assert found.named == (effect.split("=")[0],)
+    assert low < found.causes[0].strength[0] < high

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
@@ -59,9 +60,10 @@ def calibrate_twin(
         InputError: the session cannot calibrate anything; the message says what is missing.
     """
     tell = progress or (lambda stage: None)
+    acquisition, cut_off = without_cut_off_darks(acquisition)
     _prepare_spectra(acquisition, tell=tell, advise=advise)
     transfer = compute_photon_transfer(acquisition, estimator=estimator, repeated=repeated, progress=tell)
-    warnings = list(transfer.warnings)
+    warnings = [*cut_off, *transfer.warnings]
     evidence = dict(transfer.evidence)
     spectral = None
     if any(level.kV is not None for level in transfer.levels):

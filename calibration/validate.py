@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
+from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..files import sha256_of_file
@@ -164,6 +165,7 @@ def validate_twin(
         InputError: no flat that can be compared, another detector, or no darks.
     """
     tell = progress or (lambda name: None)
+    acquisition, cut_off = without_cut_off_darks(acquisition)
     flats = [item for item in acquisition.of_kind("flat") if not item.corrected & {"log", "gain"}]
     held_back = [item for item in flats if item.role == "evaluation"]
     chosen = held_back or flats
@@ -188,7 +190,7 @@ def validate_twin(
     }
     calibrated = {name for level in twin.levels for name in level.series}
     same_session = sha256_of_file(acquisition.path) in str(twin.provenance.get("acquisition_sha256", "")).split("+")
-    rows, skipped = [], []
+    rows, skipped = [], [*cut_off]
     for item in chosen:
         tell(item.name)
         setting = item.setting

@@ -130,6 +130,7 @@ def build_problem(
     variants: Sequence[Variant],
     calibrated_elsewhere: bool = False,
     exposed: Sequence[Series] = (),
+    ends_at_zero: frozenset[str] = frozenset(),
     side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
@@ -141,7 +142,7 @@ def build_problem(
         variants: effects to try.
         calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
             marked as calibrating).
-        exposed: as in `read_session`.
+        exposed, ends_at_zero: as in `read_session`.
         side: of the squares of the panel's pixels that the acquisition has for pixels.
         progress: called with the name of each stage.
 
@@ -149,7 +150,9 @@ def build_problem(
         InputError: nothing that can be judged: no darks and flats, or another detector than the twin's.
     """
     tell = progress or (lambda stage: None)
-    session = read_session(acquisition, calibrated_elsewhere=calibrated_elsewhere, exposed=exposed)
+    session = read_session(
+        acquisition, calibrated_elsewhere=calibrated_elsewhere, exposed=exposed, ends_at_zero=ends_at_zero
+    )
     requests = [item.request for item in session]
     variants = with_pauses(variants, stated=all(item.pause_stated for item in requests[1:]))
     conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
@@ -157,7 +160,7 @@ def build_problem(
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     conditions |= beam_conditions(base, requests, cache=cache)
     model = ForwardModel(base=base, conditions=conditions, cache=cache)
-    measured = _measured(session, acquisition, twin, model, tell=tell)
+    measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
     expected = measured.expected
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
@@ -203,6 +206,7 @@ def _measured(
     twin: Twin,
     model: ForwardModel,
     *,
+    side: int,
     tell: Callable[[str], None],
 ) -> _Measured:
     """Two passes over the frames: which pixels and series can be used, then what these say; scenes are found in between.
@@ -211,7 +215,7 @@ def _measured(
         InputError: no series that can be compared.
     """
     known_good = twin.maps.bad_pixels == 0
-    seen = _seen_series(session, acquisition, model, good=known_good, tell=tell)
+    seen = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
     maps = calibrated_maps(seen.kept, seen.expected, seen.looks, twin=twin, good=known_good)
     outlying = new_outliers(seen.kept, seen.expected, seen.looks, maps)
     clean = maps.good & ~outlying
@@ -239,6 +243,7 @@ def _seen_series(
     model: ForwardModel,
     *,
     good: NDArray[np.bool_],
+    side: int,
     tell: Callable[[str], None],
 ) -> SeenSeries:
     """Series that the base twin can be compared with, and a first look at their frames.
@@ -262,6 +267,8 @@ def _seen_series(
         expected,
         good=good,
         bits=acquisition.instrument.bits,
+        dark_at=model.base.maps.dark_at,
+        side=side,
         skipped=skipped,
         tell=tell,
     )
@@ -322,7 +329,7 @@ class _Compared:
         """One series: its templates and projections, and what every change does to it."""
         measured, session = self.measured, self.measured.expected
         moved = session.moved(one, self.asked)
-        frame = mean_frame(one, measured.pictures[one.name], session.maps, clean=measured.clean, side=self.side)
+        frame = mean_frame(one, measured.pictures[one.name], session.maps, side=self.side)
         probes = series_probes(
             session,
             one,
@@ -330,7 +337,6 @@ class _Compared:
             summary=measured.summaries[one.name],
             moved=moved,
             variants=self.variants,
-            clean=measured.clean,
             all_outliers=measured.outliers,
             memory=measured.memory.get(one.name),
         )

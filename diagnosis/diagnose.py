@@ -54,6 +54,9 @@ _SHARP_CHANCE = {
 # photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of scatter's log evidence goes to another
 # effect, 0.016 where 40 % of scatter filled a wide field
 _LOOSE = {"object_scatter": 0.02}
+# beside 16 scatters of 3 to 40 % alone these gained nothing (2 and 350 of an evidence of 1.5e7 a focal spot), a dark drift 3e-3 of it, a
+# tail, K fluorescence and a lag 3e-4
+_SHARP = frozenset(("motion_blur", "misregistration", "focal_spot"))
 # traps are more than a law of two knows: in eight sessions with lags of 0.5-4 % alone a dark drift gained up to 4e-5 of lag's
 # evidence, beside three since the calibration 4e-4, 5e-4 and 2.5e-3
 _LEFT = {("image_lag", "always"): 2e-4, ("image_lag", "calibration"): 1e-3}
@@ -156,6 +159,7 @@ def diagnose(
             variants=catalogue_variants(without=left_out, side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
             exposed=session.exposed,
+            ends_at_zero=session.ends_at_zero,
             side=session.factor,
             progress=progress,
         )
@@ -273,7 +277,7 @@ def judge(
     sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
     chance = _SHARP_CHANCE if sharp else _CHANCE
     unknown = unknown_evidence(residual, shared, problem.parts, problem.part_names)
-    doubts = Doubts(chance=chance, loose=_LOOSE, left=_LEFT, told=_TOLD, elsewhere=_elsewhere(problem))
+    doubts = Doubts(chance=chance, loose=_LOOSE, sharp=_SHARP, left=_LEFT, told=_TOLD, elsewhere=_elsewhere(problem))
 
     def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(

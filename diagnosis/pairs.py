@@ -62,6 +62,7 @@ class Doubts:
         chance: log evidence that sessions without it show, beyond what the nuisances allow; taken off.
         loose: effects whose law leaves something where it predicts nothing, and the share of their log evidence, in place of
             PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
+        sharp: effects that change edges alone, which nothing that such a law leaves looks like: not doubted for it.
         left: share of its log evidence that what is wrong with its law may give a second one, where it is not PAIR_DOUBT_STRONG;
             by effect and onset.
         told: effects that pixels or codes of their own tell, which no other effect's law can leave: found at the least that is
@@ -71,6 +72,7 @@ class Doubts:
 
     chance: Mapping[str, float] = field(default_factory=dict)
     loose: Mapping[str, float] = field(default_factory=dict)
+    sharp: frozenset[str] = frozenset()
     left: Mapping[tuple[str, str], float] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     elsewhere: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
@@ -170,11 +172,12 @@ class _SecondDoubted:
         doubts = self._doubts
         strong, weak = sorted(pair.effects, key=lambda effect: -self._singles[effect].log_evidence)
         stronger = max(self._singles[strong].log_evidence, 0.0)
-        doubt = doubts.loose.get(strong, PAIR_DOUBT) * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
+        loose = strong in doubts.loose and weak not in doubts.sharp
+        doubt = (doubts.loose[strong] if loose else PAIR_DOUBT) * stronger + PAIR_DOUBT_ROOT * math.sqrt(stronger)
         curves = {curve.effect: curve for curve in (pair.first, pair.second)}
         # what a law that is nearly right leaves is taken up by whatever can take it, at the least that is plausible
         at_bottom = weak not in doubts.told and strengths[weak] < _AT_BOTTOM * curves[weak].low
-        if strong not in doubts.loose and not at_bottom:
+        if not loose and not at_bottom:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlap
             shared = 1.0 + PAIR_DOUBT_SHARED * overlap**2
             leaves = (

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.coarser import coarser
+from ..acquisition.cut_off import share_of_zeros, without_cut_off_darks
 from ..calibration.calibrate import calibrate_twin
 from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
@@ -29,7 +30,8 @@ class PreparedSession:
     Fields: acquisition (less the series that cannot be used); exposed (of these, saturated series: what they left in the panel is
     known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
     wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at); factor (pixels along
-    each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels).
+    each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels);
+    ends_at_zero (names of lit series whose numbers go down to 0 and not below).
     """
 
     acquisition: AcquisitionFile
@@ -41,6 +43,7 @@ class PreparedSession:
     notes: tuple[str, ...]
     factor: int
     all_pixels: AcquisitionFile
+    ends_at_zero: frozenset[str]
 
 
 def calibrated_twin(
@@ -69,6 +72,8 @@ def prepare_session(
     """
     tell = progress or (lambda stage: None)
     all_pixels, left_out = _of_one_shape(acquisition, twin)
+    all_pixels, cut_off = without_cut_off_darks(all_pixels)
+    left_out += cut_off
     factor = 1 if twin is not None else coarse_factor(all_pixels.series[0].shape)
     acquisition = coarser(all_pixels, factor)
     names = calibrating_names(acquisition.series)
@@ -107,6 +112,9 @@ def prepare_session(
         left_out=tuple(left_out),
         notes=notes,
         factor=factor,
+        ends_at_zero=frozenset(
+            item.name for item in all_pixels.series if item.kind in ("flat", "object") and share_of_zeros(item) > 0.0
+        ),
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
         ),

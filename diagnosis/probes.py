@@ -155,7 +155,8 @@ class ScalarContext:
     noise alone leaves of a pattern in the corrected mean frame; quantum_DN2: the base model's quantum variance of one frame;
     dark_DN: the base model's mean dark;
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
-    of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; areas: the
+    of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; whole_lines: good pixels fill
+    rows and columns, so that noise of these is seen; areas: the
     good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
@@ -174,6 +175,7 @@ class ScalarContext:
     counts_all_outliers: bool
     gain: NDArray[np.floating] | None = None
     averaged: int = 1
+    whole_lines: bool = True
     areas: "Areas" = field(init=False)
     label_gain: NDArray[np.float64] = field(init=False)
 
@@ -241,20 +243,21 @@ def expected_scalars(
             for known, correlation, line in zip(correlation_names, correlations, lines, strict=True):
                 values[known] = (q * correlation + shared + line) / here
         line_q = mean_q * keep
-        values["row_ratio"] = math.log(
-            max(
-                (row + moving.rows()) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w,
-                1e-12,
+        if context.whole_lines:
+            values["row_ratio"] = math.log(
+                max(
+                    (row + moving.rows()) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w,
+                    1e-12,
+                )
+                / total
             )
-            / total
-        )
-        values["column_ratio"] = math.log(
-            max(
-                (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w,
-                1e-12,
+            values["column_ratio"] = math.log(
+                max(
+                    (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w,
+                    1e-12,
+                )
+                / total
             )
-            / total
-        )
         values["block_ratio"] = math.log(
             max(
                 line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX)

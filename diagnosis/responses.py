@@ -29,6 +29,7 @@ Moved = tuple[
 ]  # change of a corrected mean frame, DN, and the scalar probes under the change, by name
 Known = dict[object, tuple[ExpectedSeries, Map, dict[str, float]]]
 _NO_DISPLACEMENT = {ALONG_ROWS: 0.0, ALONG_COLUMNS: 0.0}
+_WHOLE_LINES = 0.98  # share of the pixels in use that a series must show for noise of rows and columns
 _CODES_SHARE, _CODES_FRAMES = (
     0.02,
     16,
@@ -267,6 +268,7 @@ def _context(
     counts_all: bool,
 ) -> ScalarContext:
     """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it."""
+    in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
     squared = signal_DN**2 if lit else 0.0
     noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + maps.dark_noise(item)
@@ -289,6 +291,7 @@ def _context(
         counts_all_outliers=counts_all,
         gain=maps.gain if lit and "gain" not in item.series.corrected else None,
         averaged=item.request.exposures_per_frame,
+        whole_lines=int(clean.sum()) > _WHOLE_LINES * in_use,
     )
 
 

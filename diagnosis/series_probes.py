@@ -28,7 +28,6 @@ from .registration import render_variance
 from .responses import Moved, SeriesModel, SessionModel
 from .summaries import LEAST_NOISE_DN2, SeriesSummary
 
-_ABOVE_NOISE = 4.0  # standard deviations of a frame
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
@@ -138,21 +137,18 @@ def mean_frame(
     corrected_DN: NDArray[np.float64],
     maps: CalibratedMaps,
     *,
-    clean: NDArray[np.bool_],
     side: int,
 ) -> MeanFrame:
     """A series' corrected mean frame (row, column) against the model.
 
-    clean: pixels in use that do not stand out (row, column); side: of the squares of the panel's pixels that stand for pixels.
+    side: of the squares of the panel's pixels that stand for pixels.
     """
-    shape, frames, expected = clean.shape, one.session.series.n_frames, one.expected
+    clean, frames, expected = one.context.good, one.session.series.n_frames, one.expected
+    shape = clean.shape
     signal = signal_map(expected, shape)
     mask = clean if one.placement is None else inside(clean, one.placement)
     quantum = full_size(expected.quantum_variance_DN2, shape)
     white = np.maximum(full_size(expected.white_variance_DN2, shape), LEAST_NOISE_DN2)
-    if one.session.shares:
-        # where noise reaches below 0 a logarithm has cut it off
-        mask = mask & (signal > _ABOVE_NOISE * np.sqrt(quantum + white))
     quantum = quantum / frames + signal**2 * maps.gain_quantum
     white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session)
     if one.session.series.kind == "object":
@@ -182,7 +178,6 @@ def series_probes(
     summary: SeriesSummary,
     moved: Sequence[Moved | None],
     variants: Sequence[Variant],
-    clean: NDArray[np.bool_],
     all_outliers: int,
     memory: tuple[float, int] | None,
 ) -> SeriesProbes:
@@ -195,7 +190,6 @@ def series_probes(
         summary: what its frames' noise says.
         moved: what the changes do to it, those of variants' strengths first.
         variants: effects to try; the mean frame is projected on what each does at its first strength.
-        clean: pixels in use that do not stand out (row, column).
         all_outliers: pixels that stand out in any series.
         memory: of outlying pixels in this series, see `memory_of`.
     """
@@ -207,7 +201,7 @@ def series_probes(
         white_DN2=frame.white_DN2,
         autocovariance_table=one.expected.noise_autocovariance,
     )
-    kind, good = one.session.series.kind, session.maps.good
+    kind, good, clean = one.session.series.kind, session.maps.good, one.context.good
     pattern, outliers = None, None
     if kind in ("flat", "dark"):
         lit = frame.signal_DN if kind == "flat" else None

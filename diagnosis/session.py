@@ -25,7 +25,7 @@ class SessionSeries:
 
     own_noise: the flats that calibrate its beam are single frames, so that the twin has the noise from series like this one.
     divided: its frames were divided by an open field measured elsewhere, so that their level says nothing.
-    shares: they are I/I0, or logarithms of it.
+    shares: they are I/I0, or logarithms of it. ends_at_zero: its numbers go down to 0 and not below, so that noise may be cut off.
     """
 
     series: Series
@@ -35,6 +35,7 @@ class SessionSeries:
     own_noise: bool = False
     divided: bool = False
     shares: bool = False
+    ends_at_zero: bool = False
 
     @property
     def name(self) -> str:
@@ -167,7 +168,11 @@ def _on_one_clock(series: Sequence[Series]) -> bool:
 
 
 def read_session(
-    acquisition: AcquisitionFile, *, calibrated_elsewhere: bool = False, exposed: Sequence[Series] = ()
+    acquisition: AcquisitionFile,
+    *,
+    calibrated_elsewhere: bool = False,
+    exposed: Sequence[Series] = (),
+    ends_at_zero: frozenset[str] = frozenset(),
 ) -> tuple[SessionSeries, ...]:
     """The series of an acquisition in order of time, each with its request to the forward model.
 
@@ -176,6 +181,7 @@ def read_session(
         calibrated_elsewhere: the twin comes from another session and no series here is marked as calibrating: all were
             taken after calibration.
         exposed: series of the same session that tell nothing by themselves, but left charge in the panel where their load is known.
+        ends_at_zero: names of series whose numbers go down to 0 and not below.
 
     Raises:
         InputError: no series that the diagnosis can use.
@@ -258,7 +264,8 @@ def read_session(
                 after=after,
                 own_noise=item.kind != "dark" and beam_of(item) in noiseless,
                 divided=bool(item.corrected & {"gain", "log"}),
-                shares=holds_shares(item),
+                shares=(shares := holds_shares(item)),
+                ends_at_zero=shares or item.name in ends_at_zero,
             )
         )
     return tuple(result)

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.series import ExpectedSeries
-from .even_maps import signal_map
+from .even_maps import full_size, signal_map
 from .session import SessionSeries
-from .summaries import FirstLook, SeriesSummary, look_at_series, summarise_series
+from .summaries import LEAST_NOISE_DN2, FirstLook, SeriesSummary, look_at_series, summarise_series
 
+_ABOVE_NOISE = 4.0  # standard deviations of one exposure of one pixel
 _LABEL_PIXELS = 150  # that a noise label needs
 _MOST_SATURATED = 1e-3  # share of the pixels
 
@@ -21,13 +22,15 @@ _MOST_SATURATED = 1e-3  # share of the pixels
 class SeenSeries:
     """Series that can be compared, in order of time, and what a first pass over their frames shows, by name.
 
-    Fields: kept; expected: by the base twin; looks; labels (row, column): noise label of each pixel, -1: none; label_names;
+    Fields: kept; expected: by the base twin; looks; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
+    column): noise label of each pixel, -1: none; label_names;
     saturation_DN: end of the ADC's range, None: unknown; skipped: what is said of series that are left out.
     """
 
     kept: tuple[SessionSeries, ...]
     expected: dict[str, ExpectedSeries]
     looks: dict[str, FirstLook]
+    readable: dict[str, NDArray[np.bool_]]
     labels: dict[str, NDArray[np.int64]]
     label_names: dict[str, tuple[str, ...]]
     saturation_DN: float | None
@@ -83,16 +86,20 @@ def look_at_all(
     *,
     good: NDArray[np.bool_],
     bits: int | None,
+    dark_at: Callable[[float | None], NDArray[np.floating]],
+    side: int,
     skipped: Sequence[str],
     tell: Callable[[str], None],
 ) -> SeenSeries:
-    """First pass over the frames; saturated series are left out.
+    """First pass over the frames; series that are saturated, or nearly all cut off at 0, are left out.
 
     Args:
         items: series to look at.
         expected: by the base twin, by name.
         good: pixels in use (row, column).
         bits: of the ADC; None: unknown.
+        dark_at: dark (row, column) of an exposure time, ms.
+        side: of the squares of the panel's pixels that stand for pixels.
         skipped: what is said of series that were left out before.
         tell: called with the name of each stage.
     """
@@ -100,10 +107,20 @@ def look_at_all(
     looks: dict[str, FirstLook] = {}
     labels: dict[str, NDArray[np.int64]] = {}
     label_names: dict[str, tuple[str, ...]] = {}
-    saturated: dict[str, str] = {}
+    readable: dict[str, NDArray[np.bool_]] = {}
+    left_out: dict[str, str] = {}
     for item in items:
-        signal = signal_map(expected[item.name], good.shape)
-        labels[item.name], label_names[item.name] = _labels(signal, float(signal.max()), item.series.kind, good)
+        model = expected[item.name]
+        signal = signal_map(model, good.shape)
+        readable[item.name] = np.ones(good.shape, dtype=bool)
+        if item.ends_at_zero and item.request.beam_on:
+            readable[item.name] = _above_noise(item, model, signal, dark_at=dark_at, side=side)
+            if (readable[item.name] & good).sum() < _LABEL_PIXELS:
+                left_out[item.name] = f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels"
+                continue
+        labels[item.name], label_names[item.name] = _labels(
+            signal, float(signal.max()), item.series.kind, good & readable[item.name]
+        )
         tell(f"frames of {item.name}")
         looks[item.name] = look_at_series(
             item.series.iter_frames(),
@@ -114,15 +131,16 @@ def look_at_all(
         )
         full = looks[item.name].saturated_share
         if full > _MOST_SATURATED and item.series.kind != "dark":
-            saturated[item.name] = f"{item.name}: saturated in {100 * full:.2g} % of the pixels"
+            left_out[item.name] = f"{item.name}: saturated in {100 * full:.2g} % of the pixels"
     return SeenSeries(
-        kept=tuple(item for item in items if item.name not in saturated),
+        kept=tuple(item for item in items if item.name not in left_out),
         expected=expected,
         looks=looks,
+        readable=readable,
         labels=labels,
         label_names=label_names,
         saturation_DN=saturation_DN,
-        skipped=(*skipped, *saturated.values()),
+        skipped=(*skipped, *left_out.values()),
     )
 
 
@@ -133,15 +151,35 @@ def summarise_all(
     summaries: dict[str, SeriesSummary] = {}
     for item in seen.kept:
         tell(f"frames of {item.name} without outliers")
+        good = clean & seen.readable[item.name]
         summaries[item.name] = summarise_series(
             item.series.iter_frames(),
-            good=clean,
+            good=good,
             labels=seen.labels[item.name],
-            pattern=_pattern(item, signal_map(seen.expected[item.name], clean.shape), clean),
+            pattern=_pattern(item, signal_map(seen.expected[item.name], good.shape), good),
             name=f"series {item.name}",
             saturation_DN=seen.saturation_DN,
         )
     return summaries
+
+
+def _above_noise(
+    item: SessionSeries,
+    expected: ExpectedSeries,
+    signal_DN: NDArray[np.float64],
+    *,
+    dark_at: Callable[[float | None], NDArray[np.floating]],
+    side: int,
+) -> NDArray[np.bool_]:
+    """Pixels (row, column) whose numbers lie so far above 0 that no noise was cut off there."""
+    subtracted = item.shares or "offset" in item.series.corrected
+    number_DN = signal_DN if subtracted else signal_DN + dark_at(item.series.exposure_ms)
+    variance = full_size(expected.quantum_variance_DN2, signal_DN.shape) + full_size(
+        expected.white_variance_DN2, signal_DN.shape
+    )
+    # it was cut off before pixels or exposures were averaged
+    one_DN = side * np.sqrt(item.request.exposures_per_frame * np.maximum(variance, LEAST_NOISE_DN2))
+    return np.asarray(number_DN > _ABOVE_NOISE * one_DN)
 
 
 def _pattern(item: SessionSeries, signal: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64] | None:

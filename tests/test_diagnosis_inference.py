@@ -620,6 +620,8 @@ def test_what_a_law_leaves_is_asked_of_a_second_effect_in_proportion_to_the_firs
     assert weigh(residual, without, made, doubts={"left": {("strong", "always"): 1e-3}})[0].effects == alone
     assert weigh(residual, without, made, doubts={"left": {("weak", "always"): 1e-3}})[0].effects == pair
     assert weigh(residual, without, made, doubts={"loose": {"strong": 0.02}})[0].effects == alone
+    sharp = {"loose": {"strong": 0.02}, "sharp": frozenset(("weak",))}
+    assert weigh(residual, without, made, doubts=sharp)[0].effects == pair
     assert weigh(residual, without, made, doubts={"loose": {"weak": 0.02}})[0].effects == pair
     plain = residual + 14.0 * weak
     assert weigh(plain, without, made, doubts={"loose": {"strong": 1e-5}})[0].effects == pair

@@ -50,3 +50,29 @@ def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, low, 
     found = diagnosed(effect)
     assert found.named == (effect.split("=")[0],)
     assert low < found.causes[0].strength[0] < high
+
+
+@pytest.mark.slow
+def test_a_camera_that_subtracts_its_own_dark_cuts_noise_off_at_0(tmp_path):
+    path = tmp_path / "session.h5"
+    drawn = session_system(2072, rows=48, columns=48, geometry=GEOMETRIES["coarse"])
+    noisy = replace(drawn, read_noise_DN=20.0, hot_pixels=0)
+    run_protocol(path, protocol="full", seed=2072, system=noisy, geometry="coarse", frames=6, products=1)
+    with h5py.File(path, "r+") as file:
+        series = file["series"].values()
+        first = min((one for one in series if one.attrs["kind"] == "dark"), key=lambda one: one.attrs["index"])
+        dark, exposure_ms = first["frames"][:].mean(axis=0), first.attrs["exposure_ms"]
+        growth = noisy.dark_current_DN_per_ms
+        shadow = 0.0
+        for one in series:
+            left = one["frames"][:] - dark - growth * (one.attrs["exposure_ms"] - exposure_ms)
+            one["frames"][...] = np.clip(np.round(left), 0, 65535)
+            if one.attrs["kind"] == "object":
+                shadow = max(shadow, float(np.mean(one["frames"][:] == 0)))
+    # the step's lead end is dark enough for it
+    assert shadow > 0.02
+    with open_acquisition(path) as acquisition:
+        found = diagnose(acquisition, rng=np.random.default_rng(1))
+    assert found.verdict == "no_gap"
+    assert any("so that noise below 0 was cut off" in line for line in found.warnings)
+    assert any("as by a camera that subtracts its own dark" in line for line in found.warnings)

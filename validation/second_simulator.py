@@ -328,6 +328,16 @@ PAIRS = (
     "nonlinearity+motion_blur",
 )
 UNKNOWN = ("tiles", "wandering_tiles")
+NOT_OF_COUNTS = (
+    "row_noise",
+    "dark_drift",
+    "k_fluorescence",
+)  # electronics' and energies', of which numbers of photons are free
+
+
+def cases_of(of: LineOf) -> list[str]:
+    """Effects, and pairs of them, that a line can have."""
+    return [case for case in (*CASES, *PAIRS) if not (of.counting and set(case.split("+")) & set(NOT_OF_COUNTS))]
 
 
 def attenuation_per_mm(material: str, energies_keV: np.ndarray) -> np.ndarray:
@@ -473,7 +483,8 @@ class Line:
         shown = []
         for _ in range(count):
             level = np.zeros(self.of.shape) if lit is None else self._exposure(*lit, on, after)
-            held = level * (1.0 - lag) + released * self.charge_DN
+            freed = released * self.charge_DN
+            held = level * (1.0 - lag) + (self.rng.poisson(freed) if self.of.counting else freed)
             self.charge_DN = (1.0 - released) * self.charge_DN + lag * level
             level = held if "image_lag" in on else level
             level = (
@@ -499,9 +510,13 @@ class Line:
     def _exposure(
         self, signal: np.ndarray, variance: np.ndarray, remote: tuple | None, on: dict, after: bool
     ) -> np.ndarray:
-        quanta = np.sqrt(variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)) * self.rng.standard_normal(
-            self.of.shape
-        )
+        variance = variance * (1.0 + on.get("excess_noise", 0.0) / 100.0)
+        if (
+            self.of.counting
+        ):  # none is seen of a fraction of a photon: a Gaussian cut off at 0 would brighten deep shadows
+            quanta = self.rng.poisson(variance) - variance
+        else:
+            quanta = np.sqrt(variance) * self.rng.standard_normal(self.of.shape)
         level = gaussian_filter(signal, self.of.spread_px) + gaussian_filter(quanta, self.of.spread_px, mode="wrap")
         if remote is not None:
             photons = remote[0] + np.sqrt(remote[0]) * self.rng.standard_normal(self.of.shape)
@@ -630,13 +645,11 @@ def run() -> None:
     parser.add_argument("--line", choices=LINES, default="usual", help="which line (default usual)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=20, help="of a series (default 20)")
-    parser.add_argument(
-        "--only", nargs="+", choices=[*sorted(CASES), *PAIRS], default=[*CASES, *PAIRS], metavar="EFFECT"
-    )
+    parser.add_argument("--only", nargs="+", choices=[*sorted(CASES), *PAIRS], metavar="EFFECT")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     rows = []
-    for effect in options.only:
+    for effect in options.only or cases_of(LINES[options.line]):
         row = judged(options.line, effect, options.seed, options.frames)
         rows.append(row)
         told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())

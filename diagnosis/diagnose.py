@@ -54,8 +54,8 @@ _SHARP_CHANCE = {
 # photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of scatter's log evidence goes to another
 # effect, 0.016 where 40 % of scatter filled a wide field
 _LOOSE = {"object_scatter": 0.02}
-# beside 16 scatters of 3 to 40 % alone these gained nothing (a focal spot 2, once 350 of an evidence of 1.5e7), a dark drift up to 3e-3
-# of scatter's evidence, a tail, K fluorescence and a lag 3e-4
+# beside 16 scatters of 3 to 40 % alone these gained nothing (a focal spot 2, once 350 of an evidence of 1.5e7), a dark drift up to
+# 3e-3 of scatter's evidence, a tail, K fluorescence and a lag 3e-4
 _SHARP = frozenset(("motion_blur", "misregistration", "focal_spot"))
 # traps are more than a law of two knows: in eight sessions with lags of 0.5-4 % alone a dark drift gained up to 4e-5 of lag's
 # evidence, beside three since the calibration 4e-4, 5e-4 and 2.5e-3

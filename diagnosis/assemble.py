@@ -114,9 +114,9 @@ class Problem:
         """With further variants and their responses (strength, probe)."""
         curves = []
         for variant, responses in more:
-            # what an effect does by chance depends on its onset (lost bits lower later levels only), and may on the rest
+            # what an effect does by chance depends on its onset (lost bits lower later levels only), and on the direction of a heel
             alike = [item for item in self.curves if (item.effect, item.since) == (variant.effect, variant.since)]
-            like = next((item for item in alike if item.parameters == variant.parameters), alike[0])
+            like = next((item for item in alike if item.variant == variant.refined_from), alike[0])
             curves.append(variant.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact))
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
@@ -159,7 +159,8 @@ def build_problem(
     known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     conditions |= beam_conditions(base, requests, cache=cache)
-    model = ForwardModel(base=base, conditions=conditions, cache=cache)
+    own_maps = any(item.calibrates for item in session)
+    model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps, cache=cache)
     measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
     expected = measured.expected
     tell("responses")

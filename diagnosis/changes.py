@@ -144,7 +144,8 @@ class Variant:
     """An effect with its inner parameters fixed.
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
-    the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here.
+    the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
+    refined_from: name of the variant that was refined to be this one, None: not refined.
     """
 
     effect: str
@@ -156,6 +157,7 @@ class Variant:
     high: float
     strengths: tuple[float, ...]
     fitted: tuple[Parameter, ...] = ()
+    refined_from: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
 
     def curve(
@@ -179,6 +181,17 @@ class Variant:
             spread=spread,
             jitter=jitter,
             exact=exact,
+        )
+
+    def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
+        """The same with other inner parameters, asked at other strengths; its name says where it came from."""
+        label = ", ".join(f"{name} {value:.3g}" for name, value in parameters.items())
+        return replace(
+            self,
+            parameters=dict(parameters),
+            name=f"{label}, refined from {self.name}".strip(", "),
+            strengths=tuple(strengths),
+            refined_from=self.name,
         )
 
     def applied(self, strength: float) -> AppliedEffect:

@@ -21,6 +21,7 @@ _CACHE_BYTES = 200_000_000
 _KNOW_WHEN = frozenset(
     ("heel", "bad_pixels", "gain_map_error")
 )  # effects that look otherwise where calibration has seen them
+_TAKEN_IN = frozenset(("heel",))  # the twin's own maps hold what was always there of these, beam by beam
 _ON_OBJECTS_ALONE = frozenset(
     {item.id for item in EFFECTS.values() if item.stage == "object_blur"}
     | {"misregistration", "object_scatter", "composition_error"}
@@ -153,11 +154,13 @@ class ForwardModel:
     """The base twin as the series of a session ask it.
 
     Fields: base: the twin with all pixels alike, and the effects that it has; conditions of the session that effects know;
+    own_maps: series of the session make dark and gain map, so that these series, too, are asked for what was always there;
     cache, filled by asking.
     """
 
     base: Twin
     conditions: dict[str, float]
+    own_maps: bool = True
     cache: ModelCache = field(default_factory=draft_cache)
 
     @property
@@ -198,10 +201,15 @@ class ForwardModel:
         return expected, refused
 
     def _asked(self, request: SeriesRequest, change: Change) -> ExpectedSeries:
+        effects = (*change.twin.effects, *change.effects)
+        if self.own_maps and any(item.id in _TAKEN_IN and item.since == "always" for item in effects):
+            acting = (item for item in effects if item.since == "always" or request.after_calibration)
+            effects = tuple(replace(item, since="calibration") if item.id in _TAKEN_IN else item for item in acting)
+            request = replace(request, after_calibration=True)
         return expected_series(
             change.twin,
             request,
-            effects=(*change.twin.effects, *change.effects),
+            effects=effects,
             parameters=change.parameters,
             cache=self.cache,
             use_measured_level=False,

@@ -138,6 +138,10 @@ def weigh_hypotheses(
     # no law is exact: a strong effect leaves a part of what it does to be explained by anything
     explained = max(item.log_evidence for item, _ in weighed)
     beyond -= UNKNOWN_CHANCE + UNKNOWN_DOUBT * max(0.0, min(beyond, explained))
+    likest = max(singles, key=lambda effect: singles[effect].log_evidence, default="")
+    if likest and singles[likest].log_evidence > beyond:
+        # what chance shows of the effect that looks most like it is no evidence of anything else either
+        beyond -= doubts.chance.get(likest, 0.0)
     weighed.append(
         (
             Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=beyond, location=place),

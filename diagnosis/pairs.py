@@ -24,9 +24,9 @@ PAIR_DOUBT_ELSEWHERE = 0.36  # share of both that is left of them where the two 
 # sealed effects of evidences up to 1e6 another one gained 5 at most (a wandering output 15), beside glares of up to 4e7 90, beside
 # one with a focal spot a tail 294 of 3e6
 PAIR_DOUBT_LEAST = 12.0
-PAIR_DOUBT_STRONG = 3e-5
+PAIR_DOUBT_STRONG = 1e-5
 PAIR_DOUBT_FADES = 1e6
-PAIR_DOUBT_SHARED = 9.0  # and so much more of the latter, times the square of the effects' overlap
+PAIR_DOUBT_SHARED = 29.0  # and so much more of the latter, times the square of the effects' overlap
 APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _PAIR_NODES = 13
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair

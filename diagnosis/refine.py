@@ -238,13 +238,7 @@ def _refined(
     best, strength = variant, fit.best
 
     def near(parameters: Mapping[str, float], shares: Sequence[float]) -> Variant:
-        label = ", ".join(f"{name} {value:.3g}" for name, value in parameters.items())
-        return replace(
-            variant,
-            parameters=dict(parameters),
-            name=f"{label}, refined from {variant.name}".strip(", "),
-            strengths=tuple(share * strength for share in shares),
-        )
+        return variant.refined(parameters, [share * strength for share in shares])
 
     def curve_of(item: Variant, responses: NDArray[np.float64]) -> Curve:
         like = fit.curve

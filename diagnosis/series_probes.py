@@ -28,6 +28,7 @@ from .registration import render_variance
 from .responses import Moved, SeriesModel, SessionModel
 from .summaries import LEAST_NOISE_DN2, SeriesSummary
 
+_NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 _AXIS_OF_EFFECT = {
     "object_scatter": "level",
@@ -148,7 +149,11 @@ def mean_frame(
     signal = signal_map(expected, shape)
     mask = clean if one.placement is None else inside(clean, one.placement)
     quantum = full_size(expected.quantum_variance_DN2, shape)
-    white = np.maximum(full_size(expected.white_variance_DN2, shape), LEAST_NOISE_DN2)
+    white = full_size(expected.white_variance_DN2, shape)
+    if one.session.request.beam_on and float(white.min()) <= LEAST_NOISE_DN2:
+        came = variance_of_what_came(quantum + white, signal, corrected_DN)
+        quantum = np.maximum(quantum, came - white)
+    white = np.maximum(white, LEAST_NOISE_DN2)
     quantum = quantum / frames + signal**2 * maps.gain_quantum
     white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session)
     if one.session.series.kind == "object":
@@ -159,6 +164,19 @@ def mean_frame(
     return MeanFrame(
         signal_DN=signal, residual_DN=corrected_DN - signal, mask=mask, quantum_DN2=quantum, white_DN2=white
     )
+
+
+def variance_of_what_came(
+    variance_DN2: NDArray[np.float64], signal_DN: NDArray[np.float64], corrected_DN: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Variance (row, column), DN^2, that the light which is there gives a frame, by the mean ratio of variance to signal.
+
+    Without noise of the detector's own, a deep shadow has none by the model, and light that strays there the evidence of thousands.
+    """
+    from scipy.ndimage import uniform_filter
+
+    seen = uniform_filter(np.asarray(corrected_DN, dtype=np.float64), _NEIGHBOURS_PX)
+    return np.asarray(seen * float(variance_DN2.sum()) / max(float(signal_DN.sum()), 1e-9))
 
 
 def _near_steps(signal: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -279,6 +279,25 @@ def test_departure_that_no_effect_makes_is_unknown_and_placed(setup):
     assert leading.probability > 0.9
 
 
+@pytest.mark.parametrize(("elsewhere", "lowered"), [(False, True), (True, False)])
+def test_what_chance_shows_of_the_effect_that_looks_most_like_it_is_no_evidence_of_an_unknown_one(elsewhere, lowered):
+    """As long as that effect explains more than the unknown one; where it does not, it says nothing."""
+    rng = np.random.default_rng(41)
+    direction = np.where(GROUPS == 4, 1.0, 0.0) * rng.standard_normal(PROBES)
+    made = [one_node("blur", direction, high=500.0)]
+    residual = rng.standard_normal(PROBES) + 25.0 * direction * (1.0 + 0.12 * rng.standard_normal(PROBES))
+    if elsewhere:
+        residual[GROUPS == 2] += 30.0 * rng.standard_normal(int(np.count_nonzero(GROUPS == 2)))
+    plain, doubted = (
+        {item.effects: item.log_evidence for item in weigh(residual, np.zeros((PROBES, 1)), made, doubts=doubts)}
+        for doubts in (None, {"chance": {"blur": 30.0}})
+    )
+    assert (plain["blur",] > plain[UNKNOWN,]) == lowered
+    assert plain[UNKNOWN,] > 100.0
+    assert doubted["blur",] == pytest.approx(plain["blur",] - 30.0)
+    assert doubted[UNKNOWN,] == pytest.approx(plain[UNKNOWN,] - (30.0 if lowered else 0.0), abs=5.0)
+
+
 def test_effects_with_the_same_response_share_the_probability(setup):
     rng, factors, chosen = setup
     twin = chosen[0]

@@ -402,6 +402,23 @@ def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
     np.testing.assert_array_equal(found.spread, later.spread)
 
 
+def test_a_refined_variant_keeps_what_the_one_it_came_from_does_by_chance():
+    """More of a heel on one side hangs on the direction in which it falls."""
+    turned = [item for item in catalogue_variants() if item.effect == "heel" and item.since == "always"]
+    own = [
+        replace(curve("heel", axis(0)), variant=item.name, since="always", spread=axis(number)[:, None])
+        for number, item in enumerate(turned)
+    ]
+    of_session = problem(own)
+    names = [item.name for item in fields(Problem)]
+    whole = Problem(**{name: getattr(of_session, name, None) for name in names} | {"variants": ()})
+    for start, like in zip(turned, own, strict=True):
+        refined = start.refined({**start.parameters, "curvature": 0.31}, (3.0, 4.0))
+        assert refined.name.endswith(f"refined from {start.name}") and refined.strengths == (3.0, 4.0)
+        found = whole.with_variants([(refined, np.stack([axis(0)] * 2))]).curves[-1]
+        np.testing.assert_array_equal(found.spread, like.spread)
+
+
 @pytest.mark.parametrize("effect", sorted(EFFECTS))
 def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(make_model_twin, effect):
     twin = make_model_twin((24, 24), readout_ms=2.0)

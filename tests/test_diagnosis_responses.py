@@ -1,6 +1,7 @@
 """Dark and gain map of calibrating series, and what changes of the forward model can move."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,10 @@ from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.calibrated_maps import calibrated_maps
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.even_maps import compact, full_size
-from raytwin.diagnosis.forward_model import Change, strength_rows
+from raytwin.diagnosis.forward_model import Change, ForwardModel, strength_rows
 from raytwin.diagnosis.placing import inside
 from raytwin.diagnosis.registration import Placement
+from raytwin.diagnosis.series_probes import variance_of_what_came
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.registration import parts_px
 from raytwin.generator.series import SeriesRequest
@@ -198,3 +200,36 @@ def test_an_effect_that_began_earlier_stands_for_a_later_one_unless_what_came_be
     assert lag["always"].whenever_it_began(first) is None
     # a heel looks otherwise where calibration has seen it
     assert changed("heel", strength=0.01).whenever_it_began(later) is None
+
+
+def test_light_that_no_model_expects_brings_its_own_noise():
+    """A panel that counts has none in a deep shadow; what strays there comes in quanta."""
+    signal = np.where(np.arange(32)[None, :] < 16, 1000.0, 0.0) * np.ones((32, 1))
+    found = variance_of_what_came(2.0 * signal, signal, signal + 40.0)
+    assert found[:, :12] == pytest.approx(np.full((32, 12), 2080.0))
+    assert found[:, 20:] == pytest.approx(np.full((32, 12), 80.0))
+
+
+@pytest.mark.parametrize("own_maps", [True, False])
+def test_a_heel_that_was_always_there_is_asked_of_the_series_that_make_the_maps(make_model_twin, own_maps):
+    """A gain map is one for all beams; the twin's own maps hold it beam by beam."""
+    model = ForwardModel(base=make_model_twin((24, 24)), conditions={}, own_maps=own_maps)
+    setting = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
+    calibrating = SeriesRequest(kind="flat", setting=setting, frames=6, exposure_ms=20.0, after_calibration=False)
+    turned = replace(calibrating, panel_rotation_deg=180.0, after_calibration=True)
+    heel = AppliedEffect(
+        id="heel", parameters={"strength": 10.0, "direction_deg": 90.0, "curvature": 0.0}, since="always"
+    )
+    change = Change(label="heel", twin=model.base, effects=(heel,))
+
+    def across(request):
+        alone = model.expect(request)
+        ratio = full_size(model.expect_changed(request, change, alone).signal_DN, (24, 24)) / full_size(
+            alone.signal_DN, (24, 24)
+        )
+        return float(ratio[:, -1].mean() / ratio[:, 0].mean() - 1.0)
+
+    once = across(calibrating)
+    assert once == (pytest.approx(-0.07, abs=0.03) if own_maps else 0.0)
+    # with it in the maps already the turned panel shows it twice
+    assert across(turned) == pytest.approx(0.08 if own_maps else 0.16, abs=0.03)

@@ -115,7 +115,7 @@ def look_at_all(
         readable[item.name] = np.ones(good.shape, dtype=bool)
         if item.ends_at_zero and item.request.beam_on:
             readable[item.name] = _above_noise(item, model, signal, dark_at=dark_at, side=side)
-            if (readable[item.name] & good).sum() < _LABEL_PIXELS:
+            if (readable[item.name] & good).sum() < min(_LABEL_PIXELS, good.sum() / 2):
                 left_out[item.name] = f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels"
                 continue
         labels[item.name], label_names[item.name] = _labels(

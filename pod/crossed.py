@@ -38,6 +38,7 @@ from .links import Link
 from .trials import Trials
 
 Array = NDArray[np.float64]
+_SLOW = 15  # steps that most minima take less than
 Codes = NDArray[np.intp]
 
 _FARTHEST = 8.5  # standard deviations to which means over a normal effect are taken
@@ -244,6 +245,9 @@ def minimise(
             model = model + np.outer(change, change) / along - np.outer(stretched, stretched) / bent
         elif iteration % 5 == 4:
             model = second_differences(function, trial, trial_value)
+        if iteration % _SLOW == _SLOW - 1:
+            # along a bent valley what earlier steps have shown of the curvature holds it up
+            model = second_differences(function, trial, trial_value)
         point, value, gradient, fresh = trial, trial_value, new_gradient, False
     return point, value, model, False
 
@@ -371,7 +375,8 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             conditional[percent] = size_in_range(
                 plain, smallest=smallest, largest=largest, log_size=log_size, percent=percent
             )[0]
-        if sizes[90] is not None:
+        # along a likelihood that rises without end there is nothing to bound
+        if sizes[90] is not None and float(mixed.sd.max()) <= LARGEST_SD:
             one, two, low = _bounds(mixed, design, table, factors=factors, link=link, log_size=log_size, notes=notes)
     return PodFit(
         link=link.name,

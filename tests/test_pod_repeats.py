@@ -309,7 +309,7 @@ def test_false_alarms_that_come_by_image_count_less():
 
 @lru_cache(maxsize=1)
 def fit_of_identical_networks() -> tuple[PodFit, PodFit]:
-    """A crossed fit of three networks with the same hits, and the fit of one of them alone; half a minute's work."""
+    """A crossed fit of three networks with the same hits, and the fit of one of them alone."""
     rng = np.random.default_rng(5)
     size = np.sort(rng.uniform(0.02, 0.15, 70))
     seen = rng.random(70) < -np.expm1(-np.exp(-3.0 + 60.0 * size))
@@ -326,6 +326,14 @@ def test_images_that_every_network_hits_or_misses_get_the_clustered_curve() -> N
     assert fit.a90 == pytest.approx(once.a90, rel=1e-6)
     assert fit.a90_95.wald is not None and once.a90_95.wald is not None
     assert fit.a90_95.wald >= 0.9 * once.a90_95.wald
+
+
+def test_no_bounds_are_sought_along_a_likelihood_that_rises_without_end(monkeypatch) -> None:
+    """Half a minute to two minutes for sizes that the clustered curve then gave."""
+    sought = []
+    monkeypatch.setattr("raytwin.pod.crossed._bounds", lambda *_, **__: sought.append(1))
+    fit_of_identical_networks.__wrapped__()
+    assert not sought
 
 
 def test_the_band_of_a_clustered_fall_back_follows_the_clustered_curve() -> None:

@@ -159,7 +159,7 @@ def build_problem(
     known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     conditions |= beam_conditions(base, requests, cache=cache)
-    own_maps = any(item.calibrates for item in session)
+    own_maps = any(item.calibrates and item.series.kind == "flat" for item in session)
     model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps, cache=cache)
     measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
     expected = measured.expected

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..generator.series import ExpectedSeries
 from ..generator.twin import Twin
 from .even_maps import full_size, mean_over
+from .fixed_pattern import smooth_part
 from .session import SessionSeries
 from .summaries import FirstLook
 
@@ -57,13 +58,15 @@ class CalibratedMaps:
     """Dark and gain map.
 
     Fields: darks; gain (row, column): what the calibrating flats show over what the smooth model expects; shares: of each
-    calibrating flat in it, by name (none: the twin's gain map); gain_quantum, gain_white: relative variance of one pixel's
+    calibrating flat in it, by name (none: the twin's gain map); beams (row, column): what the twin's flats of a series' beam show
+    over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
     gain, correlated as quanta are, and white; good (row, column): pixels in use; frames of the calibrating flats, by name.
     """
 
     darks: CalibratedDarks
     gain: NDArray[np.float64]
     shares: dict[str, float]
+    beams: Mapping[str, NDArray[np.float64]]
     gain_quantum: float
     gain_white: float
     good: NDArray[np.bool_]
@@ -77,12 +80,10 @@ class CalibratedMaps:
         """A series' mean frame (row, column) less the dark and over the gain map, DN."""
         measured = mean_DN - self.darks.under(item)
         if item.request.beam_on and "gain" not in item.series.corrected:
-            measured = self.over_gain(measured)
+            measured = measured / np.where(self.good, self.gain, 1.0)
+            if item.name in self.beams:
+                measured = measured / self.beams[item.name]
         return measured
-
-    def over_gain(self, lit_DN: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A mean frame without its dark (row, column) over the gain map, DN; as it is where pixels are not in use."""
-        return lit_DN / np.where(self.good, self.gain, 1.0)
 
 
 def exposure_of(item: SessionSeries) -> float:
@@ -131,6 +132,7 @@ def calibrated_maps(
         darks=under,
         gain=gain,
         shares=shares,
+        beams={} if flats else _beams_of_twin(twin, kept, gain, good),
         gain_quantum=quantum,
         gain_white=white,
         good=good & (gain > _LEAST_GAIN),
@@ -176,3 +178,20 @@ def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
     if shapes:
         gain = np.asarray(np.mean(np.stack(shapes), axis=0), dtype=np.float64)
     return gain
+
+
+def _beams_of_twin(
+    twin: Twin, kept: Sequence[SessionSeries], gain: NDArray[np.float64], good: NDArray[np.bool_]
+) -> dict[str, NDArray[np.float64]]:
+    """Smooth shape (row, column) of the twin's flats of each lit series' beam over its gain map: a heel differs from beam to beam."""
+    in_use = good & (gain > _LEAST_GAIN)
+    shapes: dict[str, NDArray[np.float64]] = {}
+    beams = {}
+    for item in kept:
+        level = twin.level_nearest(item.request.setting) if item.request.beam_on else None
+        if level is not None and len(twin.levels) > 1:
+            if level.name not in shapes:
+                over = np.where(in_use, level.flat_shape / np.where(in_use, gain, 1.0), 1.0) - 1.0
+                shapes[level.name] = 1.0 + smooth_part(over, in_use)
+            beams[item.name] = shapes[level.name]
+    return beams

@@ -154,7 +154,7 @@ class ForwardModel:
     """The base twin as the series of a session ask it.
 
     Fields: base: the twin with all pixels alike, and the effects that it has; conditions of the session that effects know;
-    own_maps: series of the session make dark and gain map, so that these series, too, are asked for what was always there;
+    own_maps: flats of the session make the gain map, so that these, too, are asked for what was always there;
     cache, filled by asking.
     """
 

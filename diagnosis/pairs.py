@@ -26,7 +26,7 @@ PAIR_DOUBT_ELSEWHERE = 0.36  # share of both that is left of them where the two 
 PAIR_DOUBT_LEAST = 12.0
 PAIR_DOUBT_STRONG = 1e-5
 PAIR_DOUBT_FADES = 1e6
-PAIR_DOUBT_SHARED = 29.0  # and so much more of the latter, times the square of the effects' overlap
+PAIR_DOUBT_SHARED = 2.9e-4  # and so much more of it, times the square of the effects' overlap
 APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _PAIR_NODES = 13
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
@@ -63,8 +63,8 @@ class Doubts:
         loose: effects whose law leaves something where it predicts nothing, and the share of their log evidence, in place of
             PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
         sharp: effects that change edges alone, which nothing that such a law leaves looks like: not doubted for it.
-        left: share of its log evidence that what is wrong with its law may give a second one, where it is not PAIR_DOUBT_STRONG;
-            by effect and onset.
+        left: shares of its log evidence that what is wrong with its law may give a second one, by effect and onset, where they are
+            not PAIR_DOUBT_STRONG, elsewhere, and PAIR_DOUBT_SHARED, more where both act.
         told: effects that pixels or codes of their own tell, which no other effect's law can leave: found at the least that is
             plausible they are doubted no more than elsewhere.
         elsewhere: probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is not doubted.
@@ -73,7 +73,7 @@ class Doubts:
     chance: Mapping[str, float] = field(default_factory=dict)
     loose: Mapping[str, float] = field(default_factory=dict)
     sharp: frozenset[str] = frozenset()
-    left: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    left: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     elsewhere: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
@@ -179,12 +179,9 @@ class _SecondDoubted:
         at_bottom = weak not in doubts.told and strengths[weak] < _AT_BOTTOM * curves[weak].low
         if not loose and not at_bottom:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlap
-            shared = 1.0 + PAIR_DOUBT_SHARED * overlap**2
-            leaves = (
-                doubts.left.get((strong, curves[strong].since), PAIR_DOUBT_STRONG)
-                * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
-            )
-            doubt = min(doubt, PAIR_DOUBT_LEAST + leaves * shared * stronger)
+            apart, shared = doubts.left.get((strong, curves[strong].since), (PAIR_DOUBT_STRONG, PAIR_DOUBT_SHARED))
+            leaves = (apart + shared * overlap**2) * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
+            doubt = min(doubt, PAIR_DOUBT_LEAST + leaves * stronger)
         gain = evidence - self._singles[strong].log_evidence
         if strong in doubts.elsewhere and gain > 0.0:
             moves = np.any(np.abs(self._singles[strong].best.curve.responses) > _MOVES, axis=0)

@@ -74,6 +74,8 @@ def prepare_session(
     all_pixels, left_out = _of_one_shape(acquisition, twin)
     all_pixels, cut_off = without_cut_off_darks(all_pixels)
     left_out += cut_off
+    if not all_pixels.series:
+        raise _nothing_left(acquisition, left_out)
     factor = 1 if twin is not None else coarse_factor(all_pixels.series[0].shape)
     acquisition = coarser(all_pixels, factor)
     names = calibrating_names(acquisition.series)
@@ -86,11 +88,7 @@ def prepare_session(
     left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
     kept = tuple(item for item in acquisition.series if item.name not in found.unusable)
     if not kept:
-        raise InputError(
-            f"acquisition {acquisition.path}",
-            received="; ".join(left_out),
-            expected="series with light and noise",
-        )
+        raise _nothing_left(acquisition, left_out)
     exposed = tuple(item for item in acquisition.series if item.name in found.saturated)
     acquisition = replace(acquisition, series=kept)
     elsewhere = twin is not None and not made_of(twin, kept)
@@ -179,6 +177,12 @@ def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[Acqu
     ]
     kept = tuple(item for item in acquisition.series if item.shape == shape)
     return replace(acquisition, series=kept), left_out
+
+
+def _nothing_left(acquisition: AcquisitionFile, left_out: Sequence[str]) -> InputError:
+    return InputError(
+        f"acquisition {acquisition.path}", received="; ".join(left_out), expected="series with light and noise"
+    )
 
 
 def _not_calibrated(

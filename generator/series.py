@@ -293,22 +293,11 @@ def _illumination(twin: Twin, request: SeriesRequest, cache: ModelCache) -> tupl
     """Shape of the flat nearest in kV and filters, and relative gain (row, column)."""
     gain = twin.maps.gain_relative
     relative = cache.pixels(twin.maps, "relative gain", lambda: np.where(gain > 1e-6, gain, 1.0))
-    shape: FloatArray | None = None
-    if twin.levels:
-        level = None if request.setting is None else twin.level_at(request.setting)
-        if level is None:
-            kV = None if request.setting is None else request.setting.kV
-            wanted = set() if request.setting is None else {str(layer) for layer in request.setting.filters}
-            level = min(
-                twin.levels,
-                key=lambda item: (
-                    abs(math.log(item.kV / kV)) if kV is not None and item.kV is not None else 0.0,
-                    len(wanted ^ {str(layer) for layer in item.filters}),
-                ),
-            )
-        seen = level.flat_shape
-        shape = cache.pixels(level, "shape of the flat", lambda: np.maximum(seen, 0.0))
-    return (relative if shape is None else shape), relative
+    level = twin.level_nearest(request.setting)
+    if level is None:
+        return relative, relative
+    seen = level.flat_shape
+    return cache.pixels(level, "shape of the flat", lambda: np.maximum(seen, 0.0)), relative
 
 
 def _context(

@@ -187,3 +187,18 @@ class Twin:
             if sorted(str(layer) for layer in level.filters) == wanted:
                 return level
         return None
+
+    def level_nearest(self, setting: Setting | None) -> Level | None:
+        """The level of these kV and filters, else the nearest in kV, then in filters; None: no levels."""
+        level = None if setting is None else self.level_at(setting)
+        if level is not None or not self.levels:
+            return level
+        kV = None if setting is None else setting.kV
+        wanted = set() if setting is None else {str(layer) for layer in setting.filters}
+        return min(
+            self.levels,
+            key=lambda item: (
+                abs(math.log(item.kV / kV)) if kV is not None and item.kV is not None else 0.0,
+                len(wanted ^ {str(layer) for layer in item.filters}),
+            ),
+        )

@@ -2,8 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.cli import main
 
 
@@ -113,3 +115,15 @@ def test_file_that_is_no_acquisition_is_one_line_and_leaves_no_folder(sessions, 
     assert len(lines) == 1
     assert "expected an acquisition file" in lines[0]
     assert not (tmp_path / "new").exists()
+
+
+def test_only_darks_whose_noise_was_cut_off_are_one_line(tmp_path, capsys):
+    frames = np.clip(4.0 * np.random.default_rng(3).standard_normal((6, 32, 32)), 0, None)
+    with write_acquisition(tmp_path / "darks.h5") as writer:
+        writer.add_series("dark", kind="dark", exposure_ms=20.0, frames=np.round(frames).astype(np.uint16))
+    assert main(["diagnose", str(tmp_path / "darks.h5"), "-o", str(tmp_path / "out")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert "numbers are 0" in lines[0]
+    assert "expected series with light and noise" in lines[0]
+    assert not (tmp_path / "out").exists()

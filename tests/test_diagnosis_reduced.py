@@ -553,3 +553,23 @@ def test_an_explanation_clears_a_label_that_its_effect_makes_look_wrong():
     assert not clears(like_scatter, "explained", "image_lag")
     assert not clears(like_scatter, "unknown_effect")
     assert not clears(swapped, "explained", "object_scatter")
+
+
+@pytest.mark.slow
+def test_a_heel_that_was_always_there_is_named_with_a_twin_from_another_session(tmp_path, capsys):
+    path, twin = tmp_path / "session.h5", tmp_path / "twin.h5"
+    words = ["--protocol", "full", "--seed", "2074", "--size", "48", "--frames", "10", "--products", "1"]
+    assert main(["lab", "-o", str(path), *words, "--effect", "heel=12@always"]) == 0
+    assert main(["calibrate", str(path), "-o", str(twin)]) == 0
+    with h5py.File(path, "r+") as file:
+        for name, node in list(file["series"].items()):
+            if node.attrs["role"] == "calibration":
+                del file["series"][name]
+    capsys.readouterr()
+    assert main(["diagnose", str(path), "-o", str(tmp_path / "answer"), "--json", "--twin", str(twin)]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    # each beam's flats hold the heel of their own: the mean of all of them had left a gradient in every beam
+    leading = answer["causes"][0]
+    assert leading["effect"] == "heel"
+    assert leading["probability"] > 0.9
+    assert leading["strength"]["value"] == pytest.approx(12.0, abs=2.5)

@@ -42,15 +42,9 @@ class CalibratedDarks:
             result += weight * self.means_DN[name]
         return result
 
-    def noise_under(self, item: SessionSeries, good: NDArray[np.bool_]) -> float:
-        """Variance of the dark that is subtracted, one pixel, DN^2; good: pixels in use (row, column)."""
-        if "offset" in item.series.corrected:
-            return 0.0
-        total = 0.0
-        for name, weight in self.weights[exposure_of(item)].items():
-            variance = mean_over(self.white_DN2[name], good)
-            total += weight**2 * variance / self.frames[name]
-        return total
+    def weights_under(self, item: SessionSeries) -> Mapping[str, float]:
+        """Weight of each calibrating dark, by name, in the dark that is subtracted from a series."""
+        return {} if "offset" in item.series.corrected else self.weights[exposure_of(item)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,9 +52,11 @@ class CalibratedMaps:
     """Dark and gain map.
 
     Fields: darks; gain (row, column): what the calibrating flats show over what the smooth model expects; shares: of each
-    calibrating flat in it, by name (none: the twin's gain map); beams (row, column): what the twin's flats of a series' beam show
-    over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
-    gain, correlated as quanta are, and white; good (row, column): pixels in use; frames of the calibrating flats, by name.
+    calibrating flat in it, by name (none: the twin's gain map); beams (row, column): what the twin's flats of a series' beam
+    show over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
+    gain, correlated as quanta are, and white; gain_darks: change of the gain, 1/DN, when a calibrating dark is brighter, by
+    name: what is subtracted from a series as bright as the calibrating flats was subtracted from these as well; good (row,
+    column): pixels in use; frames of the calibrating flats, by name.
     """
 
     darks: CalibratedDarks
@@ -69,12 +65,24 @@ class CalibratedMaps:
     beams: Mapping[str, NDArray[np.float64]]
     gain_quantum: float
     gain_white: float
+    gain_darks: Mapping[str, float]
     good: NDArray[np.bool_]
     frames: Mapping[str, int]
 
-    def dark_noise(self, item: SessionSeries) -> float:
-        """Variance of the dark that is subtracted from a series, one pixel, DN^2."""
-        return self.darks.noise_under(item, self.good)
+    def dark_noise(self, item: SessionSeries, signal_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance, DN^2, that noise of the calibrating darks gives a pixel of a corrected mean frame, through the gain map as well.
+
+        signal_DN: of the series, of any shape, which the result has.
+        """
+        under = self.darks.weights_under(item)
+        divided = item.request.beam_on and "gain" not in item.series.corrected
+        total = np.zeros(np.shape(signal_DN))
+        for name, white_DN2 in self.darks.white_DN2.items():
+            variance = mean_over(white_DN2, self.good) / self.darks.frames[name]
+            own, divisor = under.get(name, 0.0), self.gain_darks[name] if divided else 0.0
+            if own or divisor:
+                total += (own + divisor * signal_DN) ** 2 * variance
+        return total
 
     def corrected(self, item: SessionSeries, mean_DN: NDArray[np.float64]) -> NDArray[np.float64]:
         """A series' mean frame (row, column) less the dark and over the gain map, DN."""
@@ -120,12 +128,15 @@ def calibrated_maps(
     shares = _flat_shares(flats, expected, good)
     gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
     quantum = white = 0.0
+    gain_darks = dict.fromkeys(under.white_DN2, 0.0)
     for item in flats:
         model = expected[item.name]
-        weight = (shares[item.name] / mean_over(model.signal_DN, good)) ** 2
-        weight /= item.series.n_frames
+        share = shares[item.name] / mean_over(model.signal_DN, good)
+        weight = share**2 / item.series.n_frames
         quantum += weight * mean_over(model.quantum_variance_DN2, good)
         white += weight * mean_over(model.white_variance_DN2, good)
+        for name, part in under.weights_under(item).items():
+            gain_darks[name] -= share * part
         signal = np.maximum(full_size(model.signal_DN, good.shape), 1e-9)
         gain += shares[item.name] * (looks[item.name].mean_DN - under.under(item)) / signal
     return CalibratedMaps(
@@ -135,6 +146,7 @@ def calibrated_maps(
         beams={} if flats else _beams_of_twin(twin, kept, gain, good),
         gain_quantum=quantum,
         gain_white=white,
+        gain_darks=gain_darks,
         good=good & (gain > _LEAST_GAIN),
         frames={item.name: looks[item.name].frames for item in flats},
     )
@@ -184,12 +196,14 @@ def _beams_of_twin(
     twin: Twin, kept: Sequence[SessionSeries], gain: NDArray[np.float64], good: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
     """Smooth shape (row, column) of the twin's flats of each lit series' beam over its gain map: a heel differs from beam to beam."""
+    if len(twin.levels) < 2:
+        return {}
     in_use = good & (gain > _LEAST_GAIN)
     shapes: dict[str, NDArray[np.float64]] = {}
     beams = {}
     for item in kept:
         level = twin.level_nearest(item.request.setting) if item.request.beam_on else None
-        if level is not None and len(twin.levels) > 1:
+        if level is not None:
             if level.name not in shapes:
                 over = np.where(in_use, level.flat_shape / np.where(in_use, gain, 1.0), 1.0) - 1.0
                 shapes[level.name] = 1.0 + smooth_part(over, in_use)

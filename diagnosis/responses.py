@@ -270,8 +270,9 @@ def _context(
     """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it."""
     in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
-    squared = signal_DN**2 if lit else 0.0
-    noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + maps.dark_noise(item)
+    lit_DN = np.asarray(signal_DN if lit else 0.0)
+    squared = float(lit_DN) ** 2
+    noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + float(maps.dark_noise(item, lit_DN))
     return ScalarContext(
         kind=kind,
         frames=frames,

@@ -155,7 +155,7 @@ def mean_frame(
         quantum = np.maximum(quantum, came - white)
     white = np.maximum(white, LEAST_NOISE_DN2)
     quantum = quantum / frames + signal**2 * maps.gain_quantum
-    white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session)
+    white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
     if one.session.series.kind == "object":
         white = white + render_variance(signal, side=side)
         if one.session.request.scene_kind not in SHARP_SCENES:

@@ -84,7 +84,7 @@ def test_darks_of_the_same_exposure_average_and_their_noise_falls_with_the_frame
     means = {"few": np.full(SHAPE, 100.0), "many": np.full(SHAPE, 104.0)}
     maps = maps_of([*darks, scene], means, {item.name: expectation(0.0, white_DN2=4.0) for item in darks})
     np.testing.assert_allclose(maps.darks.under(scene), 103.0)
-    assert maps.dark_noise(scene) == pytest.approx(4.0 / 40)
+    assert maps.dark_noise(scene, np.array(1000.0)) == pytest.approx(4.0 / 40)
 
 
 def test_without_calibrating_series_dark_and_gain_are_the_twins_and_corrected_series_stay():
@@ -94,7 +94,7 @@ def test_without_calibrating_series_dark_and_gain_are_the_twins_and_corrected_se
     assert maps.shares == {}
     np.testing.assert_allclose(maps.corrected(scene, np.full(SHAPE, 1107.0)), 1000.0, rtol=1e-6)
     np.testing.assert_array_equal(maps.corrected(done, np.full(SHAPE, 1107.0)), 1107.0)
-    assert maps.dark_noise(done) == 0.0
+    assert maps.dark_noise(done, np.array(1000.0)) == 0.0
 
 
 def test_the_gain_map_weighs_flats_by_signal_to_noise_and_shows_what_the_model_does_not():
@@ -115,6 +115,29 @@ def test_the_gain_map_weighs_flats_by_signal_to_noise_and_shows_what_the_model_d
     assert maps.gain_quantum == pytest.approx(1.0 / (20 * 4000.0))
     assert maps.gain_white == 0.0
     assert [tuple(place) for place in np.argwhere(~maps.good)] == [(3, 4)]
+
+
+@pytest.mark.parametrize("signal_DN", [100.0, 1000.0, 2500.0])
+def test_noise_of_darks_that_the_gain_map_has_too_is_not_counted_twice(signal_DN):
+    rng = np.random.default_rng(4)
+    dark = series("dark", "dark", exposure_ms=50.0, frames=10)
+    flats = [series("weak", "flat", exposure_ms=50.0), series("strong", "flat", exposure_ms=50.0)]
+    scene = series("scene", "object", exposure_ms=50.0, calibrates=False)
+    expected = {
+        "dark": expectation(0.0, white_DN2=90.0),
+        "weak": expectation(500.0, quantum_DN2=1.0, white_DN2=0.0),
+        "strong": expectation(1500.0, quantum_DN2=1.0, white_DN2=0.0),
+    }
+    left = []
+    for _ in range(60):
+        means = {"dark": 50.0 + 3.0 * rng.standard_normal(SHAPE)}
+        means |= {"weak": np.full(SHAPE, 550.0), "strong": np.full(SHAPE, 1550.0)}
+        maps = maps_of([dark, *flats, scene], means, expected)
+        left.append(maps.corrected(scene, np.full(SHAPE, 50.0 + signal_DN)) - signal_DN)
+    predicted = maps.dark_noise(scene, np.full(SHAPE, signal_DN))
+    assert np.mean(predicted) == pytest.approx(float(np.mean(np.square(left))), rel=0.05)
+    # as bright as the flats it nearly cancels; 3 DN squared is what is subtracted
+    assert (np.mean(predicted) < 0.6) == (signal_DN == 1000.0)
 
 
 def test_maps_that_are_the_same_everywhere_become_one_pixel_and_come_back():

@@ -16,7 +16,7 @@ from ..generator.series import ExpectedSeries, beam_conditions, expected_series,
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, twin_changes, with_pauses
+from .changes import Variant, smooth_twin, spectral_sds, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
@@ -35,6 +35,9 @@ from .usable import SeenSeries, look_at_all, stated_series, summarise_all
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
+_NEAR_A_POINT = (
+    0.2  # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
+)
 _PLACES = "places of scenes"
 
 
@@ -131,6 +134,7 @@ def build_problem(
     calibrated_elsewhere: bool = False,
     exposed: Sequence[Series] = (),
     ends_at_zero: frozenset[str] = frozenset(),
+    spectral_point: NDArray[np.float64] | None = None,
     side: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Problem:
@@ -143,6 +147,8 @@ def build_problem(
         calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
             marked as calibrating).
         exposed, ends_at_zero: as in `read_session`.
+        spectral_point: spectral parameters (parameter,) at which these nuisances are taken as linear in place of the best ones,
+            about which they have their priors all the same.
         side: of the squares of the panel's pixels that the acquisition has for pixels.
         progress: called with the name of each stage.
 
@@ -158,6 +164,11 @@ def build_problem(
     conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
     known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
+    back: dict[str, float] = {}
+    if spectral_point is not None and base.spectral is not None:
+        steps = (base.spectral.best - spectral_point) / spectral_sds(base.spectral)
+        back = dict(zip(base.spectral.names, map(float, steps), strict=True))
+        base = replace(base, spectral=replace(base.spectral, best=spectral_point))
     conditions |= beam_conditions(base, requests, cache=cache)
     own_maps = any(item.calibrates and item.series.kind == "flat" for item in session)
     model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps, cache=cache)
@@ -165,7 +176,8 @@ def build_problem(
     expected = measured.expected
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
-    changes += [Change.of_twin(step) for step in twin_changes(model.base)]
+    steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
+    changes += [Change.of_twin(step) for step in steps_taken]
     changes += without_each(model.base)
     unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
     compared = _Compared(
@@ -174,6 +186,7 @@ def build_problem(
         known=len(model.base.effects),
         variants=tuple(variants),
         thicker=_thicker_scenes(expected.series),
+        back=back,
         side=side,
     )
     parts = []
@@ -316,7 +329,8 @@ class _Compared:
     """A session and the changes that every series of it is asked with.
 
     Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; known: number of
-    these; variants; thicker: see `_thicker_scenes`; side: of the squares of the panel's pixels that stand for pixels.
+    these; variants; thicker: see `_thicker_scenes`; back: prior standard deviations from the base twin's spectral parameters to the
+    calibrated ones, by name; side: of the squares of the panel's pixels that stand for pixels.
     """
 
     measured: _Measured
@@ -324,6 +338,7 @@ class _Compared:
     known: int
     variants: tuple[Variant, ...]
     thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
+    back: Mapping[str, float]
     side: int
 
     def part(self, one: SeriesModel) -> _Part:
@@ -406,8 +421,11 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         ]
     )
     sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
+    residual = np.concatenate([block.residual for block in blocks])
+    for name, step in compared.back.items():
+        residual -= step * factors.get(name, 0.0)
     problem = Problem(
-        residual=np.concatenate([block.residual for block in blocks]),
+        residual=residual,
         factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(names), 0)),
         factor_names=tuple(factors),
         curves=tuple(curves),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..calibration.priors import ATTENUATION_SCALE, PRIORS, UNDECLARED_SCINTILLATOR
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.effects.effect import Parameter
-from ..generator.twin import Estimate, Twin
+from ..generator.twin import Estimate, SpectralPosterior, Twin
 from .coarse import in_squares, pixels_in_square
 from .curves import Curve
 from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS_ANYWHERE
@@ -301,26 +301,38 @@ class TwinChange:
     step_sd: float
 
 
-def twin_changes(twin: Twin) -> list[TwinChange]:
-    """Steps in what calibration has fitted, each with the step's size in prior standard deviations.
+def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
+    """Standard deviations (parameter,) that spectral parameters are taken to have before a session is seen.
 
-    Spectral parameters are taken with the priors that calibration started from, not its posterior: the calibrating
-    series are among the probes and say again what they know.
+    They are those that calibration started from, not its posterior's: the calibrating series are among the probes and say again
+    what they know.
+    """
+    result = []
+    for name in posterior.names:
+        sd = PRIORS.get(name, ATTENUATION_SCALE).sd
+        if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
+            sd = UNDECLARED_SCINTILLATOR.sd
+        if name in ("log_output", "log_DN_per_keV"):
+            # fixed by the level within percents; a wide prior would only leave the linear range
+            sd = 0.03
+        result.append(sd)
+    return np.array(result)
+
+
+def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]:
+    """Steps in what calibration has fitted, each with the step's size in prior standard deviations (`spectral_sds`).
+
+    Args:
+        twin: as asked.
+        spectral_steps: size of a step over the posterior's standard deviation.
     """
     result: list[TwinChange] = []
     posterior = twin.spectral
     if posterior is not None:
         best = np.asarray(posterior.best, dtype=np.float64)
         draws = posterior.samples.std(axis=0)
-        for index, name in enumerate(posterior.names):
-            prior = PRIORS.get(name, ATTENUATION_SCALE)
-            sd = prior.sd
-            if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
-                sd = UNDECLARED_SCINTILLATOR.sd
-            if name in ("log_output", "log_DN_per_keV"):
-                # fixed by the level within percents; a wide prior would only leave the linear range
-                sd = 0.03
-            step = min(max(float(draws[index]), 0.05 * sd), sd)
+        for index, (name, sd) in enumerate(zip(posterior.names, spectral_sds(posterior), strict=True)):
+            step = min(max(spectral_steps * float(draws[index]), 0.05 * sd), sd)
             if name == "inherent_filtration_mm_Al" and best[index] - step < 0:
                 step = abs(step)
             changed = best.copy()

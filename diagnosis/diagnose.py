@@ -152,6 +152,7 @@ def diagnose(
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
     had = already_there(session.twin.effects)
     left_out = (*without, *had, *(UNSEEN if session.factor > 1 else ()))
+
     try:
         problem = build_problem(
             session.acquisition,
@@ -160,6 +161,7 @@ def diagnose(
             calibrated_elsewhere=session.calibrated_elsewhere,
             exposed=session.exposed,
             ends_at_zero=session.ends_at_zero,
+            spectral_point=session.spectral_point,
             side=session.factor,
             progress=progress,
         )
@@ -481,7 +483,7 @@ def _next_measurement(
         {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
     )
     answer: dict[str, Any] = {"separates": sorted({effect for item in tied[:2] for effect in item.effects})}
-    found = best_repeat(problem, first, second)
+    found, other = best_repeat(problem, first, second), None
     if found is None or found.separation_then < WORTH_IT:
         planned = best_measurement(problem, first, second, rng=rng)
         if planned is not None and (planned.separation_then >= WORTH_IT or found is None):
@@ -492,14 +494,22 @@ def _next_measurement(
                 "separation": planned.separation,
                 "separation_then": planned.separation_then,
             }
+        if planned is not None and _all_later(problem, (*first.values(), *second.values())):
+            other = planned.measurement.text, planned.separation_then
     if found is None:
         return None
     return answer | {
-        "text": repeat_text(found, tied[0].effects, tied[1].effects),
+        "text": repeat_text(found, tied[0].effects, tied[1].effects, other=other),
         "series": found.series,
         "separation": found.separation,
         "separation_then": found.separation_then,
     }
+
+
+def _all_later(problem: Problem, curves: Sequence[tuple[Curve, float]]) -> bool:
+    """Whether curves (with strengths) all stand for effects that set in after the calibration."""
+    named = {(curve.effect, curve.variant) for curve, _ in curves}
+    return all(item.since == "calibration" for item in problem.variants if (item.effect, item.name) in named)
 
 
 def _threshold(problem: Problem, nuisances: LocalNuisances, rng: np.random.Generator) -> float:

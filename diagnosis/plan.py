@@ -150,8 +150,14 @@ class Repeat:
     separation_then: float
 
 
-def repeat_text(repeat: Repeat, first: Sequence[str], second: Sequence[str]) -> str:
-    """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them."""
+def repeat_text(
+    repeat: Repeat, first: Sequence[str], second: Sequence[str], *, other: tuple[str, float] | None = None
+) -> str:
+    """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them.
+
+    other: the best measurement that the session lacks, in words, and the separation with it, which is not worth it either: what
+    the calibration has not seen before a change cannot be made up for after it.
+    """
     names = " and ".join(first) + " from " + " and ".join(second)
     if repeat.separation_then >= WORTH_IT:
         return (
@@ -163,10 +169,15 @@ def repeat_text(repeat: Repeat, first: Sequence[str], second: Sequence[str]) -> 
         for effect in (*first, *second)
         if effect in ISOLATED_BY and (effect in first) != (effect in second)
     )
-    return (
+    too_little = (
         f"no series of this session will do: {repeat.times} times as many frames of the best one, {repeat.series}, tell"
-        f" {names} by {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}. Measure what"
-        f" isolates them: {isolating}"
+        f" {names} by {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+    )
+    if other is None:
+        return f"{too_little}. Measure what isolates them: {isolating}"
+    return (
+        f"{too_little}; nor will {other[0]} ({other[1]:.1f}). A change is told by what was measured before it as well: have among"
+        f" the calibrating series, too, what isolates them: {isolating}"
     )
 
 

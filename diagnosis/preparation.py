@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.coarser import coarser
@@ -31,7 +32,8 @@ class PreparedSession:
     known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
     wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at); factor (pixels along
     each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels);
-    ends_at_zero (names of lit series whose numbers go down to 0 and not below).
+    ends_at_zero (names of lit series whose numbers go down to 0 and not below); spectral_point (parameter,): where the twin's
+    spectral nuisances are taken as linear (None: at its best parameters).
     """
 
     acquisition: AcquisitionFile
@@ -44,6 +46,7 @@ class PreparedSession:
     factor: int
     all_pixels: AcquisitionFile
     ends_at_zero: frozenset[str]
+    spectral_point: NDArray[np.float64] | None
 
 
 def calibrated_twin(
@@ -113,10 +116,49 @@ def prepare_session(
         ends_at_zero=frozenset(
             item.name for item in all_pixels.series if item.kind in ("flat", "object") and share_of_zeros(item) > 0.0
         ),
+        spectral_point=_spectral_point(acquisition, twin, rng=rng, progress=progress),
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
         ),
     )
+
+
+def _spectral_point(
+    acquisition: AcquisitionFile,
+    twin: Twin,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None,
+) -> NDArray[np.float64] | None:
+    """The twin's spectral parameters (parameter,) as later flats show them; None where the twin has seen all their beams.
+
+    A calibration from few beams leaves the spectrum wide, and what other beams show lies far along its nuisances: straight lines
+    from the calibrated point do not reach it, and an effect of the beam was named that made up for that.
+    """
+    calibrating = calibrating_names(acquisition.series)
+    flats = [item for item in acquisition.of_kind("flat") if item.setting is not None]
+    later = [item for item in flats if item.name not in calibrating]
+    if twin.spectral is None or all(item.setting is None or twin.level_at(item.setting) for item in later):
+        return None
+    seen = {_beam(item) for item in later}
+    chosen = {item.name for item in flats if item in later or _beam(item) not in seen}
+    chosen |= {item.name for item in acquisition.of_kind("dark")}
+    part = tuple(replace(item, role="calibration") for item in acquisition.series if item.name in chosen)
+    try:
+        found = calibrate_twin(replace(acquisition, series=part), rng=rng, progress=progress).spectral
+    except (InputError, FitError):
+        return None
+    if found is None:
+        return None
+    values = dict(zip(found.names, map(float, found.best), strict=True))
+    best = zip(twin.spectral.names, map(float, twin.spectral.best), strict=True)
+    return np.array([values.get(name, value) for name, value in best])
+
+
+def _beam(item: Series) -> tuple[float | None, frozenset[str]]:
+    """kV and filters of a series."""
+    setting = item.setting
+    return (None, frozenset()) if setting is None else (setting.kV, frozenset(map(str, setting.filters)))
 
 
 def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> InputError:

@@ -17,6 +17,7 @@ from raytwin.diagnosis.diagnose import _clears
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.plausibility import Suspect, check_plausibility
+from raytwin.diagnosis.preparation import prepare_session
 from raytwin.diagnosis.session import measured_levels, read_session
 from raytwin.diagnosis.unknown import unknown_evidence
 from raytwin.diagnosis.whitening import Whitening
@@ -573,3 +574,42 @@ def test_a_heel_that_was_always_there_is_named_with_a_twin_from_another_session(
     assert leading["effect"] == "heel"
     assert leading["probability"] > 0.9
     assert leading["strength"]["value"] == pytest.approx(12.0, abs=2.5)
+
+
+def test_beams_that_no_series_calibrated_move_where_the_spectrums_lines_are_drawn(line, tmp_path):
+    shutil.copy(line / "session.h5", tmp_path / "one.h5")
+    with h5py.File(tmp_path / "one.h5", "r+") as file:
+        for node in file["series"].values():
+            if node.attrs["kind"] == "flat" and node.attrs["kV"] < 60.0:
+                node.attrs["role"] = "evaluation"
+    points, twins = {}, {}
+    for name, path in (("both", line / "session.h5"), ("one", tmp_path / "one.h5")):
+        with open_acquisition(path) as acquisition:
+            prepared = prepare_session(acquisition, twin=None, rng=np.random.default_rng(1))
+        points[name], twins[name] = prepared.spectral_point, prepared.twin
+    assert points["both"] is None
+    names = twins["one"].spectral.names
+    assert points["one"].shape == (len(names),)
+    of = names.index("inherent_filtration_mm_Al")
+    wanted = twins["both"].spectral.best[twins["both"].spectral.names.index("inherent_filtration_mm_Al")]
+    # the twin's own best filtration comes from flats of one voltage
+    assert abs(points["one"][of] - wanted) < abs(twins["one"].spectral.best[of] - wanted)
+
+
+@pytest.mark.slow
+def test_a_change_of_the_beam_that_one_calibrated_voltage_cannot_tell_stays_a_tie(tmp_path, capsys):
+    session, more = tmp_path / "session.h5", tmp_path / "more.h5"
+    words = ["--seed", "2951", "--size", "64", "--effect"]
+    short = ["--protocol", "products", "--leave-out", "low_kV", "--frames", "12"]
+    full = ["--protocol", "full", "--session", "1", "--only", "wedge", "--only", "filtered_flats", "--frames", "12"]
+    assert main(["lab", "-o", str(session), *short, *words, "kv_error=-1.2"]) == 0
+    assert main(["lab", "-o", str(more), *full, *words, "kv_error=-1.2@always"]) == 0
+    capsys.readouterr()
+    assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--also", str(more), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    at = {cause["effect"]: cause["probability"] for cause in answer["causes"]}
+    # a filtration had been named, which made up for the bent way to the other voltage
+    assert at["kv_error"] > 0.3
+    assert at["filtration_error"] < 0.6
+    if answer["verdict"] == "ambiguous":
+        assert "A change is told by what was measured before it as well" in answer["next_measurement"]["text"]

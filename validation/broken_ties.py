@@ -63,7 +63,7 @@ def drawn_effect(rng: np.random.Generator) -> tuple[str, str, float]:
     return family, effect, sign * float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def one_case(seed: int, folder: Path, size: int, frames: int) -> dict:
+def one_case(seed: int, folder: Path, *, protocol: str, size: int, frames: int) -> dict:
     """Truth, first verdict, and what became of a tie."""
     family, effect, strength = drawn_effect(np.random.default_rng([seed, 7]))
     common = ["--seed", str(seed), "--size", str(size)]
@@ -71,9 +71,8 @@ def one_case(seed: int, folder: Path, size: int, frames: int) -> dict:
     geometry = options if "--geometry" in options else []
     session, more = str(folder / "session.h5"), str(folder / "more.h5")
     planted = f"{effect}={strength:.3g}"
-    answer_of(
-        ["lab", "-o", session, "--protocol", "short", *options, "--effect", planted, "--frames", str(frames), *common]
-    )
+    words = ["lab", "-o", session, "--protocol", protocol, *options, "--effect", planted, "--frames", str(frames)]
+    answer_of([*words, *common])
     first = answer_of(["diagnose", session, "-o", str(folder / "first")])
     row = {"seed": seed, "family": family, "effect": effect, "strength": strength}
     row |= {"first": first["verdict"], "broken": None}
@@ -107,6 +106,7 @@ def run() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=10)
     parser.add_argument("--seed", type=int, default=2600, help="of the first case; the next ones follow (default 2600)")
+    parser.add_argument("--protocol", choices=("short", "products"), default="short", help="of the first session")
     parser.add_argument("--size", type=int, default=64, help="pixels a side (default 64)")
     parser.add_argument("--frames", type=int, default=6, help="of each flat of the first session (default 6)")
     parser.add_argument("--json", type=Path)
@@ -114,7 +114,9 @@ def run() -> None:
     rows = []
     for seed in range(arguments.seed, arguments.seed + arguments.cases):
         with tempfile.TemporaryDirectory() as folder:
-            rows.append(one_case(seed, Path(folder), arguments.size, arguments.frames))
+            rows.append(
+                one_case(seed, Path(folder), protocol=arguments.protocol, size=arguments.size, frames=arguments.frames)
+            )
         print(json.dumps(rows[-1]), flush=True)
         if arguments.json is not None:
             arguments.json.parent.mkdir(parents=True, exist_ok=True)

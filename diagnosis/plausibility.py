@@ -54,6 +54,8 @@ _INHERENT_MAY_BE_MM_AL = (0.0, 3.0)  # as far as calibration's prior plausibly g
 _INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)  # where flats tell
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
 _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
+_CLEAR_QUANTA = 5.0  # standard deviations of a variance above that of a dark
+_ENERGY_RANGE = 4.0  # times between the signals of quanta of the softest and of a usual beam
 _DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
 _RELEASED = 0.08  # of the exposures before, which an image lag may leave in a dark
 _RELEASED_LATER, _REMEMBERED = 0.02, 3  # the same in the last frames of a lit series; from so many exposures before
@@ -227,7 +229,7 @@ def check_plausibility(
     for reading in judged:
         before = [one.level_DN for one in judged if one.series.index < reading.series.index][-_REMEMBERED:]
         reading.released = _RELEASED_LATER * max(before, default=0.0) / max(reading.level_DN, 1e-9)
-    dim, judged = _without_beam(judged)
+    dim, judged = _without_beam(judged, good)
     suspects += dim
     relative = _relative_gain([item for item in judged if item.series.kind == "flat"], good)
     for reading in judged:
@@ -405,17 +407,23 @@ def _measure(item: _Reading, dark: FloatArray | None, read_DN2: float, good: NDA
     return True
 
 
-def _without_beam(judged: list[_Reading]) -> tuple[list[Suspect], list[_Reading]]:
+def _without_beam(judged: list[_Reading], good: NDArray[np.bool_]) -> tuple[list[Suspect], list[_Reading]]:
     """Flats without light among flats with light."""
     flats = [item for item in judged if item.series.kind == "flat"]
     found, left = [], []
     # per mAs, or per ms: a short exposure is weak by right
     rates = {item.name: item.level_DN / math.exp(item.label.log_load) for item in flats}
     loads = {item.name: item.label.load is None for item in flats}
+    dim = set()
+    for item in flats:
+        alike = [rate for name, rate in rates.items() if loads[name] == loads[item.name]]
+        if rates[item.name] <= _NO_BEAM * float(np.median(alike)):
+            dim.add(item.name)
+    gains = [item.gain_DN for item in flats if item.name not in dim and item.gain_DN > 0]
+    usual = float(np.median(gains)) if gains else math.nan
     for item in judged:
-        alike = [rate for name, rate in rates.items() if loads[name] == loads.get(item.name)]
-        dim = item.name in rates and rates[item.name] <= _NO_BEAM * float(np.median(alike))
-        if item.series.kind == "flat" and (dim or not item.level_DN > 0):
+        dark = item.name in dim and not _shows_quanta(item, usual, good)
+        if item.series.kind == "flat" and (dark or not item.level_DN > 0):
             found.append(
                 Suspect(
                     series=(item.name,),
@@ -426,6 +434,14 @@ def _without_beam(judged: list[_Reading]) -> tuple[list[Suspect], list[_Reading]
         else:
             left.append(item)
     return found, left
+
+
+def _shows_quanta(item: _Reading, gain_DN: float, good: NDArray[np.bool_]) -> bool:
+    """Whether the little light of a flat has the noise of quanta, which are worth about gain_DN each: a soft beam behind metal."""
+    if item.variance_DN2 is None or not item.gain_DN > 0:
+        return False
+    clear = item.gain_DN * item.level_DN > _CLEAR_QUANTA * item.gain_sd * _mean(item.variance_DN2, good)
+    return clear and gain_DN / _ENERGY_RANGE < item.gain_DN < gain_DN * _ENERGY_RANGE
 
 
 def _relative_gain(flats: Sequence[_Reading], good: NDArray[np.bool_]) -> FloatArray:

@@ -162,6 +162,25 @@ def test_weak_flat_of_a_short_exposure_is_no_dark(changed):
     assert not any("shows no beam" in item.text for item in found_in(changed(change)).suspects)
 
 
+@pytest.mark.parametrize("quanta", [True, False])
+def test_little_light_with_the_noise_of_quanta_is_a_beam(changed, quanta):
+    rng = np.random.default_rng(8)
+
+    def change(file):
+        node, dark = file["series"][f"{FLAT_40}_2"], file["series"]["dark_25ms"]["frames"][:].astype(float)
+        frames = node["frames"][:].astype(float)
+        noise_DN = [np.std(np.diff(one, axis=0)) / np.sqrt(2.0) for one in (frames, dark)]
+        signal_DN = frames.mean() - dark.mean()
+        each_DN = (noise_DN[0] ** 2 - noise_DN[1] ** 2) / signal_DN
+        # as behind a filter that lets 0.5 % through
+        light = rng.poisson(0.005 * signal_DN / each_DN, frames.shape) * each_DN if quanta else 0.005 * signal_DN
+        left = dark.mean(axis=0) + noise_DN[1] * rng.standard_normal(frames.shape) + light
+        node["frames"][...] = np.rint(left).astype(np.uint16)
+
+    said = [item.text for item in found_in(changed(change)).suspects]
+    assert any("shows no beam" in text for text in said) == (not quanta)
+
+
 def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field():
     rng = np.random.default_rng(4)
     picture = np.full((60, 80), 30000.0)

@@ -55,6 +55,9 @@ class Instrument:
     belt_axis: str | None = None
 
     def __post_init__(self) -> None:
+        if self.scintillator == ():
+            # a detector without a sensitive layer is none: what it is, is not stated
+            object.__setattr__(self, "scintillator", None)
         zero_allowed = {"focal_spot_mm", "readout_ms"}
         for field in fields(self):
             value = getattr(self, field.name)

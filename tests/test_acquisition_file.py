@@ -413,3 +413,13 @@ def test_a_line_s_description_and_binning_come_back_from_the_file(tmp_path):
         (series,) = acquisition.series
         assert series.setting.binning == 2
         assert (series.belt_speed_mm_s, series.frame_interval_ms) == (100.0, 2.0)
+
+
+def test_an_empty_scintillator_is_one_that_nobody_states(tmp_path):
+    path = tmp_path / "session.h5"
+    with write_acquisition(path, Instrument(scintillator=(), inherent_filtration=())) as writer:
+        writer.add_series("dark", kind="dark", exposure_ms=20.0, frames=np.full((2, 8, 8), 100, np.uint16))
+    with open_acquisition(path) as acquisition:
+        assert acquisition.instrument.scintillator is None
+        # that nothing filters the beam is a statement
+        assert acquisition.instrument.inherent_filtration == ()

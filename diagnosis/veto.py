@@ -118,7 +118,9 @@ def misfit_of(problem: Problem, leading: Hypothesis) -> Misfit:
     # what nuisances and laws are pulled by counts as well
     beyond = float(residual / root @ allowed.solve(residual / root)) - _USUALLY_LEFT * len(residual)
     there = float(problem.residual @ LocalNuisances(problem.factors, problem.blocks).solve(problem.residual))
-    left = beyond / max(there, 1e-12) if beyond > _LEAST_UNFIT * len(residual) else 0.0
+    # a gap that lifts all squares to one a probe at the most cannot tell what is left of it from noise that is taken as too small
+    judged = beyond > _LEAST_UNFIT * len(residual) and there > len(residual)
+    left = beyond / there if judged else 0.0
     found, known = allowed.fitted(residual / root), 1.0 - allowed.variance
     pulled = [
         math.sqrt(float(np.sum(found[chance][seen] ** 2) / np.sum(known[chance][seen])))

@@ -467,6 +467,27 @@ def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was(
     assert not misfit(30.0 * np.sqrt(0.03)).refused
 
 
+@pytest.mark.parametrize(("size_of_gap", "refused"), [(2.0, False), (30.0, True)])
+def test_a_gap_no_larger_than_noise_may_be_is_not_refused_for_what_the_noise_leaves(size_of_gap, refused):
+    rng = np.random.default_rng(11)
+    size = 600
+    direction, other = np.zeros(size), np.zeros(size)
+    direction[:20] = rng.standard_normal(20)
+    other[300:] = rng.standard_normal(300)
+    response = size_of_gap * direction
+    made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
+    # noise of 0.85, where 0.77 is usual; as large a share of the gap is something else in both
+    residual = response + 0.1 * size_of_gap * other + 0.85 * rng.standard_normal(size)
+    planted = SimpleNamespace(
+        residual=residual,
+        factors=np.zeros((size, 1)),
+        groups=np.repeat(np.arange(20), 30),
+        blocks=np.zeros(size, dtype=int),
+    )
+    leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+    assert misfit_of(planted, leading).refused == refused
+
+
 @pytest.mark.parametrize(("times", "refused"), [(1.0, False), (6.0, True)])
 def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_does(times, refused):
     rng = np.random.default_rng(9)

@@ -4,20 +4,22 @@ The simulator shares no code with the twin or the virtual lab but the file forma
 the twin, so that wrong attenuation tables are not tried here, and SpekPy, of which it takes another model and table (`kqp`,
 NIST). A panel that adds up energies, Gaussian noise of the compound Poisson's variance, objects sampled at points (no pixel is
 cut by an edge), a Gaussian spread, no times; five lines of other pixels, distances, beams and scintillators (`LINES`), a panel
-whose pixels are all alike and see no farther than themselves (`even`), and one that counts (`counting`: darks of zeros).
-Its effects are laws of its own: scatter and
-tails are Gaussians, glare is two of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of
-gain; K photons are caught under two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced
-objects have shifted path lengths.
+whose pixels are all alike and see no farther than themselves (`even`), one that counts (`counting`: darks of zeros), and any
+number of lines of which all is drawn (`random`). Its effects are laws of its own: scatter and tails are Gaussians, glare is two
+of them, lag is one exponential, the focal spot a Gaussian, drift is white, tiles are steps of gain; K photons are caught under
+two Gaussians, a moving object is seen in nine places, a heel is a wedge of tungsten, displaced objects have shifted path
+lengths.
 
     python validation/second_simulator.py --seed 1 --json build/second_simulator.json
     python validation/second_simulator.py --line coarse
+    python validation/second_simulator.py --line random --seed 200 --frames 12
     python validation/second_simulator.py --only none kv_error tiles veiling_glare+kv_error
 """
 
 import argparse
 import contextlib
 import copy
+import dataclasses
 import json
 import math
 import tempfile
@@ -376,6 +378,99 @@ def spectrum(name: str, kV: float, aluminium_mm: float, copper_mm: float) -> tup
     return np.bincount(whole, absorbed * energies)[seen] / sums[seen], sums[seen]
 
 
+def random_line(seed: int) -> str:
+    """Name of a line whose pixels, distances, beams, panel and noise are all drawn; it joins LINES."""
+    rng = np.random.default_rng([99, seed])
+
+    def one_of(*choices):
+        return choices[rng.integers(len(choices))]
+
+    shape = one_of(
+        (64, 64), (96, 96), (128, 128), (80, 200), (160, 72), (48, 256), (100, 132), (192, 192)
+    )  # the last is compared in squares of two pixels
+    pixel_mm = math.exp(rng.uniform(math.log(0.05), math.log(0.8)))
+    detector_mm = pixel_mm * max(shape) * rng.uniform(5, 25)
+    near = rng.uniform(1.05, 2.2)
+    far = near * rng.uniform(1.1, 1.5)
+    voltages = one_of(
+        (40.0, 80.0),
+        (50.0, 100.0),
+        (60.0, 120.0),
+        (45.0, 75.0, 110.0),
+        (80.0, 160.0),
+        (35.0, 50.0),
+        (70.0, 140.0),
+        (30.0, 60.0, 90.0),
+    )
+    bits = one_of(12, 14, 16, 16)
+    material, thickness_mm, edge_keV, line_keV = one_of(
+        ("CsI", 0.15, 34.5, 29.5), ("CsI", 0.6, 34.5, 29.5), ("Gd2O2S", 0.1, 50.24, 42.8), ("Gd2O2S", 0.3, 50.24, 42.8)
+    )
+    most_photons = math.exp(rng.uniform(math.log(2e3), math.log(4e5)))
+    full_DN = rng.uniform(0.4, 0.85) * (2**bits - 1)
+    soft = voltages[0] < 40.0
+    name = f"random {seed}"
+    drawn = LineOf(
+        shape=shape,
+        pixel_mm=round(pixel_mm, 4),
+        near_mm=round(detector_mm / near, 1),
+        far_mm=round(detector_mm / far, 1),
+        detector_mm=round(detector_mm, 1),
+        spread_px=one_of(0.0, 0.3, 0.5, 0.8, 1.2),
+        read_DN=0.0,
+        dark_DN=0.0,
+        bits=bits,
+        DN_per_keV=1.0,
+        photons=7e-4,
+        scintillator=(material, thickness_mm),
+        edge_keV=edge_keV,
+        line_keV=line_keV,
+        lag_s=one_of(0.05, 0.2, 0.5, 1.5),
+        pause_s=one_of(2.0, 6.0, 20.0),
+        readout_ms=one_of(0.0, 5.0, 30.0),
+        current_mA=dict.fromkeys(voltages, 1.0),
+        copper_times=1.0,
+        anode_deg=one_of(8.0, 12.0, 16.0, 22.0),
+        beryllium_mm=one_of(0.5, 1.0, 2.5),
+        wedge_mm=0.5 if soft else round(rng.uniform(1.0, 3.0), 1),
+        water_mm=round(rng.uniform(8, 20) if soft else rng.uniform(15, 45), 0),
+        lead_mm=round(rng.uniform(0.5, 3.0), 1),
+        declared=bool(rng.uniform() < 0.75),
+    )
+    LINES[name] = drawn
+    # photons and keV of a mAs at each voltage, and keV behind copper
+    sums = {}
+    for kV in voltages:
+        energies, photons = spectrum(name, kV, 2.1, 0.0)
+        behind_copper = spectrum(name, kV, 2.1, 0.1)
+        sums[kV] = float(photons.sum()), float(photons @ energies), float(behind_copper[0] @ behind_copper[1])
+    spectrum.cache_clear()
+    count, energy_keV, _ = sums[max(voltages)]
+    DN_per_keV = full_DN / (most_photons * energy_keV / count)
+    # SpekPy's photons are those on a square centimetre at a metre
+    photons = 0.01 * pixel_mm**2 * (1000.0 / detector_mm) ** 2 * math.exp(0.25 * rng.standard_normal())
+    current_mA = most_photons / (count * photons / drawn.photons * 0.16)
+    noise_DN = DN_per_keV * 60.0 * math.sqrt(most_photons)
+    LINES[name] = dataclasses.replace(
+        drawn,
+        DN_per_keV=DN_per_keV,
+        photons=photons,
+        current_mA={kV: float(f"{current_mA * energy_keV / sums[kV][1]:.4g}") for kV in voltages},
+        copper_times=round(min(energy / behind for _, energy, behind in sums.values()) * 0.9, 2),
+        read_DN=max(noise_DN * rng.uniform(0.03, 0.3), 0.6),
+        dark_DN=round((2**bits - 1) * rng.uniform(0.01, 0.06)),
+    )
+    CASES["dark_drift"] = max(1.6 * LINES[name].read_DN, 3.0), True
+    return name
+
+
+def random_cases(seed: int) -> list[str]:
+    """No effect, two single ones, and a pair."""
+    rng = np.random.default_rng([98, seed])
+    single = rng.choice([case for case in CASES if case != "none"], 2, replace=False)
+    return ["none", *map(str, single), str(rng.choice(PAIRS))]
+
+
 class Line:
     """A line with its effects, drawn from a generator; what charge the panel still holds goes from series to series."""
 
@@ -642,15 +737,23 @@ def judged(name: str, effect: str, seed: int, frames: int) -> dict:
 def run() -> None:
     """The table on the terminal, and the rows as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--line", choices=LINES, default="usual", help="which line (default usual)")
+    parser.add_argument(
+        "--line",
+        choices=[*LINES, "random"],
+        default="usual",
+        help="which line (default usual); random: all of it drawn from the seed, and four of the cases",
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=20, help="of a series (default 20)")
     parser.add_argument("--only", nargs="+", choices=[*sorted(CASES), *PAIRS], metavar="EFFECT")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
     rows = []
-    for effect in options.only or cases_of(LINES[options.line]):
-        row = judged(options.line, effect, options.seed, options.frames)
+    line = random_line(options.seed) if options.line == "random" else options.line
+    if line != options.line:
+        print(LINES[line])
+    for effect in options.only or (random_cases(options.seed) if line != options.line else cases_of(LINES[line])):
+        row = judged(line, effect, options.seed, options.frames)
         rows.append(row)
         told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())
         named = ", ".join(row["named"]) or row["verdict"]

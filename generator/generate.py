@@ -295,15 +295,10 @@ class ChannelModel:
 
 def _flat_shape(twin: Twin, setting: Setting) -> NDArray[np.float32]:
     """Open field over its median (row, column): of this kV and filter, else of the nearest kV that was measured."""
-    level = twin.level_at(setting)
+    level = twin.level_nearest(setting)
     if level is None:
-        known = [one for one in twin.levels if one.kV is not None] or list(twin.levels)
-        level = min(
-            known,
-            key=lambda one: (
-                abs(math.log((one.kV or setting.kV) / setting.kV)),
-                not same_layers(one.filters, setting.filters),
-            ),
+        raise InputError(
+            "twin", received="no levels", expected="at least one measured flat", remedy="calibrate it from flats"
         )
     return level.flat_shape
 

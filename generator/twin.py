@@ -189,14 +189,14 @@ class Twin:
         return None
 
     def level_nearest(self, setting: Setting | None) -> Level | None:
-        """The level of these kV and filters, else the nearest in kV, then in filters; None: no levels."""
+        """The level of these kV and filters, else of those whose kV is known the nearest in kV, then in filters; None: no levels."""
         level = None if setting is None else self.level_at(setting)
         if level is not None or not self.levels:
             return level
         kV = None if setting is None else setting.kV
         wanted = set() if setting is None else {str(layer) for layer in setting.filters}
         return min(
-            self.levels,
+            [item for item in self.levels if item.kV is not None] or self.levels,
             key=lambda item: (
                 abs(math.log(item.kV / kV)) if kV is not None and item.kV is not None else 0.0,
                 len(wanted ^ {str(layer) for layer in item.filters}),

@@ -277,6 +277,25 @@ def test_without_a_spectrum_only_measured_levels_are_predicted():
         spectral_model_of(plain)
 
 
+@pytest.mark.parametrize(
+    ("levels", "kV", "filters", "found"),
+    [
+        ([(40.0, "Cu:0.05"), (90.0, "Cu:0.05")], 90.0, "Cu:0.05", 1),
+        ([(40.0, "Cu:0.05"), (90.0, "Cu:0.05")], 55.0, "Cu:0.05", 0),
+        # the nearest voltage counts before the filter, and an unknown voltage is near to none
+        ([(40.0, ""), (40.0, "Cu:0.05"), (90.0, "Al:1")], 80.0, "Cu:0.05", 2),
+        ([(40.0, ""), (40.0, "Cu:0.05"), (90.0, "Al:1")], 45.0, "Cu:0.1", 0),
+        ([(None, "Cu:0.05"), (40.0, "")], 90.0, "Cu:0.05", 1),
+        ([(None, "Cu:0.05")], 90.0, "Cu:0.05", 0),
+    ],
+)
+def test_the_nearest_level_is_nearest_in_voltage_then_in_filters(twin, levels, kV, filters, found):
+    made = tuple(replace(twin.levels[0], kV=kV, filters=filters_from_text(text)) for kV, text in levels)
+    wanted = Setting(kV=kV, power_W=40.0, exposure_ms=20.0, filters=filters_from_text(filters))
+    assert replace(twin, levels=made).level_nearest(wanted) is made[found]
+    assert replace(twin, levels=()).level_nearest(wanted) is None
+
+
 def pair(exposure_ms, averaged=1):
     return tuple(
         Setting(kV=kV, power_W=40.0, exposure_ms=exposure_ms, filters=COPPER, averaged=averaged) for kV in GAINS

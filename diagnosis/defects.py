@@ -98,10 +98,11 @@ def _of_lines(ratio: NDArray[np.floating], good: NDArray[np.bool_]) -> NDArray[n
 @lru_cache(maxsize=64)
 def _largest_ratio(frames: int) -> float:
     """Variance from differences of successive frames over its expectation that one pixel in ten million passes by chance."""
-    from scipy.stats import chi2
+    from scipy.special import gammainccinv
 
     freedom = 2.0 * (frames - 1.0) / 3.0  # successive differences share frames
-    return float(chi2.isf(1e-7, freedom) / freedom)
+    # upper end of chi squared
+    return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
 
 
 def memory_of(look: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:

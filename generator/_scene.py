@@ -393,9 +393,9 @@ class ModelCache:
         points = stack.reshape(len(materials), -1)
         inverse = None
         if points.shape[1] <= _MOST_UNIQUE_PIXELS:
-            distinct, where = np.unique(points.astype(np.float32), axis=1, return_inverse=True)
+            distinct, where = _distinct(points.astype(np.float32))
             if distinct.shape[1] < 0.7 * points.shape[1]:
-                points, inverse = distinct.astype(np.float64), where.reshape(-1)
+                points, inverse = distinct.astype(np.float64), where
         self._numbers += 1
         borders = find_borders(depth, least_depth=_BORDER_DEPTH)
         scene = _Scene(
@@ -473,3 +473,17 @@ def _no_level(request: "SeriesRequest") -> InputError:
         expected="a tube load (current_mA or power_W), or the level of the open beam",
         remedy="state current_mA or power_W",
     )
+
+
+def _distinct(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Distinct columns of points (coordinate, point), in order, and the number of each point's column (point,).
+
+    One or two coordinates are sorted as numbers, in a tenth of the time that columns take.
+    """
+    if len(points) > 2:
+        distinct, where = np.unique(points, axis=1, return_inverse=True)
+        return distinct, where.reshape(-1)
+    numbers = points[0] if len(points) == 1 else points[0] + 1j * points[1]
+    found, where = np.unique(numbers, return_inverse=True)
+    distinct = found[None, :] if len(points) == 1 else np.stack([found.real, found.imag])
+    return distinct, where.reshape(-1)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from raytwin.errors import InputError
+from raytwin.generator._scene import _distinct
 from raytwin.generator.projection import project_polychromatic
 
 TOLERANCE = 1e-4  # relative; what the docstring promises
@@ -200,3 +201,11 @@ def test_a_pixel_does_not_depend_on_its_neighbours(seed, pixels):
 def test_what_cannot_be_projected_is_refused_in_lab_words(thickness, mu, weights, message):
     with pytest.raises(InputError, match=message):
         project_polychromatic(np.array(thickness), np.array(mu), np.array(weights))
+
+
+@pytest.mark.parametrize("coordinates", [1, 2, 3])
+def test_distinct_path_lengths_are_found_once_each_and_put_back(coordinates):
+    points = np.random.default_rng(3).integers(0, 5, (coordinates, 400)).astype(np.float32) / np.float32(3.0)
+    distinct, where = _distinct(points)
+    np.testing.assert_array_equal(distinct[:, where], points)
+    assert len({tuple(column) for column in distinct.T}) == distinct.shape[1] < 400

@@ -35,9 +35,8 @@ from .usable import SeenSeries, look_at_all, stated_series, summarise_all
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
-_NEAR_A_POINT = (
-    0.2  # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
-)
+# step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
+_NEAR_A_POINT = 0.2
 _PLACES = "places of scenes"
 
 

@@ -11,6 +11,7 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.coarser import coarser
 from ..acquisition.cut_off import share_of_zeros, without_cut_off_darks
 from ..calibration.calibrate import calibrate_twin
+from ..calibration.repeated_frames import beam_of
 from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
 from .coarse import LEAST_SIDE, coarse_factor
@@ -130,35 +131,34 @@ def _spectral_point(
     rng: np.random.Generator,
     progress: Callable[[str], None] | None,
 ) -> NDArray[np.float64] | None:
-    """The twin's spectral parameters (parameter,) as later flats show them; None where the twin has seen all their beams.
+    """The twin's spectral parameters (parameter,) as the session's flats show them, each beam's later ones; None: it knows all beams.
 
     A calibration from few beams leaves the spectrum wide, and what other beams show lies far along its nuisances: straight lines
     from the calibrated point do not reach it, and an effect of the beam was named that made up for that.
     """
     calibrating = calibrating_names(acquisition.series)
-    flats = [item for item in acquisition.of_kind("flat") if item.setting is not None]
-    later = [item for item in flats if item.name not in calibrating]
-    if twin.spectral is None or all(item.setting is None or twin.level_at(item.setting) for item in later):
+    flats = [
+        item
+        for item in acquisition.of_kind("flat")
+        if item.setting is not None and not item.corrected & {"log", "gain"} and item.panel_rotation_deg % 360.0 == 0.0
+    ]
+    if twin.spectral is None or all(item.setting is None or twin.level_at(item.setting) for item in flats):
         return None
-    seen = {_beam(item) for item in later}
-    chosen = {item.name for item in flats if item in later or _beam(item) not in seen}
+    later = {beam_of(item) for item in flats if item.name not in calibrating}
+    chosen = {item.name for item in flats if item.name not in calibrating or beam_of(item) not in later}
     chosen |= {item.name for item in acquisition.of_kind("dark")}
-    part = tuple(replace(item, role="calibration") for item in acquisition.series if item.name in chosen)
+    series = tuple(
+        replace(item, role="calibration" if item.name in chosen else "evaluation") for item in acquisition.series
+    )
     try:
-        found = calibrate_twin(replace(acquisition, series=part), rng=rng, progress=progress).spectral
+        found = calibrated_twin(replace(acquisition, series=series), rng=rng, progress=progress).spectral
     except (InputError, FitError):
-        return None
+        return None  # then the calibrated point has to do
     if found is None:
         return None
     values = dict(zip(found.names, map(float, found.best), strict=True))
     best = zip(twin.spectral.names, map(float, twin.spectral.best), strict=True)
     return np.array([values.get(name, value) for name, value in best])
-
-
-def _beam(item: Series) -> tuple[float | None, frozenset[str]]:
-    """kV and filters of a series."""
-    setting = item.setting
-    return (None, frozenset()) if setting is None else (setting.kV, frozenset(map(str, setting.filters)))
 
 
 def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> InputError:

@@ -594,6 +594,18 @@ def test_beams_that_no_series_calibrated_move_where_the_spectrums_lines_are_draw
     wanted = twins["both"].spectral.best[twins["both"].spectral.names.index("inherent_filtration_mm_Al")]
     # the twin's own best filtration comes from flats of one voltage
     assert abs(points["one"][of] - wanted) < abs(twins["one"].spectral.best[of] - wanted)
+    # a twin from elsewhere that knows one voltage, and a session whose own calibrating flats show both
+    with open_acquisition(line / "session.h5") as acquisition:
+        given = prepare_session(acquisition, twin=twins["one"], rng=np.random.default_rng(1))
+    assert abs(given.spectral_point[of] - wanted) < abs(twins["one"].spectral.best[of] - wanted)
+    # flats of a panel that was turned do not calibrate, nor here
+    with h5py.File(tmp_path / "one.h5", "r+") as file:
+        for node in file["series"].values():
+            if node.attrs["kind"] == "flat" and node.attrs["kV"] < 60.0:
+                node.attrs["panel_rotation_deg"] = 90.0
+    with open_acquisition(tmp_path / "one.h5") as acquisition:
+        turned = prepare_session(acquisition, twin=twins["one"], rng=np.random.default_rng(1))
+    assert turned.spectral_point is None
 
 
 @pytest.mark.slow

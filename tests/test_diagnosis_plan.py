@@ -442,10 +442,16 @@ def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(
     assert can_show(effect, scene)
 
 
+def gain_found(residual, made):
+    """A problem of 600 probes in twenty groups, without nuisances, and a hypothesis that a curve explains it at 10."""
+    groups = np.repeat(np.arange(20), 30)
+    problem = SimpleNamespace(residual=residual, factors=np.zeros((residual.size, 1)), groups=groups, blocks=groups)
+    return problem, SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+
+
 def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was():
     rng = np.random.default_rng(8)
     size = 600
-    groups = np.repeat(np.arange(20), 30)
     direction, other = np.zeros(size), np.zeros(size)
     direction[:300] = rng.standard_normal(300)
     other[300:] = rng.standard_normal(300)
@@ -455,9 +461,7 @@ def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was(
         made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
         noise = 0.7 * rng.standard_normal(size)  # floors make probes' standard deviations wider than their noise
         residual = response * (1.0 + off) + left * other + noise
-        planted = SimpleNamespace(residual=residual, factors=np.zeros((size, 1)), groups=groups, blocks=groups)
-        leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
-        return misfit_of(planted, leading)
+        return misfit_of(*gain_found(residual, made))
 
     assert misfit(0.0).left == 0.0
     # a law that is off by a tenth leaves nothing that it may not
@@ -478,14 +482,7 @@ def test_a_gap_no_larger_than_noise_may_be_is_not_refused_for_what_the_noise_lea
     made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
     # noise of 0.85, where 0.77 is usual; as large a share of the gap is something else in both
     residual = response + 0.1 * size_of_gap * other + 0.85 * rng.standard_normal(size)
-    planted = SimpleNamespace(
-        residual=residual,
-        factors=np.zeros((size, 1)),
-        groups=np.repeat(np.arange(20), 30),
-        blocks=np.zeros(size, dtype=int),
-    )
-    leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
-    assert misfit_of(planted, leading).refused == refused
+    assert misfit_of(*gain_found(residual, made)).refused == refused
 
 
 @pytest.mark.parametrize(("times", "refused"), [(1.0, False), (6.0, True)])
@@ -499,13 +496,6 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
         curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
     )
     residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
-    planted = SimpleNamespace(
-        residual=residual,
-        factors=np.zeros((size, 1)),
-        groups=np.repeat(np.arange(20), 30),
-        blocks=np.zeros(size, dtype=int),
-    )
-    leading = SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
-    found = misfit_of(planted, leading)
+    found = misfit_of(*gain_found(residual, made))
     assert found.pulled == pytest.approx(times, rel=0.35)
     assert found.refused == refused

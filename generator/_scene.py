@@ -478,7 +478,7 @@ def _no_level(request: "SeriesRequest") -> InputError:
 def _distinct(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Distinct columns of points (coordinate, point), in order, and the number of each point's column (point,).
 
-    One or two coordinates are sorted as numbers, in a tenth of the time that columns take.
+    One or two coordinates are sorted as numbers, in a third of the time that columns take or less (16,384 points).
     """
     if len(points) > 2:
         distinct, where = np.unique(points, axis=1, return_inverse=True)

@@ -16,7 +16,7 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import Problem, build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
 from ..diagnosis.curves import Curve
-from ..diagnosis.held_out import folds_of, left_over, noise_alone, shrinkage_of
+from ..diagnosis.held_out import folds_of, left_over, shrinkage_of
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 
@@ -60,8 +60,8 @@ def shrinkage(problem: Problem, effects: Sequence[tuple[Curve, float]]) -> dict[
     for fold in (0, 1):
         fit = folds != fold
         if fit.any() and not fit.all():
-            before[~fit], after[~fit] = left_over(problem, fit), left_over(problem, fit, effects)
-            noise[~fit] = noise_alone(problem, fit)
+            (before[~fit], sd), (after[~fit], _) = left_over(problem, fit), left_over(problem, fit, effects)
+            noise[~fit] = problem.noise[~fit] / sd
     known = np.isfinite(before)
     if not known.any():
         return None

@@ -89,8 +89,8 @@ def _beam(view: SeriesView) -> tuple[Any, ...]:
 
 def left_over(
     problem: Problem, fit: NDArray[np.bool_], added: Sequence[tuple[Curve, float]] = ()
-) -> NDArray[np.float64]:
-    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction, and these (probe,).
 
     added: effects and their strengths that are taken off; what they do by chance is fitted beside the nuisances and counts as
     noise. What their laws may be off by is fitted as well, so that no nuisance is drawn away by it, but neither taken off nor
@@ -113,13 +113,8 @@ def left_over(
     # the nuisances' part alone: those of the laws come last
     held = np.pad(factors[~fit], ((0, 0), (0, known.factors.shape[1] - factors.shape[1])))
     left = residual[~fit] - held @ known.fitted(residual[fit] / root)
-    return np.asarray(left / np.sqrt(own[~fit] + known.known_of(held)))
-
-
-def noise_alone(problem: Problem, fit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """What a repeat of the same measurement would show outside `fit`: counting noise, of all that nuisances fitted there allow."""
-    inner = LocalNuisances(problem.factors[fit], problem.blocks[fit])
-    return np.asarray(problem.noise[~fit] / np.sqrt(1.0 + inner.known_of(problem.factors[~fit])))
+    sd = np.sqrt(own[~fit] + known.known_of(held))
+    return np.asarray(left / sd), np.asarray(sd)
 
 
 def held_out(
@@ -140,13 +135,14 @@ def held_out(
         held = ~fit
         if not fit.any() or not held.any():
             continue
-        before[held] = left_over(problem, fit)
-        noise[held] = noise_alone(problem, fit)
+        before[held], sd = left_over(problem, fit)
+        # what a repeat of the same measurement would show: counting noise, of all that nuisances fitted there allow
+        noise[held] = problem.noise[held] / sd
         strengths = strengths_on(problem, leading, effects, fit)
         added = [(leading.variants[effect], strengths[effect]) for effect in effects]
-        after[held] = left_over(problem, fit, added) if effects else before[held]
+        after[held] = left_over(problem, fit, added)[0] if effects else before[held]
         for one, effect in zip(added, effects, strict=True):
-            alone[effect][held] = left_over(problem, fit, [one])
+            alone[effect][held] = left_over(problem, fit, [one])[0]
     known = np.isfinite(before)
     before, after, noise, series = before[known], after[known], noise[known], problem.series_of[known]
     axes = np.array([name.axis for name in problem.names])[known]

@@ -66,8 +66,10 @@ class LocalNuisances:
         right = right[self._order]
         across = right[self._across]
         for part, lower, coupling in self._parts:
-            right[part] = _half(lower, right[part])
-            across -= coupling.T @ right[part]
+            there = np.flatnonzero(np.any(right[part], axis=0))  # of many vectors few touch a block's own nuisances
+            own = _half(lower, right[part, there])
+            right[part, there] = own
+            across[:, there] -= coupling.T @ own
         right[self._across] = _half(self._cholesky, across)
         return right
 

@@ -293,13 +293,13 @@ def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ..
     if not images:
         return {}
     rows, columns = shape
-    ramps = (np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :])
-    alike = probes.projection.apply(np.stack([np.broadcast_to(ramp, shape) for ramp in ramps]))
-    result = {}
-    for key, image in images.items():
-        if image.size == 1:
-            found = float(image.flat[0]) * alike
-        else:
-            found = probes.projection.apply(np.stack([image * ramp for ramp in ramps]))
-        result[key] = probes.without_scalars(found)
-    return result
+    ramps = np.zeros((2, *shape), np.float32)
+    ramps[0], ramps[1] = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :]
+    uneven_ones = [key for key, image in images.items() if image.size > 1]
+    # all at once: the projection is larger than a processor's cache
+    under = [ramps, *(images[key] * ramps for key in uneven_ones)]
+    alike, *found = probes.projection.apply(np.stack(under))
+    result = {key: float(image.flat[0]) * alike for key, image in images.items()} | dict(
+        zip(uneven_ones, found, strict=True)
+    )
+    return {key: probes.without_scalars(columns) for key, columns in result.items()}

@@ -127,9 +127,7 @@ class Areas:
             if one is image:
                 return means
         values = image.ravel()[self.order]
-        sums = np.array([np.add.reduce(values[part]) for part in self.parts])
-        counts = np.array([part.stop - part.start for part in self.parts])
-        found = float(np.add.reduce(values)) / values.size, sums / counts
+        found = float(np.add.reduce(values)) / values.size, np.array([_mean(values[part]) for part in self.parts])
         # what acts after the quanta leaves their map as it is
         self.known[:] = [(image, found), *self.known[:1]]
         return found
@@ -137,7 +135,12 @@ class Areas:
     def mean(self, image: NDArray[np.floating] | float) -> float:
         """Mean of a map over all good pixels."""
         whole = np.asarray(image)
-        return float(whole.flat[0]) if whole.size == 1 else float(whole.ravel()[self.order].mean())
+        return float(whole.flat[0]) if whole.size == 1 else _mean(whole.ravel()[self.order])
+
+
+def _mean(values: NDArray[np.floating]) -> float:
+    """Mean of values, NaN of none; half as long as numpy's own for some thousand of them."""
+    return float(np.add.reduce(values)) / values.size if values.size else math.nan
 
 
 @lru_cache(maxsize=64)
@@ -358,13 +361,15 @@ class _MovingPicture:
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "_MovingPicture":
+        if not expected.trend_DN:
+            return _STILL
         good, areas = context.good, context.areas
         shape: NDArray[np.float64] | float = 1.0
         kept, courses = [], []
-        if expected.trend_DN and context.kind in ("flat", "object"):
+        if context.kind in ("flat", "object"):
             signal = np.broadcast_to(expected.signal_DN, good.shape).ravel()[areas.order]
             shape = signal / max(float(signal.mean()), 1e-12)
-        for image, course in expected.trend_DN or ():
+        for image, course in expected.trend_DN:
             whole = np.broadcast_to(np.asarray(image, dtype=np.float64), good.shape).ravel()[areas.order]
             own = whole - float(whole.mean()) * shape
             profile = np.asarray(course, dtype=np.float64)
@@ -373,7 +378,7 @@ class _MovingPicture:
                 kept.append(own)
                 courses.append(profile - profile.mean())
         if not kept:
-            return _MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)), areas.order[:0], np.zeros((0, 0)))
+            return _STILL
         pixels, profiles = np.stack(kept), np.stack(courses)
         whole = np.zeros((len(kept), *good.shape))
         whole.reshape(len(kept), -1)[:, areas.order] = pixels
@@ -437,6 +442,9 @@ class _MovingPicture:
             return 0.0
         early, late = self.courses[:, :-step], self.courses[:, step:]
         return float(np.sum(early @ late.T / early.shape[1] * self.products[0]))
+
+
+_STILL = _MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)), np.zeros(0, np.intp), np.zeros((0, 0)))
 
 
 def _mean_product(images: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -667,19 +675,20 @@ class MapProjection:
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
-        sharper, root = np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0))
+        # a template counts by its shape: single precision is a ten-thousandth of what is left of one that is kept
+        maps = (np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0)), white_DN2)
+        sharper, root, white = (np.ascontiguousarray(one, dtype=np.float32) for one in maps)
         kernels = _separated(np.asarray(autocovariance_table, dtype=np.float64))
-        white = np.ascontiguousarray(white_DN2, dtype=np.float64)
         used: list[Template] = []
-        rows, spread = (np.empty((len(templates), *mask.shape)) for _ in range(2))
+        rows, spread = (np.empty((len(templates), *mask.shape), np.float32) for _ in range(2))
         for template in templates:
             # rows are 0 outside the mask, as the weights are
-            image = np.ascontiguousarray(template.image)
+            image = np.ascontiguousarray(template.image, dtype=np.float32)
             norm = weigh_template(image, sharper, root, white, *kernels, rows[len(used)], spread[len(used)])
             if norm > _LEAST_NORM and math.isfinite(norm):
                 used.append(template)
         rows, spread = (one[: len(used)].reshape(len(used), mask.size) for one in (rows, spread))
-        left = rows @ spread.T
+        left = np.asarray(rows @ spread.T, dtype=np.float64)
         own = np.diag(left).copy()
         chosen: list[int] = []
         columns: list[NDArray[np.float64]] = []
@@ -702,7 +711,7 @@ class MapProjection:
 
             lower = np.tril(np.stack(columns, axis=1)[chosen])
             inverse = solve_triangular(lower, np.eye(len(chosen)), lower=True, check_finite=False)
-            np.matmul(inverse.astype(np.float32), rows[chosen].astype(np.float32), out=self._rows)
+            np.matmul(inverse.astype(np.float32), rows[chosen], out=self._rows)
         self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
 
     def __len__(self) -> int:
@@ -739,15 +748,15 @@ class MapProjection:
         return list(self._names)
 
 
-def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, of which the table is a quarter.
+def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, a quarter of each as of the table.
 
     A spread that no effect has changed is one such product.
     """
     across, sizes, along = np.linalg.svd(table)
     parts = np.flatnonzero(sizes > 1e-12 * sizes[0])
     halves = (across[:, parts] * sizes[parts]).T, along[parts]
-    rows, columns = (np.concatenate([half[:, :0:-1], half], axis=1) for half in halves)
+    rows, columns = (half.astype(np.float32) for half in halves)
     return rows, columns
 
 

@@ -16,6 +16,7 @@ from ..generator._fine_picture import FINE
 
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
 _CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
+_SETTLED_PX = 0.0005  # step below which a further one with the same share changes nothing
 LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
 _STRAY_PX = 2.0  # radius over which light that strays is taken as even
 _WEAK = 0.05
@@ -24,6 +25,7 @@ _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
 _DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
 _LARGEST_STEP_PX = 0.25
+_SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
 _WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
 CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
@@ -137,7 +139,10 @@ def register(
     doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
     # edges are rendered with errors that any number of series share
     share = 1.0 / max(len(measured), 1)
-    for caution in _CAUTION:
+    settled = False
+    for caution, before in zip(_CAUTION, (math.inf, *_CAUTION), strict=False):
+        if settled and caution == before:
+            break
         placement = _placement(current, covariance)
         normal, right = precision.copy(), precision @ current
         for image, model, noise, design, doubtful in zip(splines, models, variance, slopes, doubts, strict=True):
@@ -148,7 +153,7 @@ def register(
             level_weight = float((level * weight) @ level) + 1e-30
             # a brighter beam is no light that strays: smoothed, what it leaves at an edge would look like a displacement
             apart = picture - float((level * weight) @ picture[inner]) / level_weight * model
-            residual = (apart - _stray(apart, inner / (noise + 100.0 * doubt)))[inner]
+            residual = (apart - _stray(apart, *_away(inner / (noise + 100.0 * doubt))))[inner]
             cross = (design * weight) @ level
             normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
             right += (design * weight) @ residual - cross * float((level * weight) @ residual) / level_weight
@@ -160,6 +165,7 @@ def register(
         # where the measured picture still lies further on than the model, the residual falls along the model's slope
         step = -((vectors * inverse) @ vectors.T) @ right
         current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
+        settled = float(np.hypot(*step)) < _SETTLED_PX
     return _placement(current, covariance)
 
 
@@ -225,7 +231,7 @@ def register_drawn(
             1.0 / len(images) / (float(np.max(noise[inner])) + _CAUTION[-1] ** 2 * float(np.max(doubt[inner])))
             for noise, doubt in zip(variance, doubts, strict=True)
         ],
-        away=[inner / (noise + 100.0 * doubt) for noise, doubt in zip(variance, doubts, strict=True)],
+        away=[_away(inner / (noise + 100.0 * doubt)) for noise, doubt in zip(variance, doubts, strict=True)],
     )
     known: dict[tuple[int, int], float] = {}
 
@@ -249,12 +255,14 @@ def register_drawn(
     models = draw((float(current[0]), float(current[1])))
     rest = fit.of(models)
     covariance: NDArray[np.float64] = np.eye(2) * prior_px**2
+    slopes: list[NDArray[np.float64]] = []
     for _ in range(_DRAWN_ROUNDS):
-        moved = [draw((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
-        slopes = [
-            np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
-            for model, *pair in zip(models, *moved, strict=True)
-        ]
+        if not slopes:
+            moved = [draw((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
+            slopes = [
+                np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
+                for model, *pair in zip(models, *moved, strict=True)
+            ]
         normal, right = fit.slope(models, slopes)
         # along a single edge nothing shows the displacement: a weak direction stays where it is
         values, vectors = np.linalg.eigh(normal)
@@ -270,10 +278,12 @@ def register_drawn(
                 break
         else:
             break
-        near = float(np.hypot(*(there - current))) < _DRAWN_ENOUGH_PX
+        moved_px = float(np.hypot(*(there - current)))
         rest, current, models = after, there, pictures
-        if near:
+        if moved_px < _DRAWN_ENOUGH_PX:
             break
+        if moved_px > _SAME_SLOPES_PX:
+            slopes = []
     return _placement(current, covariance)
 
 
@@ -281,14 +291,14 @@ def register_drawn(
 class _LeftOver:
     """What pictures leave of measured ones, level and smooth light left free.
 
-    Fields: images, measured (row, column); inner, pixels that count (row, column); weights of the pixels of each image; away
-    (row, column), weights with which light that strays is seen.
+    Fields: images, measured (row, column); inner, pixels that count (row, column); weights of the pixels of each image; away:
+    weights with which light that strays is seen, as `_away` has them.
     """
 
     images: Sequence[NDArray[np.float64]]
     inner: NDArray[np.bool_]
     weights: Sequence[float]
-    away: Sequence[NDArray[np.float64]]
+    away: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
     def _residuals(
         self, models: Sequence[NDArray[np.floating]]
@@ -300,7 +310,7 @@ class _LeftOver:
             # the level first, as in `register`
             brighter = float(level @ image[self.inner]) / power
             apart = np.asarray(image - brighter * model, dtype=np.float64)
-            residual = (apart - _stray(apart, away))[self.inner]
+            residual = (apart - _stray(apart, *away))[self.inner]
             share = float(level @ residual) / power
             yield residual - share * level, level, weight
 
@@ -320,12 +330,20 @@ class _LeftOver:
         return normal, right
 
 
-def _stray(residual: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smooth part of a residual, as pixels away from edges show it."""
+def _away(weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (row, column) of pixels away from edges, and their smooth sum."""
     from scipy.ndimage import gaussian_filter
 
-    total = gaussian_filter(weight, _STRAY_PX, mode="constant")
-    return np.asarray(gaussian_filter(weight * residual, _STRAY_PX, mode="constant") / np.maximum(total, 1e-30))
+    return weight, np.maximum(gaussian_filter(weight, _STRAY_PX, mode="constant"), 1e-30)
+
+
+def _stray(
+    residual: NDArray[np.float64], weight: NDArray[np.float64], total: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The smooth part of a residual, as pixels away from edges show it; weight, total: see `_away`."""
+    from scipy.ndimage import gaussian_filter
+
+    return np.asarray(gaussian_filter(weight * residual, _STRAY_PX, mode="constant") / total)
 
 
 def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:

@@ -153,25 +153,21 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     if not lit:
         return None
     wanders = OutputCourse(variant.parameters["correlation_s"], variant.parameters["jitter_share"])
-    columns = []
     means = wanders.means([block.session.request for block, _ in lit], readout_ms)
-    for shares in means.T:
-        level = np.zeros(size)
-        for (block, place), share in zip(lit, shares, strict=True):
-            level[place] = block.nuisances[level_of(block.session)] * (0.01 * share / scales.LEVEL_OF_SERIES_SD)
-        columns.append(level)
-    for block, place in lit:
+    single = []  # (probe, what it does by itself)
+    levels = np.zeros((size, means.shape[1]))
+    for (block, place), shares in zip(lit, means, strict=True):
+        amount = 0.01 / scales.LEVEL_OF_SERIES_SD * block.nuisances[level_of(block.session)]
+        np.multiply.outer(amount, shares, out=levels[place])
         request = block.session.request
         profiles = dict(time_templates(request.frames))
         for index, name in enumerate(block.names):
             if name.statistic.startswith("trend"):
                 along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
-                amount = 0.01 * along / math.sqrt(request.frames)
+                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / block.sd[index]))
             elif name.statistic == "frame_factor":
-                amount = 0.5
-            else:
-                continue
-            column = np.zeros(size)
-            column[place.start + index] = amount / block.sd[index]
-            columns.append(column)
-    return np.stack(columns, axis=1)
+                single.append((place.start + index, 0.5 / block.sd[index]))
+    alone = np.zeros((size, len(single)))
+    for column, (probe, amount_of_one) in enumerate(single):
+        alone[probe, column] = amount_of_one
+    return np.concatenate([levels, alone], axis=1)

@@ -34,9 +34,11 @@ class Whitening:
         """Vectors (vector, probe) with unit noise once the local nuisances are integrated out."""
         from scipy.linalg import solve_triangular
 
-        result = np.empty_like(vectors, dtype=np.float64)
+        result = np.zeros(vectors.shape)
         for members, lower in zip(self._members, self._lower, strict=True):
-            result[:, members] = solve_triangular(lower, vectors[:, members].T, lower=True, check_finite=False).T
+            own = vectors[:, members]
+            there = np.flatnonzero(np.any(own, axis=1))
+            result[np.ix_(there, members)] = solve_triangular(lower, own[there].T, lower=True, check_finite=False).T
         return result
 
     def variances(self, variances: NDArray[np.float64]) -> NDArray[np.float64]:

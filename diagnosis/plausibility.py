@@ -672,16 +672,20 @@ def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequen
     if not bright > 0:
         return ""
     picture = np.asarray(-np.log(np.maximum(item.picture / bright, 1e-6)), dtype=np.float64)
-    noise = math.sqrt(max(item.gain_DN, 0.0) / bright / item.series.n_frames) if item.gain_DN > 0 else 0.02
+    photons_known = item.gain_DN > 0  # not of single frames
+    noise = math.sqrt(item.gain_DN / bright / item.series.n_frames) if photons_known else _of_neighbours(picture)
     covered = float(np.mean(depth > 0.05))
-    dark = np.quantile(picture[maps.good], [0.05, 1.0 - max(min(covered, 0.15), 0.003) / 3.0])
-    shows = float(np.ptp(dark)) > 0.05 + 6.0 * noise
+    ends = [0.05, 1.0 - max(min(covered, 0.15), 0.003) / 3.0]
+    shadow = float(np.ptp(np.quantile(picture[maps.good], ends)))
+    shows = shadow > 0.05 + 6.0 * noise
     if float(np.max(depth)) < 0.02:
         return f"the thickness maps of {scene} are empty, but its frames show a shadow" if shows else ""
     if float(np.std(np.clip(depth, 0.0, _DEEPEST))) < 0.03:
         return ""
     if not shows:
-        return f"the thickness maps of {scene} hold an object, but its frames show no shadow"
+        # a thin object's shadow is no deeper than noise may be, and there all the same
+        none = shadow < 0.5 * float(np.ptp(np.quantile(depth[maps.good], ends)))
+        return f"the thickness maps of {scene} hold an object, but its frames show no shadow" if none else ""
     stride = maps._stride
     own = _correlation(picture, depth, maps.good, stride)
     if not own < _FITS:
@@ -705,6 +709,11 @@ def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequen
     if own < _FITS_NOT:
         return f"the thickness maps of {scene} do not fit the shadow in its frames (correlation {own:.2f})"
     return ""
+
+
+def _of_neighbours(picture: FloatArray) -> float:
+    """Standard deviation of a picture's noise (row, column), as most neighbours along rows differ."""
+    return float(np.median(np.abs(np.diff(picture, axis=1)))) / (0.6745 * math.sqrt(2.0))
 
 
 def _scales_of_map(item: _Reading, maps: _Maps, inherent_mm_Al: float) -> list[float]:

@@ -181,6 +181,27 @@ def test_little_light_with_the_noise_of_quanta_is_a_beam(changed, quanta):
     assert any("shows no beam" in text for text in said) == (not quanta)
 
 
+@pytest.mark.parametrize(("thickness", "shows"), [(0.4, True), (0.0, False)])
+def test_shadow_of_a_thin_object_in_single_frames_is_one(changed, thickness, shows):
+    # the noise of single frames says nothing of photons
+    def change(file):
+        for image in file["scenes/product1/thickness_mm"].values():
+            image[...] = 0.4 * image[:]
+        dark = file["series"]["dark_25ms"]["frames"][:].mean()
+        for name in [name for name, node in file["series"].items() if node.attrs.get("scene") == "product1"]:
+            node = file["series"][name]
+            signal = node["frames"][:1] - dark
+            opened = np.quantile(signal, 0.97)
+            shadow = np.clip(signal / opened, 1e-3, 1.0) ** thickness
+            noise = 0.3 * np.sqrt(opened) * np.random.default_rng(5).standard_normal(signal.shape)
+            for one in {"frames", "time_s"} & set(node):
+                del node[one]
+            node["frames"] = np.rint(dark + opened * shadow + noise).astype(np.uint16)
+
+    said = [item.text for item in found_in(changed(change)).suspects]
+    assert any("show no shadow" in text for text in said) == (not shows)
+
+
 def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field():
     rng = np.random.default_rng(4)
     picture = np.full((60, 80), 30000.0)

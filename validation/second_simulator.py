@@ -474,6 +474,8 @@ def random_cases(seed: int) -> list[str]:
 class Line:
     """A line with its effects, drawn from a generator; what charge the panel still holds goes from series to series."""
 
+    optical = OPTICAL  # noise of the light over that of its photons
+
     def __init__(self, name: str, effects: tuple[str, ...], rng: np.random.Generator) -> None:
         self.name, self.of, self.rng = name, LINES[name], rng
         self.effects = {name.removesuffix("_later"): CASES[name][0] for name in effects if name != "none"}
@@ -506,8 +508,16 @@ class Line:
         if self.of.counting:
             counts = arriving.sum(axis=-1)
             return counts, counts
-        optical = 1.0 if self.of.even else OPTICAL
+        optical = 1.0 if self.of.even else self.optical
         return self.of.DN_per_keV * (arriving @ energies), optical * self.of.DN_per_keV**2 * (arriving @ energies**2)
+
+    def scattered(self, source: np.ndarray) -> np.ndarray:
+        """Light scattered by objects, DN, that a source of it (row, column), DN, sends to the panel."""
+        return gaussian_filter(np.pad(source, 200), 18.0 / self.of.pixel_mm)[200:-200, 200:-200]
+
+    def spread(self, image: np.ndarray, *, mode: str = "reflect") -> np.ndarray:
+        """The panel's spread of light; mode: what lies beyond its borders."""
+        return gaussian_filter(image, self.of.spread_px, mode=mode)
 
     def open_light(self, kV: float, mAs: float, copper_mm: float, on: dict) -> tuple[np.ndarray, np.ndarray]:
         """Energies, keV, and photons (row, column, energy) that the panel absorbs of an exposure of the open field."""
@@ -551,9 +561,8 @@ class Line:
             arriving = arriving * (1.0 - share)
         signal, variance = self.signals(arriving, energies)
         if scene and "object_scatter" in on:
-            source = np.pad(signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0)), 200)
-            wide = gaussian_filter(source, 18.0 / self.of.pixel_mm)[200:-200, 200:-200]
-            added = on["object_scatter"] / 100.0 * wide / 0.38 * (0.55 if far else 1.0)
+            source = signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0))
+            added = on["object_scatter"] / 100.0 * self.scattered(source) / 0.38 * (0.55 if far else 1.0)
             signal, variance = signal + added, variance * (1.0 + added / signal)
         if scene and "focal_spot" in on:
             magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
@@ -612,13 +621,11 @@ class Line:
             quanta = self.rng.poisson(variance) - variance
         else:
             quanta = np.sqrt(variance) * self.rng.standard_normal(self.of.shape)
-        level = gaussian_filter(signal, self.of.spread_px) + gaussian_filter(quanta, self.of.spread_px, mode="wrap")
+        level = self.spread(signal) + self.spread(quanta, mode="wrap")
         if remote is not None:
             photons = remote[0] + np.sqrt(remote[0]) * self.rng.standard_normal(self.of.shape)
             away = 0.5 * sum(gaussian_filter(photons, sigma_mm / self.of.pixel_mm) for sigma_mm in (0.12, 0.3))
-            level = level + gaussian_filter(
-                self.of.DN_per_keV * (photons * remote[1] + self.of.line_keV * away), self.of.spread_px
-            )
+            level = level + self.spread(self.of.DN_per_keV * (photons * remote[1] + self.of.line_keV * away))
         if "mtf_tail" in on:
             share = on["mtf_tail"] / 100.0
             level = (1.0 - share) * level + share * gaussian_filter(level, 2.5)
@@ -646,9 +653,11 @@ def scenes(of: LineOf) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
     return found
 
 
-def make_session(path: Path, name: str, effect: str, rng: np.random.Generator, frames: int) -> None:
+def make_session(
+    path: Path, name: str, effect: str, rng: np.random.Generator, frames: int, line_of: type[Line] = Line
+) -> None:
     """A session of a line with calibrating and later series, and its effects, joined by `+`."""
-    line = Line(name, tuple(effect.split("+")), rng)
+    line = line_of(name, tuple(effect.split("+")), rng)
     of = line.of
     scintillator = "{}:{:g}".format(*of.scintillator)
     instrument = Instrument(
@@ -709,11 +718,12 @@ def make_session(path: Path, name: str, effect: str, rng: np.random.Generator, f
         add("dark_last", "dark", 160.0, after=True)
 
 
-def judged(name: str, effect: str, seed: int, frames: int) -> dict:
+def judged(name: str, effect: str, seed: int, frames: int, line_of: type[Line] = Line) -> dict:
     """What the diagnosis says of one session."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.h5"
-        make_session(path, name, effect, np.random.default_rng([seed, zlib.crc32(effect.encode())]), frames)
+        rng = np.random.default_rng([seed, zlib.crc32(effect.encode())])
+        make_session(path, name, effect, rng, frames, line_of)
         with open_acquisition(path) as acquisition:
             found = diagnose(acquisition, rng=np.random.default_rng(seed))
     names = effect.split("+")
@@ -734,6 +744,24 @@ def judged(name: str, effect: str, seed: int, frames: int) -> dict:
     }
 
 
+def run_cases(
+    line: str, cases: list[str], seed: int, frames: int, json_file: Path | None, line_of: type[Line] = Line
+) -> None:
+    """The rows of a line's cases on the terminal, and as JSON where a file is named."""
+    rows = []
+    for effect in cases:
+        row = judged(line, effect, seed, frames, line_of)
+        rows.append(row)
+        told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())
+        named = ", ".join(row["named"]) or row["verdict"]
+        planted = "+".join(f"{one:g}" for one in row["planted"])
+        print(f"{effect:32s} {planted:>8s}  {'right' if row['right'] else 'WRONG'}  {named}  {told}", flush=True)
+    print(f"{sum(row['right'] for row in rows)} of {len(rows)} named rightly and alone")
+    if json_file:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(rows, indent=1))
+
+
 def run() -> None:
     """The table on the terminal, and the rows as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -748,21 +776,11 @@ def run() -> None:
     parser.add_argument("--only", nargs="+", choices=[*sorted(CASES), *PAIRS], metavar="EFFECT")
     parser.add_argument("--json", type=Path, help="file for the rows")
     options = parser.parse_args()
-    rows = []
     line = random_line(options.seed) if options.line == "random" else options.line
     if line != options.line:
         print(LINES[line])
-    for effect in options.only or (random_cases(options.seed) if line != options.line else cases_of(LINES[line])):
-        row = judged(line, effect, options.seed, options.frames)
-        rows.append(row)
-        told = "; ".join("{:.3g} ({:.3g} to {:.3g})".format(*one) for one in row["strengths"].values())
-        named = ", ".join(row["named"]) or row["verdict"]
-        planted = "+".join(f"{one:g}" for one in row["planted"])
-        print(f"{effect:32s} {planted:>8s}  {'right' if row['right'] else 'WRONG'}  {named}  {told}", flush=True)
-    print(f"{sum(row['right'] for row in rows)} of {len(rows)} named rightly and alone")
-    if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(rows, indent=1))
+    cases = options.only or (random_cases(options.seed) if line != options.line else cases_of(LINES[line]))
+    run_cases(line, cases, options.seed, options.frames, options.json)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Diagnoses of sessions whose spectra, cross sections and panel are those of CatSim (XCIST): one effect each, two, and none.
 
-CatSim (PyPI `gecatsim`; De Man and others) brings spectra of its own (Xspect, 70-140 kV), cross sections of its own, a panel that
-adds up energies, crosstalk between neighbours or a Lorentzian transfer function, and a scatter kernel. Objects, labels, noise and the other
-effects are those of `second_simulator.py`, which this script drives; cross sections are the first here that xraylib's are not.
+CatSim (PyPI `gecatsim`; De Man and others) brings spectra of its own (Xspect, 70-140 kV), cross sections that are not xraylib's, a
+panel that adds up energies, crosstalk between neighbours or a Lorentzian transfer function, and a scatter kernel. Objects, labels,
+noise and the other effects are those of `second_simulator.py`, which this script drives.
 
     pip install gecatsim
-    python validation/catsim_sessions.py --line csi --frames 12
+    python validation/catsim_sessions.py --line csi
     python validation/catsim_sessions.py --line gos --only none kv_error
 
 `--catsim FOLDER` takes gecatsim from where it was unpacked, for machines on which its own build fails. The script ends with exit
@@ -15,10 +15,10 @@ code 0 and the reason where gecatsim is not there.
 import argparse
 import contextlib
 import importlib.util
-import json
 import sys
 from functools import lru_cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import second_simulator as plain
@@ -26,7 +26,7 @@ from scipy.fft import dctn, idctn
 from scipy.ndimage import convolve
 
 MATERIALS = {"Al": "Al", "Pb": "Pb", "H2O": "water", "Cu": "Cu", "W": "W", "Gd2O2S": "GOS", "CsI": "CsI", "Be": "Be"}
-STATED_KV = np.arange(70.0, 141.0, 10.0)  # of CatSim's files, at ten degrees
+LOWEST_KV, HIGHEST_KV = 70.0, 140.0  # of CatSim's files, one every 10 kV
 ANODE_DEG = 10.0
 # crosstalk: share of its light that a pixel gives to each neighbour along rows and along columns; lorentzian_mm2: H of a transfer
 # function 1 / (1 + H f^2)
@@ -101,7 +101,7 @@ class CatSimLine(plain.Line):
     """A line whose light spreads and scatters as CatSim has it."""
 
     optical = 1.0  # CatSim's panels have no noise of the light
-    panel: dict = {}
+    panel: ClassVar[dict] = {}
     kernel = np.ones((1, 1))  # of scatter
 
     def spread(self, image: np.ndarray, *, mode: str = "reflect") -> np.ndarray:
@@ -144,7 +144,7 @@ def as_catsim(name: str, tools: tuple) -> str:
     def spectrum(name: str, kV: float, aluminium_mm: float, copper_mm: float) -> tuple[np.ndarray, np.ndarray]:
         of = plain.LINES[name]
         # between two voltages: both drawn out to this one, joined by how near they are
-        low = float(np.clip(STATED_KV[STATED_KV <= kV].max(initial=70.0), 70.0, 130.0))
+        low = min(max(10.0 * (kV // 10.0), LOWEST_KV), HIGHEST_KV - 10.0)
         share = (kV - low) / 10.0
         edges = np.arange(1.0, np.ceil(kV) + 1.0, 0.5)
         energies, photons = 0.5 * (edges[1:] + edges[:-1]), np.zeros(len(edges) - 1)
@@ -165,21 +165,21 @@ def as_catsim(name: str, tools: tuple) -> str:
     CatSimLine.kernel = np.fromfile(folder / "scatter" / "scatter_kernel.dat", np.float32).reshape(49, 65)
     # photons on a square centimetre at a metre, a mAs
     of_pixel = 0.01 * fields["pixel_mm"] ** 2 * (1000.0 / fields["detector_mm"]) ** 2
-    line = dict(
-        spread_px=0.0,
-        read_DN=5.0,
-        dark_DN=300.0,
-        bits=14,
-        DN_per_keV=1.0,
-        photons=of_pixel,
-        lag_s=0.3,
-        pause_s=6.0,
-        readout_ms=5.0,
-        copper_times=1.0,
-        anode_deg=ANODE_DEG,
-        beryllium_mm=1.0,
-        lead_mm=2.0,
-    )
+    line = {
+        "spread_px": 0.0,
+        "read_DN": 5.0,
+        "dark_DN": 300.0,
+        "bits": 14,
+        "DN_per_keV": 1.0,
+        "photons": of_pixel,
+        "lag_s": 0.3,
+        "pause_s": 6.0,
+        "readout_ms": 5.0,
+        "copper_times": 1.0,
+        "anode_deg": ANODE_DEG,
+        "beryllium_mm": 1.0,
+        "lead_mm": 2.0,
+    }
     plain.LINES[name] = of = plain.LineOf(**{**line, **fields})
     most = 0.0
     for kV, current_mA in of.current_mA.items():

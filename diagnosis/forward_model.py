@@ -12,7 +12,7 @@ from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.effects.registration import angles_of, parts_px
 from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
 from ..generator.twin import Twin
-from .changes import TwinChange, Variant
+from .changes import OF_BEAMS_GROWS, TwinChange, Variant, departures_found
 from .probes import ALONG_COLUMNS, ALONG_ROWS
 from .registration import SHARP_PX
 from .session import SessionSeries
@@ -167,6 +167,11 @@ class ForwardModel:
     def sharp(self) -> bool:
         """Whether pixels see no farther than themselves."""
         return self.base.noise.psf_sigma_px.value < SHARP_PX
+
+    @property
+    def beams_differ(self) -> float:
+        """How many times more than usual beams may differ from the spectral model: 1 unless calibration found departures."""
+        return 1.0 + OF_BEAMS_GROWS * (departures_found(self.base.spectral) - 1.0)
 
     def change(self, variant: Variant, strength: float) -> Change:
         """An effect of the catalogue at a strength, in this session."""

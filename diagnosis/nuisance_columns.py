@@ -26,7 +26,12 @@ _GAIN_MAP_MODES = 3  # cosines along each side
 
 
 def local_nuisances(
-    probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved], *, sharp: bool
+    probes: SeriesProbes,
+    signal: NDArray[np.float64],
+    thicker: Mapping[str, Moved],
+    *,
+    sharp: bool,
+    beams_differ: float = 1.0,
 ) -> Columns:
     """Nuisances of one series by name.
 
@@ -35,6 +40,7 @@ def local_nuisances(
         signal: expected (row, column), DN.
         thicker: what a scene with one material thicker by THICKNESS_SD would show, by material.
         sharp: pixels see no farther than themselves.
+        beams_differ: times more than usual from the spectral model.
     """
     item = probes.series.session
     columns: Columns = {
@@ -42,13 +48,13 @@ def local_nuisances(
     }
     images: _Images = {}  # of nuisances that change the mean frame alone
     if item.request.beam_on:
-        columns |= _of_beam(probes)
-        images |= _of_field(item, signal)
+        columns |= _of_beam(probes, beams_differ)
+        images |= _of_field(item, signal, beams_differ)
     else:
         images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
     if item.series.kind == "object":
         dy, dx = gradient(signal)
-        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, thicker)
+        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
         images |= _of_scene(item, dy, dx, sharp=sharp)
     return columns | _projected(probes, images)
 
@@ -72,12 +78,13 @@ def _place(item: SessionSeries) -> str:
     return f"{item.series.scene} at {item.series.source_object_mm or 0:g}"
 
 
-def _of_beam(probes: SeriesProbes) -> Columns:
+def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
     """Gain of a beam, noise of pixels that are brighter than others, and correlation of neighbours."""
     item, context = probes.series.session, probes.series.context
     brighter = dict(zip(context.label_names, context.label_gain, strict=True))
     # without a voltage, or a calibrating flat of two frames, the noise of a beam is known only from its own series
-    gain_sd = _UNKNOWN_GAIN_SD if item.series.kV is None or item.own_noise else scales.GAIN_OF_BEAM_SD
+    unknown = item.series.kV is None or item.own_noise
+    gain_sd = _UNKNOWN_GAIN_SD if unknown else beams_differ * scales.GAIN_OF_BEAM_SD
     columns: Columns = {
         f"gain of {_beam(item)}": probes.of_scalars(
             lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
@@ -104,13 +111,13 @@ def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
     )
 
 
-def _of_field(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
+def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
     """Level of beam and series, and gradient of the field."""
     rows, columns = signal.shape
     y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
     x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
     images: _Images = {
-        f"level of {_beam(item)}": scales.LEVEL_OF_BEAM_SD * signal,
+        f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
         level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
         f"tilt x of {item.name}": scales.TILT_SD * x * signal,
         f"tilt y of {item.name}": scales.TILT_SD * y * signal,
@@ -194,10 +201,13 @@ def _rough_fields(shape: tuple[int, ...], place: str) -> NDArray[np.float32]:
     return result
 
 
-def _of_thickness(probes: SeriesProbes, thicker: Mapping[str, Moved]) -> Columns:
-    """Thickness and attenuation of the scene's materials."""
+def _of_thickness(
+    probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved], beams_differ: float
+) -> Columns:
+    """Thickness and attenuation of the scene's materials; where beams differ, how attenuation changes with the depth as well."""
     item, expected = probes.series.session, probes.series.scalars
     columns: Columns = {}
+    of_beam = beams_differ * scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
     for material, (moved, values) in thicker.items():
         # less light is less noise, too
         quieter = [
@@ -206,9 +216,12 @@ def _of_thickness(probes: SeriesProbes, thicker: Mapping[str, Moved]) -> Columns
         response = np.concatenate([probes.projection.apply(moved), quieter])
         columns[f"thickness of {material} in {item.series.scene}"] = response
         columns[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
-        columns[f"attenuation of {material} at {_voltage(item)}"] = response * (
-            scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
-        )
+        columns[f"attenuation of {material} at {_voltage(item)}"] = response * of_beam
+        if beams_differ > 1.0:
+            # another spectrum hardens in another way
+            depth = np.log(np.max(signal) / np.maximum(signal, 1e-9 * np.max(signal)))
+            harder = probes.of_maps((moved * depth)[None])[0]
+            columns[f"hardness at {_voltage(item)} behind {material}"] = scales.HARDNESS_OF_BEAM * of_beam * harder
     return columns
 
 

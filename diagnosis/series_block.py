@@ -72,9 +72,9 @@ def series_block(
         thicker: what its scene with one material thicker by THICKNESS_SD would show, by material.
     """
     signal, shrink = frame.signal_DN, probes.shrink
-    nuisances = local_nuisances(probes, signal, thicker, sharp=session.model.sharp) | gain_map_noise(
-        session, probes, signal
-    )
+    nuisances = local_nuisances(
+        probes, signal, thicker, sharp=session.model.sharp, beams_differ=session.model.beams_differ
+    ) | gain_map_noise(session, probes, signal)
     responses = np.zeros((len(asked), len(probes)))
     known = [(number, found) for number, found in enumerate(moved) if found is not None]
     if known:

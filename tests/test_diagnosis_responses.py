@@ -10,10 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.diagnosis import changes as scales
 from raytwin.diagnosis.calibrated_maps import calibrated_maps
-from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.changes import catalogue_variants, departures_found, spectral_sds
 from raytwin.diagnosis.even_maps import compact, full_size
 from raytwin.diagnosis.forward_model import Change, ForwardModel, strength_rows
+from raytwin.diagnosis.nuisance_columns import local_nuisances
 from raytwin.diagnosis.placing import inside
 from raytwin.diagnosis.registration import Placement
 from raytwin.diagnosis.series_probes import variance_of_what_came
@@ -256,3 +258,56 @@ def test_a_heel_that_was_always_there_is_asked_of_the_series_that_make_the_maps(
     assert once == (pytest.approx(-0.07, abs=0.03) if own_maps else 0.0)
     # with it in the maps already the turned panel shows it twice
     assert across(turned) == pytest.approx(0.08 if own_maps else 0.16, abs=0.03)
+
+
+@pytest.mark.parametrize(("spread", "grown"), [(0.008, 1.0), (0.05, 2.5)])
+def test_departures_that_calibration_found_widen_what_beams_may_differ_by(make_model_twin, spread, grown):
+    base = make_model_twin((24, 24))
+    names = base.spectral.names
+    samples = np.repeat(base.spectral.best[None], 2, axis=0)
+    samples[:, names.index("hardness_exponent")] = [-spread, spread]  # whose prior's standard deviation is 0.02
+    samples[:, names.index("kV_error")] = [-0.05, 0.05]  # no departure from tables and models
+    usual, found = spectral_sds(base.spectral), spectral_sds(replace(base.spectral, samples=samples))
+    assert departures_found(replace(base.spectral, samples=samples)) == pytest.approx(grown)
+    departs = [name.startswith(("hardness", "kV_tilt", "yield", "escape", "log_mu_")) for name in names]
+    np.testing.assert_allclose(found, usual * np.where(departs, grown, 1.0))
+    model = ForwardModel(base=replace(base, spectral=replace(base.spectral, samples=samples)), conditions={})
+    assert model.beams_differ == pytest.approx(1.0 + scales.OF_BEAMS_GROWS * (grown - 1.0))
+    assert departures_found(None) == 1.0
+
+
+def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
+    signal = np.array([[1000.0, 500.0, 250.0, 125.0]])
+    stated = SimpleNamespace(
+        name="wedge_80kV", kind="object", scene="wedge", kV=80.0, filters=(), source_object_mm=None
+    )
+    item = SimpleNamespace(
+        series=stated,
+        name="wedge_80kV",
+        request=SimpleNamespace(beam_on=True, source_object_mm=None),
+        own_noise=False,
+        divided=False,
+    )
+    thinner = -0.01 * signal * np.log(1000.0 / signal)  # of one material 1 % thicker
+    probes = SimpleNamespace(
+        series=SimpleNamespace(session=item, scalars={}, context=SimpleNamespace(label_names=(), label_gain=())),
+        scalars=(),
+        projection=SimpleNamespace(apply=lambda image: np.asarray(image, dtype=float).ravel()),
+        of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),
+        of_scalars=lambda change: np.zeros(4),
+    )
+    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns._of_edges", lambda *_: {})
+    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns._of_scene", lambda *_, **__: {})
+    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns.gradient", lambda image: (image, image))
+
+    def columns(beams_differ):
+        return local_nuisances(probes, signal, {"Al": (thinner, {})}, sharp=False, beams_differ=beams_differ)
+
+    usual, wider = columns(1.0), columns(3.0)
+    name = "hardness at 80 kV behind Al"
+    assert name not in usual
+    of_beam = 3.0 * scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
+    np.testing.assert_allclose(wider["attenuation of Al at 80 kV"], of_beam * thinner[0])
+    np.testing.assert_allclose(wider[name], of_beam * (thinner * np.log(1000.0 / signal))[0])
+    np.testing.assert_allclose(wider["level of 80 kV "], 3.0 * usual["level of 80 kV "])
+    np.testing.assert_allclose(wider["thickness of Al in wedge"], usual["thickness of Al in wedge"])

@@ -67,6 +67,8 @@ class LocalNuisances:
         across = right[self._across]
         for part, lower, coupling in self._parts:
             there = np.flatnonzero(np.any(right[part], axis=0))  # of many vectors few touch a block's own nuisances
+            if not there.size:
+                continue
             own = _half(lower, right[part, there])
             right[part, there] = own
             across[:, there] -= coupling.T @ own

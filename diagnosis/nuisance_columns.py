@@ -221,7 +221,7 @@ def _of_thickness(
             # another spectrum hardens in another way
             depth = np.log(np.max(signal) / np.maximum(signal, 1e-9 * np.max(signal)))
             harder = probes.of_maps((moved * depth)[None])[0]
-            columns[f"hardness at {_voltage(item)} behind {material}"] = scales.HARDNESS_OF_BEAM * of_beam * harder
+            columns[f"hardness at {_voltage(item)} behind {material}"] = of_beam * harder
     return columns
 
 

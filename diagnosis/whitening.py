@@ -38,7 +38,8 @@ class Whitening:
         for members, lower in zip(self._members, self._lower, strict=True):
             own = vectors[:, members]
             there = np.flatnonzero(np.any(own, axis=1))
-            result[np.ix_(there, members)] = solve_triangular(lower, own[there].T, lower=True, check_finite=False).T
+            if there.size:
+                result[np.ix_(there, members)] = solve_triangular(lower, own[there].T, lower=True, check_finite=False).T
         return result
 
     def variances(self, variances: NDArray[np.float64]) -> NDArray[np.float64]:

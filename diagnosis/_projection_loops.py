@@ -47,7 +47,7 @@ def weigh_template(
             held[i + REACH, j + REACH] = row[i, j] * root[i, j]
             covered[i, j] = row[i, j] * white[i, j]
     for part in range(across.shape[0]):
-        # written out tap by tap: in loops over them it takes five times as long
+        # written out tap by tap: in loops over them it takes four times as long (128 x 128 pixels)
         a0, a1, a2, a3 = across[part, 0], across[part, 1], across[part, 2], across[part, 3]
         b0, b1, b2, b3 = along[part, 0], along[part, 1], along[part, 2], along[part, 3]
         for i in range(rows):

@@ -29,7 +29,7 @@ def rounded_kurtosis(sd_steps: float, frames: int) -> float:
 def _table(frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Logarithms of the noise in steps, and the excess kurtosis there; an integral over a Latin hypercube.
 
-    Its own lines: `scipy.stats` has such points, and takes half a second to import.
+    Its own lines: `scipy.stats` has such points, and takes a third of a second to import.
     """
     from scipy.special import ndtri
 

@@ -31,7 +31,7 @@ def local_nuisances(
     thicker: Mapping[str, Moved],
     *,
     sharp: bool,
-    beams_differ: float = 1.0,
+    beams_differ: float,
 ) -> Columns:
     """Nuisances of one series by name.
 

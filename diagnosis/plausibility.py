@@ -713,7 +713,7 @@ def _unlike(scene: str, members: Sequence[_Reading], maps: _Maps, others: Sequen
 
 def _of_neighbours(picture: FloatArray) -> float:
     """Standard deviation of a picture's noise (row, column), as most neighbours along rows differ."""
-    return float(np.median(np.abs(np.diff(picture, axis=1)))) / (0.6745 * math.sqrt(2.0))
+    return 1.4826 * float(np.median(np.abs(np.diff(picture, axis=1)))) / math.sqrt(2.0)
 
 
 def _scales_of_map(item: _Reading, maps: _Maps, inherent_mm_Al: float) -> list[float]:

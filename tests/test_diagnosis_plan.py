@@ -11,7 +11,7 @@ from raytwin.diagnosis import veto
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
-from raytwin.diagnosis.diagnose import _elsewhere
+from raytwin.diagnosis.diagnose import _elsewhere, _threshold
 from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
@@ -499,3 +499,13 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
     found = misfit_of(*gain_found(residual, made))
     assert found.pulled == pytest.approx(times, rel=0.35)
     assert found.refused == refused
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_one_session_in_twenty_without_a_gap_shows_a_place_at_the_most(alike):
+    rng = np.random.default_rng(12)
+    common = rng.standard_normal((4000, 1))
+    probes = np.sqrt(alike) * common + np.sqrt(1.0 - alike) * rng.standard_normal((4000, 60))
+    shown = np.mean(np.max(np.abs(probes), axis=1) > _threshold(60))
+    assert shown < 0.062  # of 4000, three standard deviations above 0.05
+    assert alike or shown > 0.038

@@ -26,9 +26,9 @@ from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
 from .pairs import Doubts
 from .plan import WORTH_IT, best_repeat, repeat_text
-from .plausibility import Suspect
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS, OUTLIERS_ANYWHERE
+from .readings import Suspect
 from .refine import refine
 from .registration import SHARP_PX
 from .strengths import applied_at_best, strength_of

@@ -16,7 +16,8 @@ from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
 from .coarse import LEAST_SIDE, coarse_factor
 from .origin import made_of
-from .plausibility import Suspect, check_plausibility
+from .plausibility import check_plausibility
+from .readings import Suspect
 from .session import calibrating_names
 
 _OF_THIS_SESSION = (

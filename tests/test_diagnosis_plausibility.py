@@ -9,7 +9,10 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.plausibility import LEAST_EVIDENCE, _inherent_mm_Al, _scaled, _without_common, check_plausibility
+from raytwin.diagnosis.label_suspects import LEAST_EVIDENCE
+from raytwin.diagnosis.map_suspects import _inherent_mm_Al, _scaled
+from raytwin.diagnosis.plausibility import check_plausibility
+from raytwin.diagnosis.readings import _without_common
 from raytwin.diagnosis.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]

@@ -16,8 +16,9 @@ from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose import _clears
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.origin import made_of
-from raytwin.diagnosis.plausibility import Suspect, check_plausibility
+from raytwin.diagnosis.plausibility import check_plausibility
 from raytwin.diagnosis.preparation import prepare_session
+from raytwin.diagnosis.readings import Suspect
 from raytwin.diagnosis.session import measured_levels, read_session
 from raytwin.diagnosis.unknown import unknown_evidence
 from raytwin.diagnosis.whitening import Whitening

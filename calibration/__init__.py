@@ -11,6 +11,9 @@ if TYPE_CHECKING:
         calibrate_twin,
         calibration_answer,
     )
+    from .flat_levels import (
+        SeriesPoint,
+    )
     from .frame_sums import (
         FrameSums,
         effective_frames,
@@ -30,7 +33,6 @@ if TYPE_CHECKING:
     )
     from .photon_transfer import (
         PhotonTransfer,
-        SeriesPoint,
         compute_photon_transfer,
     )
     from .priors import (
@@ -55,7 +57,7 @@ _LAZY = {
     "PRIORS": "priors",
     "PhotonTransfer": "photon_transfer",
     "Prior": "priors",
-    "SeriesPoint": "photon_transfer",
+    "SeriesPoint": "flat_levels",
     "SpectralFit": "spectral_fit",
     "SpreadFit": "noise_covariance",
     "Validation": "validate",

@@ -8,8 +8,8 @@ from scipy.stats import chi2, norm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
+from raytwin.calibration.flat_levels import median_variance
 from raytwin.calibration.noise_covariance import compute_noise_covariance, fit_spread, sampling_covariance
-from raytwin.calibration.photon_transfer import median_variance
 from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
 from raytwin.generator.psf import blur_variance_share

@@ -8,9 +8,10 @@ import pytest
 from raytwin.acquisition import Filter, Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.sessions import merge_sessions, one_layer, select_layer
+from raytwin.calibration.bad_pixels import cluster_evidence
 from raytwin.calibration.calibrate import bad_pixel_counts
 from raytwin.calibration.noise_covariance import compute_noise_covariance
-from raytwin.calibration.photon_transfer import cluster_evidence, compute_photon_transfer
+from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.twin import BAD_PIXEL_CODES

@@ -1,0 +1,96 @@
+"""Bad pixels of a session, with the reason for each, and the clusters that they form."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import Series
+from ..generator.twin import BAD_PIXEL_CODES
+from ._kept_sums import KeptSums
+from .dark_frames import DarkFrames
+
+_DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
+_CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
+_CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
+_NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
+
+
+def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]]) -> NDArray[np.uint8]:
+    """Reason codes (row, column) from the darks' level and noise and from the flats' response."""
+    from scipy.ndimage import median_filter
+
+    code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
+    closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
+    for key, mean in darks.by_exposure.items():
+        local = mean - median_filter(mean, size=5, mode="nearest")
+        centre, spread = _robust_spread(local)
+        limit = _DARK_NOISE_SIGMAS * max(spread, 0.5)
+        frames = sum(
+            total.frames * item.averaged for item, total in darks.sums if (item.session, item.exposure_ms) == key
+        )
+        # the mean of a noisy pixel strays by its own noise; that alone does not make it hot
+        own = 4.0 * np.sqrt(np.nan_to_num(darks.variance) / max(frames, 1))
+        departure = np.abs(local - centre) / np.maximum(limit, own)
+        np.maximum(closest, departure, out=closest)
+        code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["hot"]
+    if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
+        # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
+        from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
+
+        centre = float(np.median(darks.variance)) * darks.effective / float(chdtri(darks.effective, 0.5))
+        limit = centre * float(chdtri(darks.effective, _NOISY_CHANCE)) / darks.effective + 1.0
+        code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
+    brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
+    signal = brightest[1].mean_DN - darks.of(brightest[0])
+    if not np.median(signal) > 0:
+        return _with_clusters(code, closest)  # no response to judge; the caller says so
+    local = median_filter(signal, size=5, mode="nearest")
+    ratio = signal / np.where(local > 0, local, np.nan)
+    code[(~np.isfinite(ratio) | (ratio < 0.5)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
+    centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
+    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, 0.05))
+    np.maximum(closest, departure, out=closest)
+    code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    return _with_clusters(code, closest)
+
+
+def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Bad pixels with those that a cluster of them takes along: beside a bad one and at `_CLUSTER_SHARE` of a limit, or
+    hemmed in by bad ones."""
+    while True:
+        neighbours = _bad_neighbours(code != 0)
+        taken = (code == 0) & (((neighbours > 0) & (closest > _CLUSTER_SHARE)) | (neighbours >= _CLUSTER_NEIGHBOURS))
+        if not np.any(taken):
+            return code
+        code = np.where(taken, np.uint8(BAD_PIXEL_CODES["clustered"]), code)
+
+
+def _bad_neighbours(bad: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """How many of the eight pixels about each are bad (row, column)."""
+    from scipy.ndimage import convolve
+
+    around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    return np.asarray(convolve(bad.astype(np.int64), around, mode="constant"))
+
+
+def _robust_spread(values: NDArray[np.float64]) -> tuple[float, float]:
+    centre = float(np.median(values))
+    return centre, 1.4826 * float(np.median(np.abs(values - centre)))
+
+
+def cluster_evidence(bad: NDArray[np.uint8]) -> dict[str, int]:
+    """Groups of two or more bad pixels that touch: how many, pixels in the largest, and kernel pixels.
+
+    A kernel pixel is a bad one with fewer than five good neighbours, which interpolation cannot mend (ASTM E2597).
+    """
+    from scipy.ndimage import label
+
+    numbered, _ = label(bad != 0, structure=np.ones((3, 3)))
+    sizes = np.bincount(numbered.ravel())[1:]
+    kernel = (bad != 0) & (_bad_neighbours(bad != 0) > 3)
+    return {
+        "groups": int(np.count_nonzero(sizes > 1)),
+        "largest": int(sizes.max(initial=0)),
+        "kernel_pixels": int(np.count_nonzero(kernel)),
+    }

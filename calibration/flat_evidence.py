@@ -1,0 +1,225 @@
+"""What the flats of a session say beside the fit: drift, lag, linearity, repeats, the shape of the noise."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.setting import text_from_filters
+from .dark_frames import DarkFrames
+from .flat_levels import SeriesPoint, load_mAs_of
+from .noise_of_flats import FlatNoise
+from .repeated_frames import beam_of
+
+
+def flat_evidence(
+    points: Sequence[SeriesPoint], noise: FlatNoise, darks: DarkFrames, good: NDArray[np.bool_]
+) -> tuple[dict[str, Any], list[str]]:
+    """What the series say about drift, lag, linearity and the shape of the noise, beside the fit; and warnings of it."""
+    fit = noise.fit
+    warnings: list[str] = []
+    used = [point for point in points if point.used]
+    lit = [p for p in used if p.pair_variance_DN2 > 0 and math.isfinite(p.stack_variance_DN2) and p.frames > 2]
+    weights = np.array([p.frames for p in lit], dtype=np.float64)
+    ratio = (
+        float(np.average([p.stack_variance_DN2 / p.pair_variance_DN2 for p in lit], weights=weights)) if lit else None
+    )
+    if ratio is not None and ratio > 1.02:
+        warnings.append(
+            f"stack variances are {100 * (ratio - 1):.1f} % above pair variances: the level drifts or frames are"
+            " correlated; gains come from pairs"
+        )
+    linearity = _linearity(used)
+    read_DN2 = float(np.nanmedian(darks.variance[good])) if darks.effective > 0 else 0.0
+    dark_frames = min((kept.frames for _, kept in darks.sums), default=1)
+    left = np.asarray(fit.slope_DN / np.where(fit.gain_DN > 0, fit.gain_DN, np.nan))
+    repeats = _repeats(
+        used,
+        read_DN2=read_DN2,
+        dark_frames=dark_frames,
+        pixels=int(good.sum()),
+        share=float(np.nanmedian(left)) if np.isfinite(left).any() else 1.0,
+    )
+    for row in repeats:
+        if abs(row["change_percent"]) > max(0.3, 5.0 * row["noise_percent"]):
+            warnings.append(
+                f"the level changed by {row['change_percent']:+.2g} % from {row['series'][0]} to {row['series'][-1]} at"
+                " the same setting: output or detector drift between series"
+            )
+    if linearity is not None and linearity["largest_departure_percent"] > 1.0:
+        warnings.append(
+            "signal departs from a line in tube load or exposure by up to"
+            f" {linearity['largest_departure_percent']:.2g} %"
+        )
+    if fit.degrees > 0 and fit.chi_square / fit.degrees > 2.0:
+        warnings.append(
+            f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f}"
+            " per degree of freedom); gains are sums of covariances, and the images generated from this twin have a Gaussian spread"
+        )
+    dark_levels = [
+        {
+            "series": item.name,
+            "index": item.index,
+            "exposure_ms": item.exposure_ms,
+            "median_DN": float(np.median(total.mean_DN[good])),
+            "frames": total.frames,
+        }
+        for item, total in darks.sums
+    ]
+    neighbour = [c for c, g in zip(noise.covariances, noise.groups, strict=True) if g < 0]
+    dark_correlation = None
+    if neighbour:
+        centre = neighbour[0].radius
+        zero = sum(c.covariance_DN2[centre, centre] for c in neighbour)
+        dark_correlation = {
+            "row_direction": float(sum(c.covariance_DN2[centre + 1, centre] for c in neighbour) / zero)
+            if zero
+            else 0.0,
+            "column_direction": float(sum(c.covariance_DN2[centre, centre + 1] for c in neighbour) / zero)
+            if zero
+            else 0.0,
+        }
+    evidence = {
+        "stack_over_pair_variance": ratio,
+        "drift_percent_per_series": {p.series: p.drift_percent for p in used},
+        "output_rms_percent": max((p.common_mode_percent for p in used), default=0.0),
+        "repeated_settings": repeats,
+        "linearity": linearity,
+        "dark": dark_levels,
+        "dark_neighbour_correlation": dark_correlation,
+        "spread_fit": {
+            "model": fit.model,
+            "chi_square_per_degree": fit.chi_square / max(fit.degrees, 1),
+            "degrees": fit.degrees,
+            "other_model_chi_square_excess": fit.chi_square_other - fit.chi_square,
+            "other_model_sigma_px": fit.sigma_other_px,
+            "white_fraction": [float(value) for value in fit.white_fraction],
+        },
+        "photon_transfer": [point.as_dict() for point in points],
+    }
+    return evidence, warnings
+
+
+def session_evidence(
+    acquisition: AcquisitionFile, flats: Sequence[Series], noise: FlatNoise, darks: DarkFrames, good: NDArray[np.bool_]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Per session: its series, dark levels, levels a mAs, and their change since the first session that has the same; and warnings.
+
+    Nothing for one session.
+    """
+    numbers = sorted({item.session for item in [*flats, *(item for item, _ in darks.sums)]})
+    warnings: list[str] = []
+    if len(numbers) < 2:
+        return [], warnings
+    dark_first: dict[float | None, float] = {}
+    rate_first: dict[tuple[Any, ...], float] = {}
+    found = []
+    for number in numbers:
+        dark_change: dict[str, float] = {}
+        for key, mean in darks.by_exposure.items():
+            if key[0] == number:
+                level = float(np.median(mean[good]))
+                dark_change[f"{key[1]:g} ms" if key[1] is not None else "unknown"] = level - dark_first.setdefault(
+                    key[1], level
+                )
+        loads: dict[tuple[Any, ...], list[tuple[float, float]]] = {}
+        for item, total, _ in noise.flats_in_fit:
+            load = load_mAs_of(item)
+            if load is not None and item.session == number:
+                signal = float(np.median((total.mean_DN - darks.of(item))[good]))
+                loads.setdefault((*beam_of(item), item.source_detector_mm), []).append((signal, load))
+        level_change: dict[str, float] = {}
+        for beam, pairs in loads.items():
+            rate = sum(signal for signal, _ in pairs) / sum(load for _, load in pairs)
+            name = f"{beam[0]:g} kV" + "".join(f" {layer}" for layer in beam[1])
+            level_change[name] = 100.0 * (rate / rate_first.setdefault(beam, rate) - 1.0)
+        found.append(
+            {
+                "session": number,
+                "series": sum(item.session == number for item in acquisition.series),
+                "dark_change_DN": dark_change,
+                "level_change_percent": level_change,
+            }
+        )
+        largest = max(level_change.values(), key=abs, default=0.0)
+        if abs(largest) > 0.3:
+            warnings.append(f"session {number + 1}: levels changed by up to {largest:+.2g} % since the first session")
+        largest = max(dark_change.values(), key=abs, default=0.0)
+        if abs(largest) > 1.0:
+            warnings.append(
+                f"session {number + 1}: the dark level moved by {largest:+.3g} DN; each session has its own darks"
+            )
+    return found, warnings
+
+
+def _repeats(
+    points: Sequence[SeriesPoint], *, read_DN2: float, dark_frames: int, pixels: int, share: float
+) -> list[dict[str, Any]]:
+    """Settings measured more than once: levels in order of time, sampling noise of each, change from first to last, %.
+
+    Args:
+        points: the flats.
+        read_DN2: electronic variance of a pixel and frame.
+        dark_frames: of the shortest dark series.
+        pixels: that the levels are means of.
+        share: of the quanta's variance that the spread leaves in one pixel; a mean over pixels carries all of it.
+    """
+    groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
+    for point in points:
+        key = (point.kV, point.filters, point.exposure_ms, point.load_mAs, point.photons_per_pixel)
+        groups.setdefault((*key, point.source_detector_mm), []).append(point)
+    rows = []
+    for members in groups.values():
+        if len(members) < 2:
+            continue
+        levels = [point.mean_signal_DN for point in members]
+        change = 100.0 * (levels[-1] / levels[0] - 1.0)
+        sampling = []
+        for point in members:
+            quanta_DN2 = max(point.pair_variance_DN2 - read_DN2, 0.0) / max(share, 1e-3)
+            noise_DN2 = ((quanta_DN2 + read_DN2) / (point.frames * point.averaged) + read_DN2 / dark_frames) / pixels
+            of_pixels = 100.0 * math.sqrt(noise_DN2) / max(point.mean_signal_DN, 1e-9)
+            sampling.append(math.hypot(point.common_mode_percent / math.sqrt(point.frames), of_pixels))
+        rows.append(
+            {
+                "series": [point.series for point in members],
+                "mean_signal_DN": levels,
+                "change_percent": change,
+                "sampling_percent": sampling,
+                "noise_percent": math.hypot(sampling[0], sampling[-1], 0.02),
+            }
+        )
+    return rows
+
+
+def _linearity(points: Sequence[SeriesPoint]) -> dict[str, Any] | None:
+    """Departure of the signal from a line through zero in mAs (or photons, or ms) within each kV and filter, %."""
+    groups: dict[tuple[Any, ...], list[SeriesPoint]] = {}
+    for point in points:
+        groups.setdefault((point.kV, point.filters, point.source_detector_mm), []).append(point)
+    rows: list[dict[str, Any]] = []
+    for members in groups.values():
+        for quantity in ("load_mAs", "photons_per_pixel", "exposure_ms"):
+            values = [getattr(point, quantity) for point in members]
+            if all(value for value in values) and len(set(values)) > 1:
+                load = np.array(values, dtype=np.float64)
+                signal = np.array([point.signal_DN for point in members])
+                slope = float(np.sum(signal) / np.sum(load))
+                departure = 100.0 * (signal - slope * load) / np.max(signal)
+                rows.append(
+                    {
+                        "kV": members[0].kV,
+                        "filter": text_from_filters(members[0].filters),
+                        "against": quantity,
+                        "DN_per_unit": slope,
+                        "departure_percent_of_full": [float(value) for value in departure],
+                    }
+                )
+                break
+    if not rows:
+        return None
+    largest = max(max(abs(value) for value in row["departure_percent_of_full"]) for row in rows)
+    return {"largest_departure_percent": largest, "groups": rows}

@@ -121,29 +121,29 @@ def _spread(light: NDArray[np.float32], context: FrameContext) -> NDArray[np.flo
     return collected
 
 
-def _electrons(light_keV: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
-    """Electrons of light and dark current, Poisson in each pixel."""
-    from ._loops import electrons_of_light, poisson_tables
+def electrons_drawn(
+    light_keV: NDArray[np.float32], context: FrameContext, *, loop: Callable[..., None]
+) -> NDArray[np.float32]:
+    """Electrons of light and dark current, Poisson in each pixel; loop: as `_loops.electrons_of_light`."""
+    from ._loops import poisson_tables
 
     keep, alias = poisson_tables()
     dark = context.maps.dark_current_DN_per_ms * (context.exposure_ms * context.summed / context.system.DN_per_electron)
     electrons = np.empty_like(light_keV)
-    electrons_of_light(
-        light_keV, context.system.electrons_per_keV, dark, context.key, context.frame, keep, alias, electrons
-    )
+    loop(light_keV, context.system.electrons_per_keV, dark, context.key, context.frame, keep, alias, electrons)
     return electrons
 
 
-def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
-    """Analogue level in DN: conversion map, dark map, white electronic noise."""
-    from ._loops import read_out
-
+def level_read_out(
+    electrons: NDArray[np.float32], context: FrameContext, *, loop: Callable[..., None]
+) -> NDArray[np.float32]:
+    """Analogue level in DN: conversion map, dark map, white electronic noise; loop: as `_loops.read_out`."""
     summed = context.summed
     # The mean of n rounded numbers keeps 1/12n DN2 of rounding; `_digitise` rounds the mean once, in steps of 1/n.
     rounding_DN2 = (1.0 / summed - 1.0 / summed**2) / 12.0
     noise = np.sqrt(context.maps.read_noise_DN**2 / summed + np.float32(rounding_DN2))
     level_DN = np.empty_like(electrons)
-    read_out(
+    loop(
         electrons,
         context.maps.DN_per_electron,
         context.maps.dark_DN,
@@ -154,6 +154,18 @@ def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[n
         level_DN,
     )
     return level_DN
+
+
+def _electrons(light_keV: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
+    from ._loops import electrons_of_light
+
+    return electrons_drawn(light_keV, context, loop=electrons_of_light)
+
+
+def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
+    from ._loops import read_out
+
+    return level_read_out(electrons, context, loop=read_out)
 
 
 def _digitise(level_DN: NDArray[np.float32], context: FrameContext) -> NDArray[np.uint16] | NDArray[np.float32]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting
 from .bench import Frame
-from .chain import BASE_STAGES, SUBPIXELS, FrameContext, Stage, run_chain
+from .chain import BASE_STAGES, SUBPIXELS, FrameContext, Stage, electrons_drawn, level_read_out, run_chain
 from .objects import fine_shape
 from .phantoms import Posed
 from .response import Incidence, compute_incidence, tube_load_mAs
@@ -139,36 +139,15 @@ def light_of_arrivals(arrivals: FineRates, context: FrameContext) -> NDArray[np.
 
 
 def _electrons(light_keV: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
-    from ._loops import poisson_tables
     from ._session_loops import electrons_of_much_light
 
-    keep, alias = poisson_tables()
-    dark = context.maps.dark_current_DN_per_ms * (context.exposure_ms * context.summed / context.system.DN_per_electron)
-    electrons = np.empty_like(light_keV)
-    electrons_of_much_light(
-        light_keV, context.system.electrons_per_keV, dark, context.key, context.frame, keep, alias, electrons
-    )
-    return electrons
+    return electrons_drawn(light_keV, context, loop=electrons_of_much_light)
 
 
 def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
     from ._session_loops import read_out_fast
 
-    summed = context.summed
-    rounding_DN2 = (1.0 / summed - 1.0 / summed**2) / 12.0
-    noise = np.sqrt(context.maps.read_noise_DN**2 / summed + np.float32(rounding_DN2))
-    level_DN = np.empty_like(electrons)
-    read_out_fast(
-        electrons,
-        context.maps.DN_per_electron,
-        context.maps.dark_DN,
-        noise,
-        1.0 / summed,
-        context.key,
-        context.frame,
-        level_DN,
-    )
-    return level_DN
+    return level_read_out(electrons, context, loop=read_out_fast)
 
 
 # Photons, spread, electrons, readout, digitise: spread and ADC as in every chain.

@@ -27,9 +27,7 @@ from ..spectra import (
     DEFAULT_ANODE,
     DEFAULT_MODEL,
     DEFAULT_SCINTILLATOR,
-    MAXIMUM_KV,
-    MAXIMUM_KV_OF_ANODE,
-    MINIMUM_KV,
+    checked_kV,
     detector_response,
     energy_grid_keV,
     tube_fluence_interpolated,
@@ -238,13 +236,7 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         raise InputError(
             "setting", received=str(setting), expected="a tube load", remedy="give power_w=... or current_ma=..."
         )
-    highest_kV = MAXIMUM_KV_OF_ANODE.get(line.anode, MAXIMUM_KV)
-    if not MINIMUM_KV <= setting.kV <= highest_kV:
-        raise InputError(
-            "kV",
-            received=f"{setting.kV:g} kV",
-            expected=f"{MINIMUM_KV:g} to {highest_kV:g} kV, where the {line.anode} spectra are known",
-        )
+    checked_kV(setting.kV, anode=line.anode)
     energies = energy_grid_keV(setting.kV)
     fluence = tube_fluence_interpolated(
         setting.kV,

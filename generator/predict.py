@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
+from ..spectra import checked_kV
 from .binning import binned_pixel, binned_variance_share
 from .line_limits import check_count_rate, check_limits
 from .present_line import PresentLine, present_line
@@ -216,6 +217,7 @@ def _without_effects(twin: Twin, setting: Setting) -> Prediction:
     share_relative_sd = _slope_share_sd(twin) / share
     quantum_draws, quantum_sd = np.ones(1), 0.0
     if posterior is not None:
+        checked_kV(setting.kV, anode=posterior.anode)
         model = spectral_model_of(twin, highest_kV=setting.kV)
         signal = model.signal(posterior.samples, OpenBeam(kV=setting.kV, filters=setting.filters))
         best = posterior.best[None, :]

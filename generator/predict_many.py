@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
+from ..spectra import checked_kV
 from .present_line import present_line
 from .twin import Twin
 from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
@@ -123,6 +124,8 @@ def _levels_of_kV(
                 1.0,
             )
     if unmeasured:
+        if twin.spectral is not None:
+            checked_kV(kV, anode=twin.spectral.anode)
         model = spectral_model_of(twin, highest_kV=kV)  # raises where the twin has no spectral part
         best = twin.spectral.best if twin.spectral is not None else model.default_parameters()
         # the bare tube comes first, to measure the others by

@@ -19,6 +19,7 @@ from .tube import (
     MAXIMUM_KV_OF_ANODE,
     MINIMUM_KV,
     MODELS,
+    checked_kV,
     tube_fluence_interpolated,
     tube_spectrum,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "Response",
     "Spectrum",
     "air_kerma_uGy_per_mAs",
+    "checked_kV",
     "detector_response",
     "effective_mu_per_mm",
     "energy_grid_keV",

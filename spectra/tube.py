@@ -74,7 +74,7 @@ def tube_spectrum(
         Poludniowski et al. (2021), doi:10.1002/mp.14945 (SpekPy v2).
     Checked against: half-value layers of PTB's beam qualities to 150 kV, 3.5 % (tests/test_spectra_reference.py).
     """
-    top_keV = float(_checked_kV(kV, anode))
+    top_keV = float(checked_kV(kV, anode=anode))
     grid = energy_grid_keV(top_keV) if energies_keV is None else _common_grid(energies_keV, top_keV)
     fluence = tube_fluence_interpolated(
         kV, energies_keV=grid, anode=anode, anode_angle_deg=anode_angle_deg, model=model
@@ -130,7 +130,7 @@ def tube_fluence_interpolated(
         30 kV copper without aluminium passes the tube's L lines below its edge at 9 keV, where its transmission changes
         up to threefold within a bin: sums are 0.5 % off behind 0.05 mm at 20 kV, 7 % behind 0.2 mm, a third behind 0.5 mm.
     """
-    kV = _checked_kV(kV, anode)
+    kV = checked_kV(kV, anode=anode)
     tube = (anode, _checked_angle(anode_angle_deg), _checked_model(model))
     energies = np.asarray(energies_keV, dtype=float)
     last_keV = FIRST_CENTRE_KEV + BIN_WIDTH_KEV * (energies.size - 1)
@@ -346,13 +346,20 @@ def _spekpy_version() -> str:
     return version("spekpy")
 
 
-def _checked_kV(kV: float, anode: str) -> float:
+def checked_kV(kV: float, *, anode: str) -> float:
+    """The tube voltage, kV, if the spectra of an anode are known there.
+
+    Raises:
+        InputError: an unknown anode, or a voltage outside its range.
+    """
     if anode not in MAXIMUM_KV_OF_ANODE:
         raise InputError("anode", received=repr(anode), expected=f"one of {', '.join(MAXIMUM_KV_OF_ANODE)}")
     highest = MAXIMUM_KV_OF_ANODE[anode]
     if not MINIMUM_KV <= kV <= highest:
         raise InputError(
-            "kV", received=f"{kV} kV", expected=f"{MINIMUM_KV:g} to {highest:g} kV, where the {anode} spectra are known"
+            "kV",
+            received=f"{kV:g} kV",
+            expected=f"{MINIMUM_KV:g} to {highest:g} kV, where the {anode} spectra are known",
         )
     return float(kV)
 

@@ -65,6 +65,16 @@ def test_settings_that_cannot_be_predicted_are_refused(twin, changes, message):
         predict_levels(twin, **{"kV": KV, "filters": FILTERS, "load_mAs": LOAD_MAS, **changes})
 
 
+@pytest.mark.parametrize("kV", [9.95, 301.0])
+def test_a_voltage_without_spectra_is_refused_as_it_was_given(twin, kV):
+    """The calibrated tube gives 0.7 % more than it is set to: neither edge is where the message would have it."""
+    expected = f"kV: got {kV:g} kV; expected 10 to 300 kV"
+    with pytest.raises(InputError, match=expected):
+        predict_levels(twin, kV=[kV], filters=FILTERS[:1], load_mAs=0.02)
+    with pytest.raises(InputError, match=expected):
+        predict_flatfield(twin, Setting(kV=kV, exposure_ms=20.0, current_mA=0.1, filters=FILTERS[0]))
+
+
 def test_without_a_spectrum_only_measured_levels_are_predicted_at_once(twin):
     plain = replace(twin, spectral=None)
     known = predict_levels(plain, kV=[40.0], filters=FILTERS[:1], load_mAs=0.02)

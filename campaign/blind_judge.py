@@ -68,9 +68,10 @@ def judge_session(
     import numpy as np
 
     from ..acquisition import open_acquisition
+    from ..diagnosis.answer import diagnosis_answer
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
-    from ..diagnosis.diagnose import diagnose, diagnosis_answer
+    from ..diagnosis.diagnose import diagnose
     from ..diagnosis.preparation import calibrated_twin
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage

@@ -4,9 +4,9 @@ from importlib import import_module
 from typing import Any
 
 _PLACES = {
-    "Diagnosis": "diagnose",
+    "Diagnosis": "answer",
     "diagnose": "diagnose",
-    "diagnosis_answer": "diagnose",
+    "diagnosis_answer": "answer",
     "build_problem": "assemble",
     "summarise_series": "summaries",
     "weigh_hypotheses": "inference",

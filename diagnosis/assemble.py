@@ -23,9 +23,10 @@ from .even_maps import Map
 from .forward_model import Change, ForwardModel, draft_cache, strength_rows
 from .known_effects import lasting
 from .known_laws import beside_known, without_each
+from .model_scalars import expected_scalars
 from .nuisance_columns import Columns
 from .placing import place_scenes
-from .probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName, expected_scalars
+from .probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from .responses import Asked, Moved, SeriesModel, SessionModel, session_model
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes

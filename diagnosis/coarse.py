@@ -7,15 +7,8 @@ take hours, for effects of which most are as plain in a fortieth of the pixels.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from ..generator.effects import AppliedEffect
 from ..generator.effects.effect import Parameter
-from ..generator.twin import Twin
-from .known_effects import with_found
-
-if TYPE_CHECKING:
-    from .diagnose import Diagnosis
 
 LEAST_SIDE = 16  # rows and columns below which pictures say nothing
 LARGEST_PIXELS = 2**15  # of a frame that is diagnosed as it is
@@ -57,46 +50,3 @@ def in_squares(effect: str, parameter: Parameter, factor: int) -> Parameter:
 def parameters_in_pixels(effect: str, parameters: Mapping[str, float], factor: int) -> dict[str, float]:
     """Parameters of an effect, strength with them, that were found with squares of pixels."""
     return {name: value * pixels_in_square(effect, name, factor) for name, value in parameters.items()}
-
-
-def in_pixels(diagnosis: "Diagnosis", *, twin: Twin, factor: int) -> "Diagnosis":
-    """A diagnosis made with squares of pixels, in terms of the panel's pixels.
-
-    Args:
-        diagnosis: of the coarser session.
-        twin: the panel's own, calibrated from the same series.
-        factor: pixels along each side of a square.
-    """
-    added = tuple(
-        AppliedEffect(
-            id=item.id,
-            parameters=parameters_in_pixels(item.id, item.parameters, factor),
-            since=item.since,
-            options=item.options,
-        )
-        for item in diagnosis.added
-    )
-    causes = []
-    for cause in diagnosis.causes:
-        share = pixels_in_square(cause.effect, "strength", factor)
-        value, low, high = cause.strength
-        causes.append(
-            replace(
-                cause,
-                strength=(share * value, share * low, share * high),
-                parameters=parameters_in_pixels(cause.effect, cause.parameters, factor),
-            )
-        )
-    rows, columns = twin.maps.shape
-    text = (
-        f"frames of {rows} x {columns} were compared as means of {factor} x {factor} pixels: what is finer than that (codes,"
-        " sharpness and texture within some pixels) is hardly seen; diagnose a part of the panel for it"
-    )
-    return replace(
-        diagnosis,
-        added=added,
-        causes=tuple(causes),
-        twin=replace(twin, effects=with_found(twin.effects, added)),
-        not_tested={**diagnosis.not_tested, **UNSEEN},
-        notes=(*diagnosis.notes, text),
-    )

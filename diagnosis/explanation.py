@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..generator.effects import EFFECTS
-from .diagnose import Cause, Diagnosis, Place
+from .answer import Cause, Diagnosis, Place
 
 _NAMED_DOUBTS = 3
 _NAMED_STRAINED = 3

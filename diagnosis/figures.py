@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .answer import Diagnosis
 from .assemble import SeriesView
-from .diagnose import Diagnosis
 from .inference import UNKNOWN
 
 _BEFORE, _AFTER, _FLOOR = "#b3402a", "#2a6fb3", "#777777"

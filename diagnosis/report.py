@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files import whole_file
+from .answer import Diagnosis
 from .assemble import map_changes
-from .diagnose import Diagnosis
 from .explanation import location_text, paragraph, strained_text, strength_text, task_text, title_of
 from .figures import plot_by_axis, plot_gap_maps, plot_hypotheses, plot_places, plot_task, plot_transmission_curves
 from .inference import UNKNOWN

@@ -14,9 +14,11 @@ from .defects import counting_series
 from .even_maps import NOWHERE, Map, compact, mean_over
 from .fixed_pattern import lines_of, pattern_noise
 from .forward_model import Change, ForwardModel
+from .model_scalars import expected_scalars
 from .placing import PlacedSeries
-from .probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS, ScalarContext, expected_scalars
+from .probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS
 from .registration import Placement
+from .scalar_context import ScalarContext
 from .session import SessionSeries
 from .summaries import SeriesSummary
 from .usable import SeenSeries

@@ -20,8 +20,9 @@ from .nuisance_columns import (
     uneven,
 )
 from .output_course import OutputCourse
-from .probes import ProbeName, time_templates
+from .probes import ProbeName
 from .responses import Asked, Moved, SessionModel
+from .scalar_context import time_templates
 from .series_probes import MeanFrame, SeriesProbes
 from .session import SessionSeries
 

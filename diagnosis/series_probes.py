@@ -13,17 +13,10 @@ from .changes import Variant
 from .even_maps import Map, full_size, signal_map
 from .fixed_pattern import count_outliers, pattern_statistics
 from .forward_model import strength_rows
+from .frame_scalars import measured_scalars
+from .map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
 from .placing import SHARP_SCENES, displacement_probes, inside
-from .probes import (
-    MapProjection,
-    ProbeName,
-    Scalar,
-    Template,
-    edge_templates,
-    measured_scalars,
-    smooth_templates,
-    transmission_templates,
-)
+from .probes import ProbeName, Scalar
 from .registration import render_variance
 from .responses import Moved, SeriesModel, SessionModel
 from .summaries import LEAST_NOISE_DN2, SeriesSummary

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from raytwin.diagnosis.diagnose import Cause, Place
+from raytwin.diagnosis.answer import Cause, Place
 from raytwin.diagnosis.explanation import location_text, paragraph
 from raytwin.diagnosis.held_out import Gap
 

@@ -10,9 +10,9 @@ from raytwin.diagnosis import inference
 from raytwin.diagnosis.changes import Variant
 from raytwin.diagnosis.curve_fits import CurveFit, _log_integral, fit_curve, interval_of
 from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.diagnose import _beyond_plausible, _strained
 from raytwin.diagnosis.inexact_laws import group_factors
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.judgement import _beyond_plausible, _strained
 from raytwin.diagnosis.local_nuisances import LocalNuisances, local_columns
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.pairs import (

@@ -11,10 +11,11 @@ from raytwin.diagnosis import veto
 from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
-from raytwin.diagnosis.diagnose import _elsewhere, _threshold
+from raytwin.diagnosis.doubts import _elsewhere
 from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
+from raytwin.diagnosis.judgement import _threshold
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.probes import ALONG_ROWS

@@ -10,18 +10,13 @@ from scipy.special import ndtr
 
 from raytwin.diagnosis.defects import memory_of
 from raytwin.diagnosis.fixed_pattern import Pattern
+from raytwin.diagnosis.frame_scalars import _log_variance_of_steps, measured_scalars
 from raytwin.diagnosis.lost_bits import rounded_kurtosis
+from raytwin.diagnosis.map_probes import MapProjection, Template
+from raytwin.diagnosis.moving_picture import MovingPicture
 from raytwin.diagnosis.placing import _smeared
-from raytwin.diagnosis.probes import (
-    Areas,
-    MapProjection,
-    ScalarContext,
-    Template,
-    _log_variance_of_steps,
-    _MovingPicture,
-    measured_scalars,
-)
 from raytwin.diagnosis.registration import Placement, register, register_drawn, resample
+from raytwin.diagnosis.scalar_context import Areas, ScalarContext
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
 
@@ -256,7 +251,7 @@ def test_a_picture_that_fades_adds_to_variances_what_it_says():
         signal_DN=np.ones((1, 1)),
     )
     areas = Areas.of(good, np.zeros((rows, columns), np.int64), 1)
-    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, areas=areas, kind="dark"))
+    moving = MovingPicture.of(expected, SimpleNamespace(good=good, areas=areas, kind="dark"))
     assert moving.pixels() == moving.pixels(0)
     assert moving.pixels() == pytest.approx(float(found.label_variance_DN2[0]), rel=1e-4)
     assert moving.rows() == pytest.approx(found.row_variance_DN2, rel=1e-4)
@@ -287,11 +282,11 @@ def test_a_picture_that_fades_gives_steps_the_tails_that_it_says(frames, height_
         column_variance_DN2=0.0,
         temporal_correlation=np.zeros(3),
     )
-    moving = _MovingPicture.of(expected, SimpleNamespace(good=good, areas=Areas.of(good, labels, 1), kind="dark"))
+    moving = MovingPicture.of(expected, SimpleNamespace(good=good, areas=Areas.of(good, labels, 1), kind="dark"))
     said = moving.kurtosis(expected)
     assert said > 0.05
     assert found.kurtosis_excess - still.kurtosis_excess == pytest.approx(said, rel=0.1, abs=0.05)
-    nothing = _MovingPicture.of(
+    nothing = MovingPicture.of(
         SimpleNamespace(trend_DN=None, signal_DN=np.ones((1, 1))),
         SimpleNamespace(good=good, areas=Areas.of(good, labels, 1), kind="dark"),
     )

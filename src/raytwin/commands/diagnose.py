@@ -19,7 +19,7 @@ from ._folder import check_effects, written_folder
 if TYPE_CHECKING:
     from ..acquisition.acquisition_io import AcquisitionFile
     from ..campaign.task import TaskInput, TaskPlan
-    from ..diagnosis.diagnose import Diagnosis
+    from ..diagnosis.answer import Diagnosis
     from ..generator.twin import Twin
 
 _LATER_S = 3600.0  # from the end of a session to what was measured later, which has a clock of its own
@@ -119,7 +119,8 @@ def _diagnose(arguments: argparse.Namespace, twin: "Twin | None") -> int:
     from tqdm import tqdm
 
     from .. import __version__
-    from ..diagnosis.diagnose import diagnose, diagnosis_answer
+    from ..diagnosis.answer import diagnosis_answer
+    from ..diagnosis.diagnose import diagnose
     from ..diagnosis.explanation import paragraph, task_text
     from ..diagnosis.report import write_report
     from ..files import sha256_of_file, whole_file

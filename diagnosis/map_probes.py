@@ -1,0 +1,237 @@
+"""Map probes: projections of a mean frame's residual on templates, of unit noise and independent of each other."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._projection_loops import weigh_template
+from .probes import ProbeName
+from .registration import gradient
+
+_LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Template:
+    """A map (row, column) to project on, DN, and what it stands for."""
+
+    axis: str
+    name: str
+    unit: str
+    image: NDArray[np.floating]
+
+
+class MapProjection:
+    """Projection of residual maps onto templates that are made orthogonal in their order; unit noise.
+
+    q = T^T W r; Cov q = T^T W C W T = L L^T (Cholesky in the templates' order, dependent ones dropped); y = L^-1 q.
+    """
+
+    def __init__(
+        self,
+        templates: Sequence[Template],
+        *,
+        mask: NDArray[np.bool_],
+        quantum_DN2: NDArray[np.floating],
+        white_DN2: NDArray[np.floating],
+        autocovariance_table: NDArray[np.floating],
+        tolerance: float = 1e-3,
+    ) -> None:
+        """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
+        weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
+        # a template counts by its shape: single precision is a ten-thousandth of what is left of one that is kept
+        maps = (np.sqrt(weight), np.sqrt(np.maximum(quantum_DN2, 0.0)), white_DN2)
+        sharper, root, white = (np.ascontiguousarray(one, dtype=np.float32) for one in maps)
+        kernels = _separated(np.asarray(autocovariance_table, dtype=np.float64))
+        used: list[Template] = []
+        rows, spread = (np.empty((len(templates), *mask.shape), np.float32) for _ in range(2))
+        for template in templates:
+            # rows are 0 outside the mask, as the weights are
+            image = np.ascontiguousarray(template.image, dtype=np.float32)
+            norm = weigh_template(image, sharper, root, white, *kernels, rows[len(used)], spread[len(used)])
+            if norm > _LEAST_NORM and math.isfinite(norm):
+                used.append(template)
+        rows, spread = (one[: len(used)].reshape(len(used), mask.size) for one in (rows, spread))
+        left = np.asarray(rows @ spread.T, dtype=np.float64)
+        own = np.diag(left).copy()
+        chosen: list[int] = []
+        columns: list[NDArray[np.float64]] = []
+        for number in range(len(used)):
+            rest = float(left[number, number])
+            if rest > tolerance * own[number]:
+                chosen.append(number)
+                columns.append(left[number] / math.sqrt(rest))
+                left -= np.outer(columns[-1], columns[-1])
+        # the images are not kept: fifty a series would be most of the memory
+        self._names = tuple(
+            ProbeName(axis=item.axis, statistic="mean frame", location=item.name, unit=item.unit)
+            for item in (used[number] for number in chosen)
+        )
+        # (probe, pixel), 0 outside the mask: so maps are taken as they are
+        self._shape = mask.shape
+        self._rows = np.zeros((len(chosen), mask.size), np.float32)
+        if chosen:
+            from scipy.linalg import solve_triangular
+
+            lower = np.tril(np.stack(columns, axis=1)[chosen])
+            inverse = solve_triangular(lower, np.eye(len(chosen)), lower=True, check_finite=False)
+            np.matmul(inverse.astype(np.float32), rows[chosen], out=self._rows)
+        self.of_level = self._rows.sum(axis=1, dtype=np.float64)  # (probe,) of 1 DN in every pixel
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def apply(self, images: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Standardised projections (..., probe) of maps (..., row, column), DN."""
+        pixels = images.reshape(*images.shape[:-2], -1).astype(np.float32, copy=False)
+        return np.asarray(pixels @ self._rows.T, dtype=np.float64)
+
+    def apply_each(self, images: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
+        """Standardised projections (image, probe) of maps, (row, column) or (1, 1) where all pixels are alike, DN."""
+        result = np.empty((len(images), len(self)))
+        wide = [number for number, image in enumerate(images) if image.size > 1]
+        for number, image in enumerate(images):
+            if image.size == 1:
+                result[number] = float(image.flat[0]) * self.of_level
+        if wide:
+            result[wide] = self.apply(np.stack([images[number] for number in wide]))
+        return result
+
+    def pixel_noise(self, sd_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Variance (probe,) that independent noise of the pixels, sd_DN (row, column), gives the projections."""
+        variance = np.asarray(sd_DN, dtype=np.float32).ravel() ** 2
+        return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
+
+    def line_noise(self) -> NDArray[np.float64]:
+        """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""
+        pixels = self._rows.reshape(len(self), *self._shape)
+        return np.stack([np.sum(pixels.sum(axis=axis, dtype=np.float64) ** 2, axis=1) for axis in (2, 1)])
+
+    def names(self) -> list[ProbeName]:
+        """One name a probe."""
+        return list(self._names)
+
+
+def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, a quarter of each as of the table.
+
+    A spread that no effect has changed is one such product.
+    """
+    across, sizes, along = np.linalg.svd(table)
+    parts = np.flatnonzero(sizes > 1e-12 * sizes[0])
+    halves = (across[:, parts] * sizes[parts]).T, along[parts]
+    rows, columns = (half.astype(np.float32) for half in halves)
+    return rows, columns
+
+
+def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:
+    """Level, gradients and curvatures across the field, relative to the signal (darks: in DN)."""
+    rows, columns = mask.shape
+    y = np.linspace(-1.0, 1.0, rows)[:, None]
+    x = np.linspace(-1.0, 1.0, columns)[None, :]
+    base = np.ones(mask.shape) if kind in ("dark", "afterglow") else np.asarray(signal_DN, dtype=np.float64)
+    unit = "DN" if kind in ("dark", "afterglow") else "1"
+    shapes = [
+        ("level", "whole field", np.ones(mask.shape)),
+        ("position", "along columns", x + 0 * y),
+        ("position", "along rows", y + 0 * x),
+        ("position", "curved along columns", x**2 + 0 * y),
+        ("position", "curved along rows", y**2 + 0 * x),
+        ("position", "diagonal", x * y),
+        ("position", "cubic along columns", x**3 + 0 * y),
+        ("position", "cubic along rows", y**3 + 0 * x),
+    ]
+    result = [Template(axis=axis, name=name, unit=unit, image=base * shape) for axis, name, shape in shapes]
+    # left half against right, upper against lower quarter: seams of tiles and panels
+    for count, axis_name in ((2, "halves"), (4, "quarters")):
+        for direction in (0, 1):
+            index = (np.arange(mask.shape[direction]) * count // mask.shape[direction]) % 2
+            step = np.where(index == 0, 1.0, -1.0)
+            step_map = step[:, None] * np.ones(mask.shape) if direction == 0 else step[None, :] * np.ones(mask.shape)
+            result.append(
+                Template(
+                    axis="position",
+                    name=f"{axis_name} along {'rows' if direction == 0 else 'columns'}",
+                    unit=unit,
+                    image=base * step_map,
+                )
+            )
+    return result
+
+
+def transmission_templates(
+    signal_DN: NDArray[np.floating], open_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, bins: int = 6
+) -> list[Template]:
+    """Bins of transmission: the signal where -log T lies in each, relative; the open field apart."""
+    log_t = -np.log(np.clip(np.asarray(signal_DN / np.maximum(open_DN, 1e-12), dtype=np.float64), 1e-9, None))
+    covered = mask & (log_t > 0.02)
+    result = [
+        Template(axis="level", name="open field", unit="1", image=np.where(mask & ~covered, signal_DN, 0.0)),
+    ]
+    if covered.sum() < 64:
+        return result
+    # behind 6 and more nothing of the primary is left to speak of: one bin, in DN of the open field
+    shadow = covered & (log_t > 6.0)
+    if shadow.sum() >= 32:
+        result.append(
+            Template(
+                axis="level",
+                name="shadow, -log T above 6",
+                unit="1",
+                image=np.where(shadow, np.asarray(open_DN, dtype=np.float64), 0.0),
+            )
+        )
+    lit = covered & ~shadow
+    if lit.sum() < 64:
+        return result
+    edges = np.unique(np.quantile(log_t[lit], np.linspace(0, 1, bins + 1)))
+    for low, high in pairwise(edges):
+        inside = lit & (log_t >= low) & (log_t <= high)
+        if inside.sum() >= 32:
+            result.append(
+                Template(
+                    axis="level",
+                    name=f"-log T {low:.2f}-{high:.2f}",
+                    unit="1",
+                    image=np.where(inside, signal_DN, 0.0),
+                )
+            )
+    return result
+
+
+def edge_templates(signal_DN: NDArray[np.floating]) -> list[Template]:
+    """Displacement, blur along each direction at three scales, ringing, and tails of several lengths."""
+    from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+    image = np.asarray(signal_DN, dtype=np.float64)
+    dy, dx = gradient(image)
+    rows, columns = image.shape
+    y = (np.arange(rows) - (rows - 1) / 2)[:, None] / rows
+    x = (np.arange(columns) - (columns - 1) / 2)[None, :] / columns
+    result = [
+        Template(axis="sharpness", name="shift along columns", unit="px", image=dx),
+        Template(axis="sharpness", name="shift along rows", unit="px", image=dy),
+        Template(axis="sharpness", name="magnification", unit="1", image=x * dx + y * dy),
+        Template(axis="sharpness", name="rotation", unit="rad", image=x * dy - y * dx),
+    ]
+    for sigma in (0.6, 1.5, 4.0):
+        for axis, name in ((1, "columns"), (0, "rows")):
+            blurred = gaussian_filter1d(image, sigma, axis=axis, mode="nearest")
+            result.append(
+                Template(axis="sharpness", name=f"blur of {sigma:g} px along {name}", unit="1", image=blurred - image)
+            )
+    for sigma in (8.0, 20.0):
+        if sigma < 0.4 * min(image.shape):
+            result.append(
+                Template(
+                    axis="sharpness",
+                    name=f"tail of {sigma:g} px",
+                    unit="1",
+                    image=gaussian_filter(image, sigma, mode="nearest") - image,
+                )
+            )
+    return result

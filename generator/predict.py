@@ -16,7 +16,7 @@ from .line_limits import check_count_rate, check_limits
 from .present_line import PresentLine, present_line
 from .psf import blur_variance_share
 from .spectral_signal import OpenBeam
-from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
+from .twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_sd
 from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
 
 __all__ = [
@@ -181,17 +181,38 @@ def _changed_by_effects(found: Prediction, line: PresentLine) -> Prediction:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Flat:
+    """A flatfield while it is put together, single exposures and pixels.
+
+    Fields: mean_DN; gain_DN; quantum_DN2 (draw,): variance of quanta; quantum_sd: relative, of it beyond the draws;
+    photons, kerma_uGy: None where no spectrum is known; outside: ways in which the setting lies outside what was calibrated.
+    """
+
+    mean_DN: Estimate
+    gain_DN: Estimate
+    quantum_DN2: NDArray[np.float64]
+    quantum_sd: float
+    photons: Estimate | None
+    kerma_uGy: Estimate | None
+    outside: tuple[str, ...]
+
+
 def _without_effects(twin: Twin, setting: Setting) -> Prediction:
     warnings = list(check_limits(twin.instrument, setting))
-    load = setting.tube_load_mAs
-    if load is None:
+    load_mAs = setting.tube_load_mAs
+    if load_mAs is None:
         raise InputError(
             "setting", received=str(setting), expected="a tube load", remedy="give --current-ma or --power-w"
         )
-    level = twin.level_at(setting)
-    posterior = twin.spectral
-    instrument = twin.instrument
-    if posterior is None and (level is None or level.rate_DN_per_mAs is None):
+    level, posterior = twin.level_at(setting), twin.spectral
+    distance_mm = _distance_mm(twin, setting, level, warnings)
+    flat = None
+    if posterior is not None:
+        flat = _by_model(twin, posterior, setting, load_mAs, distance_mm=distance_mm, warnings=warnings)
+    if level is not None:
+        flat = _as_measured(twin, setting, level, flat, load_mAs=load_mAs, distance_mm=distance_mm)
+    if flat is None:
         known = ", ".join(item.name for item in twin.levels)
         raise InputError(
             "setting",
@@ -199,106 +220,143 @@ def _without_effects(twin: Twin, setting: Setting) -> Prediction:
             expected=f"a measured level with a known tube load ({known}), because this twin has no spectral part",
             remedy="calibrate from flats that state kV and current or power",
         )
-    distance = setting.source_detector_mm or instrument.source_detector_mm
-    if distance is None:
-        distance = level.source_detector_mm if level is not None and level.source_detector_mm else 1000.0
-        if posterior is not None:
+    result = _of_frames(twin, setting, flat, warnings)
+    if flat.outside:
+        text = f"outside the calibrated range of {', '.join(flat.outside)}"
+        warnings.append(text if posterior is None else f"{text}: the interval rests on the spectral model")
+    return replace(result, measured_level=level is not None, warnings=tuple(warnings))
+
+
+def _distance_mm(twin: Twin, setting: Setting, level: Level | None, warnings: list[str]) -> float:
+    """From the source to the detector; what is not known of it, or of the pixels, goes to the warnings."""
+    distance_mm = setting.source_detector_mm or twin.instrument.source_detector_mm
+    if distance_mm is None:
+        distance_mm = level.source_detector_mm if level is not None and level.source_detector_mm else 1000.0
+        if twin.spectral is not None:
             warnings.append(
                 "source-detector distance unknown: 1 m assumed on both sides, so only ratios are meaningful"
             )
-    pitch = instrument.pixel_mm
-    if pitch is None:
+    if twin.instrument.pixel_mm is None:
         warnings.append("pixel pitch unknown: photon numbers are not absolute")
-    factor = (1000.0 / distance) ** 2 * (pitch or 1.0) ** 2
+    return distance_mm
 
-    photons = kerma = None
-    outside: tuple[str, ...] = ()
+
+def _by_model(
+    twin: Twin,
+    posterior: SpectralPosterior,
+    setting: Setting,
+    load_mAs: float,
+    *,
+    distance_mm: float,
+    warnings: list[str],
+) -> _Flat:
+    """The flatfield as the posterior's draws have it.
+
+    Raises:
+        InputError: no spectra are known at the voltage, or nothing gets through the filters.
+    """
+    checked_kV(setting.kV, anode=posterior.anode)
+    model = spectral_model_of(twin, highest_kV=setting.kV)
+    beam = OpenBeam(kV=setting.kV, filters=setting.filters)
+    signal = model.signal(posterior.samples, beam)
+    best = posterior.best[None, :]
+    bare = model.signal(best, OpenBeam(kV=setting.kV, filters=())).absorbed_per_mAs
+    left = model.signal(best, beam).absorbed_per_mAs
+    # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
+    if not (np.all(signal.absorbed_per_mAs > 0) and left[0] > 1e-30 * bare[0]):
+        raise InputError(
+            "filter", received=text_from_filters(setting.filters), expected="layers that let some photons through"
+        )
+    factor = (1000.0 / distance_mm) ** 2 * (twin.instrument.pixel_mm or 1.0) ** 2
+    rate_draws = signal.rate_DN_per_mAs * load_mAs * factor
+    outside = _outside(twin, setting, float(np.median(rate_draws)))
+    # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
+    widen = math.sqrt(1.0 + len(outside))
+    level_sd = widen * posterior.level_discrepancy
+    gain_sd = widen * posterior.gain_discrepancy
     share = slope_share(twin)
-    share_relative_sd = _slope_share_sd(twin) / share
-    quantum_draws, quantum_sd = np.ones(1), 0.0
-    if posterior is not None:
-        checked_kV(setting.kV, anode=posterior.anode)
-        model = spectral_model_of(twin, highest_kV=setting.kV)
-        signal = model.signal(posterior.samples, OpenBeam(kV=setting.kV, filters=setting.filters))
-        best = posterior.best[None, :]
-        bare = model.signal(best, OpenBeam(kV=setting.kV, filters=()))
-        left = model.signal(best, OpenBeam(kV=setting.kV, filters=setting.filters)).absorbed_per_mAs
-        # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
-        if not (np.all(signal.absorbed_per_mAs > 0) and left[0] > 1e-30 * bare.absorbed_per_mAs[0]):
-            raise InputError(
-                "filter", received=text_from_filters(setting.filters), expected="layers that let some photons through"
-            )
-        rate_draws = signal.rate_DN_per_mAs * load * factor
-        outside = _outside(twin, setting, float(np.median(rate_draws)))
-        # the draws hold what the parameters leave open; single levels stray from any such model, more so outside
-        widen = math.sqrt(1.0 + len(outside))
-        level_sd = widen * posterior.level_discrepancy
-        gain_sd = widen * posterior.gain_discrepancy
-        mean_frame = _estimate_from_draws(rate_draws, level_sd)
-        gain = _estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, share_relative_sd))
-        photons = _estimate_from_draws(signal.absorbed_per_mAs * load * factor, level_sd)
-        # level and gain are known together, not one by one: their product draw by draw
-        own_share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN)
-        quantum_draws = signal.gain_DN * (share if own_share is None else own_share) * rate_draws
-        quantum_sd = math.hypot(level_sd, gain_sd)
-        at_object = instrument.source_object_mm
-        if setting.source_detector_mm is not None or at_object is None:
-            warnings.append("air kerma is given at the detector: the object's distance at this setting is unknown")
-            at_object = distance
-        kerma = _estimate_from_draws(signal.kerma_uGy_per_mAs * load * (1000.0 / at_object) ** 2, level_sd)
-    if level is not None and level.rate_DN_per_mAs is not None:
+    # level and gain are known together, not one by one: their product draw by draw
+    own_share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN)
+    at_object_mm = twin.instrument.source_object_mm
+    if setting.source_detector_mm is not None or at_object_mm is None:
+        warnings.append("air kerma is given at the detector: the object's distance at this setting is unknown")
+        at_object_mm = distance_mm
+    return _Flat(
+        mean_DN=_estimate_from_draws(rate_draws, level_sd),
+        gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, _slope_share_sd(twin) / share)),
+        quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
+        quantum_sd=math.hypot(level_sd, gain_sd),
+        photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, level_sd),
+        kerma_uGy=_estimate_from_draws(signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2, level_sd),
+        outside=outside,
+    )
+
+
+def _as_measured(
+    twin: Twin, setting: Setting, level: Level, modelled: _Flat | None, *, load_mAs: float, distance_mm: float
+) -> _Flat | None:
+    """The flatfield with what was measured at this kV and filter in place of the model's; None: its load is not known."""
+    if level.rate_DN_per_mAs is not None:
         rate = level.rate_DN_per_mAs
         relative = math.hypot((rate.high - rate.low) / (2 * 1.959964) / rate.value, _MEASURED_REPRODUCIBILITY)
-        there = level.source_detector_mm or distance
-        value = rate.value * load * (there / distance) ** 2
-        mean_frame = estimate_from_sd(value, relative * value)
-        gain = level.gain_DN
-        outside = _outside(twin, setting, mean_frame.value)
-    read = twin.noise.read_noise_DN
-    frames = setting.averaged
-    # a measured level knows its slope directly
-    if level is not None:
-        slope = level.photon_transfer_slope_DN
-        quantum_draws = np.array([slope.value * mean_frame.value])
-        quantum_sd = math.hypot(_log_sd(slope), _log_sd(mean_frame))
+        value = rate.value * load_mAs * ((level.source_detector_mm or distance_mm) / distance_mm) ** 2
+        mean_DN, gain_DN = estimate_from_sd(value, relative * value), level.gain_DN
+        outside = _outside(twin, setting, mean_DN.value)
+    elif modelled is not None:
+        mean_DN, gain_DN, outside = modelled.mean_DN, modelled.gain_DN, modelled.outside
+    else:
+        return None
+    slope = level.photon_transfer_slope_DN
+    return _Flat(
+        mean_DN=mean_DN,
+        gain_DN=gain_DN,
+        quantum_DN2=np.array([slope.value * mean_DN.value]),
+        quantum_sd=math.hypot(_log_sd(slope), _log_sd(mean_DN)),
+        photons=None if modelled is None else modelled.photons,
+        kerma_uGy=None if modelled is None else modelled.kerma_uGy,
+        outside=outside,
+    )
+
+
+def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -> Prediction:
+    """The flatfield of binned pixels and averaged frames, with the electronics' noise.
+
+    Raises:
+        InputError: more photons than a counting detector takes.
+    """
+    instrument = twin.instrument
     binned = binned_pixel(setting.binning, instrument.binning_adds)
+    mean_DN, photons, quantum_DN2 = flat.mean_DN, flat.photons, flat.quantum_DN2
     if setting.binning > 1:
-        quantum_draws = quantum_draws * binned_over_single(twin, setting.binning) * binned.quantum
-        mean_frame = mean_frame.times(binned.signal)
+        quantum_DN2 = quantum_DN2 * binned_over_single(twin, setting.binning) * binned.quantum
+        mean_DN = mean_DN.times(binned.signal)
         photons = photons.times(binned.pixels) if photons is not None else None
         if instrument.binning_adds is None:
             warnings.append("binning is taken as the mean of pixels after readout; declare binning_adds if it is not")
-    read_variance = twin.noise.read_variance_DN2 * binned.electronic
-    variance_draws = np.maximum(quantum_draws, 0.0) + max(read_variance, 1e-12)
+    read = twin.noise.read_noise_DN
+    read_DN2 = twin.noise.read_variance_DN2 * binned.electronic
+    variance_draws = np.maximum(quantum_DN2, 0.0) + max(read_DN2, 1e-12)
     variance = float(np.median(variance_draws))
-    quantum = max(variance - read_variance, 0.0)
-    read_part = 2.0 * twin.noise.read_noise_DN.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
-    variance_sd = math.hypot(quantum * quantum_sd, read_part)
-    sd_estimate = _estimate_from_draws(np.sqrt(variance_draws / frames), 0.5 * variance_sd / variance)
-    extrapolated = bool(outside)
+    of_quanta = max(variance - read_DN2, 0.0) * flat.quantum_sd
+    of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
+    relative_sd = 0.5 * math.hypot(of_quanta, of_reading) / variance
     if instrument.bits is not None:
         room = 2.0**instrument.bits - 1 - twin.dark_DN.value
-        held = mean_frame.value / binned.signal * binned.at_the_adc
+        held = mean_DN.value / binned.signal * binned.at_the_adc
         if held > room:
             warnings.append(f"the detector saturates: {held:.0f} DN above dark, room for {room:.0f} DN")
     if photons is not None and instrument.counting:
         check_count_rate(instrument, setting, photons.value)
-    if extrapolated:
-        warnings.append(
-            f"outside the calibrated range of {', '.join(outside)}: the interval rests on the spectral model"
-            if posterior is not None
-            else f"outside the calibrated range of {', '.join(outside)}"
-        )
     return Prediction(
         setting=setting,
-        mean_DN=mean_frame,
-        sd_DN=sd_estimate,
-        gain_DN=gain,
+        mean_DN=mean_DN,
+        sd_DN=_estimate_from_draws(np.sqrt(variance_draws / setting.averaged), relative_sd),
+        gain_DN=flat.gain_DN,
         photons_absorbed=photons,
-        air_kerma_uGy=kerma,
-        extrapolated=extrapolated,
-        measured_level=level is not None,
-        warnings=tuple(warnings),
+        air_kerma_uGy=flat.kerma_uGy,
+        extrapolated=bool(flat.outside),
+        measured_level=False,
+        warnings=(),
     )
 
 

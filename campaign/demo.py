@@ -132,6 +132,28 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
         InputError: the directory holds a demo of another plan.
         RaytwinError: a step failed.
     """
+    _claim(directory, plan)
+    chain = _Chain(directory=directory, run=run, tell=tell)
+    exposures = [1000.0, *plan.exposures_ms]
+    line = _measured_line(chain, plan)
+    _datasets(chain, plan, exposures)
+    found = _networks(chain, plan, exposures)
+    return {
+        "plan": asdict(plan),
+        **line,
+        **found,
+        "a90_table": a90_table(found["pod"], found["compare"], exposures),
+        "noise": {f"{exposure:g}ms": noise_comparison(directory, f"{exposure:g}ms") for exposure in plan.exposures_ms},
+        "commands": chain.commands,
+    }
+
+
+def _claim(directory: Path, plan: DemoPlan) -> None:
+    """Make the folder one of this plan.
+
+    Raises:
+        InputError: it holds a demo of another plan, or other files.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     fingerprint = json.dumps(asdict(plan), sort_keys=True)
     kept = directory / "plan.json"
@@ -146,29 +168,21 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
             raise InputError("-o", received=f"{directory}, a folder with files in it", expected="a new or empty folder")
         with whole_file(kept) as temporary:
             temporary.write_text(fingerprint)
-    chain = _Chain(directory=directory, run=run, tell=tell)
+
+
+def _measured_line(chain: _Chain, plan: DemoPlan) -> dict[str, Any]:
+    """The line that is measured, its twin, and how well that predicts flats."""
     at = chain.path
-    seed = str(plan.seed)
-    size = ["--size", f"{plan.size[0]}x{plan.size[1]}", "--pixel-mm", f"{plan.pixel_mm:g}", "--seed", seed]
+    size = ["--size", f"{plan.size[0]}x{plan.size[1]}", "--pixel-mm", f"{plan.pixel_mm:g}", "--seed", str(plan.seed)]
     if plan.source_detector_mm is not None:
         size += ["--source-detector-mm", f"{plan.source_detector_mm:g}"]
     bones = [] if plan.bones_mm is None else ["--bones-mm", ",".join(f"{length:g}" for length in plan.bones_mm)]
-
-    # the measured system
     truth = chain.step(
         "lab_calibration",
-        [
-            "lab",
-            "-o",
-            at("calibration.h5"),
-            "--protocol",
-            "calibration",
-            *size,
-            "--frames",
-            str(plan.calibration_frames),
-        ],
+        ["lab", "-o", at("calibration.h5"), "--protocol", "calibration", *size,
+         "--frames", str(plan.calibration_frames)],
         outputs=["calibration.h5"],
-    )
+    )  # fmt: skip
     calibration = chain.step("calibrate", ["calibrate", at("calibration.h5"), "-o", at("twin.h5")], outputs=["twin.h5"])
     validation = chain.step("validate", ["validate", at("twin.h5"), at("calibration.h5")])
     for name, count, more in (("set1", plan.products, []), ("set2", plan.test_products, bones)):
@@ -177,29 +191,32 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
             ["lab", "-o", at(f"{name}.h5"), "--protocol", name, *size, "--products", str(count), *more],
             outputs=[f"{name}.h5"],
         )
+    return {"truth": truth, "calibration": calibration, "validation": validation}
 
-    # measured images as datasets
+
+def _datasets(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> None:
+    """Measured images as datasets; generated ones, for training from set 1, for testing from the 1 s images of set 2."""
+    at = chain.path
     twin = ["--twin", at("twin.h5")]
     chain.step(
         "references",
-        ["import", "reference", at("set1.h5"), "-o", at("references.h5"), *twin, "--validation", "0.2", "--seed", seed],
+        ["import", "reference", at("set1.h5"), "-o", at("references.h5"), *twin, "--validation", "0.2",
+         "--seed", str(plan.seed)],
         outputs=["references.h5"],
-    )
-    exposures = [1000.0, *plan.exposures_ms]
-    pairs = {exposure: setting_pair(exposure) for exposure in exposures}
-    for exposure, (low, high) in pairs.items():
+    )  # fmt: skip
+    for exposure in exposures:
+        low, high = setting_pair(exposure)
         chain.step(
             f"real_{exposure:g}ms",
             ["import", "reference", at("set2.h5"), "-o", at(f"real_{exposure:g}ms.h5"), *twin,
              "--low", str(low), "--high", str(high)],
             outputs=[f"real_{exposure:g}ms.h5"],
         )  # fmt: skip
-
-    # generated images: for training from set 1, for testing from the 1 s images of set 2
     for exposure in plan.exposures_ms:
-        low, high = pairs[exposure]
+        low, high = setting_pair(exposure)
         setting = ["--low", str(low), "--high", str(high)]
         number = f"{exposure:g}ms"
+        seed = 1000 * plan.seed + 10 * int(exposure)
         for kind, source, count, offset in (
             ("train", "references.h5", plan.generated, 0),
             ("test", "real_1000ms.h5", plan.test_products, 1),
@@ -207,20 +224,25 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
             chain.step(
                 f"generate_{kind}_{number}",
                 ["generate", at("twin.h5"), at(source), *setting, "-n", str(count),
-                 "--seed", str(1000 * plan.seed + 10 * int(exposure) + offset), "--no-counts",
-                 "-o", at(f"{kind}_{number}.h5")],
+                 "--seed", str(seed + offset), "--no-counts", "-o", at(f"{kind}_{number}.h5")],
                 outputs=[f"{kind}_{number}.h5"],
             )  # fmt: skip
         chain.step(
             f"published_{number}",
             ["generate", at("twin.h5"), at("real_1000ms.h5"), *setting, "-n", str(plan.test_products),
-             "--recipe", "as_published", "--seed", str(1000 * plan.seed + 10 * int(exposure) + 2), "--no-counts",
-             "-o", at(f"published_{number}.h5")],
+             "--recipe", "as_published", "--seed", str(seed + 2), "--no-counts", "-o", at(f"published_{number}.h5")],
             outputs=[f"published_{number}.h5"],
         )  # fmt: skip
-    # networks: one shared start, first from the least noisy images (noisier ones teach a new network nothing for hundreds of
-    # steps), then from all exposures; a few networks for each exposure after that
-    common = ["--recipe", plan.recipe, "--batch", str(plan.batch), "--seed", seed]
+
+
+def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:
+    """Networks trained, tried and compared.
+
+    One shared start, first from the least noisy images (noisier ones teach a new network nothing for hundreds of steps), then
+    from all exposures; a few networks for each exposure after that.
+    """
+    at = chain.path
+    common = ["--recipe", plan.recipe, "--batch", str(plan.batch), "--seed", str(plan.seed)]
     _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_clear.h5")
     _mix(chain, [f"train_{exposure:g}ms.h5" for exposure in plan.exposures_ms], "train_mixed.h5")
     first = chain.step(
@@ -259,19 +281,7 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
             pod[name] = _pod(chain, name)
         if len(kinds) == 2:
             compared[number] = _compared(chain, number)
-    return {
-        "plan": asdict(plan),
-        "truth": truth,
-        "calibration": calibration,
-        "validation": validation,
-        "training": training,
-        "detection": detection,
-        "pod": pod,
-        "compare": compared,
-        "a90_table": a90_table(pod, compared, exposures),
-        "noise": {f"{exposure:g}ms": noise_comparison(directory, f"{exposure:g}ms") for exposure in plan.exposures_ms},
-        "commands": chain.commands,
-    }
+    return {"training": training, "detection": detection, "pod": pod, "compare": compared}
 
 
 def setting_pair(exposure_ms: float) -> tuple[Setting, Setting]:

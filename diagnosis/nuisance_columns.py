@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from . import changes as scales
 from .even_maps import Map
 from .noise_correlation import correlation_sum
+from .point_maps import blurred_between_points, sampled_at_points
 from .registration import CELL_SD_PX, gradient
 from .responses import Moved, SessionModel
 from .series_probes import SeriesProbes
@@ -56,6 +57,8 @@ def local_nuisances(
         dy, dx = gradient(signal)
         columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
         images |= _of_scene(item, dy, dx, sharp=sharp)
+        if sharp:
+            images |= _between_points(item, signal)
     return columns | _projected(probes, images)
 
 
@@ -152,6 +155,18 @@ def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float
     for number, field in enumerate(_rough_fields(dy.shape, place)):
         images[f"rough edge {number} of {place}"] = slope * field
     return images
+
+
+def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
+    """Where pixels jump as maps of points do, what a blur shows of how borders run between them."""
+    maps = item.request.thickness_mm
+    if maps is None or not sampled_at_points(maps):
+        return {}
+    place = _place(item)
+    return {
+        f"outline of {place} between points, {number}": image
+        for number, image in enumerate(blurred_between_points(maps, signal))
+    }
 
 
 def _of_edges(probes: SeriesProbes, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> Columns:

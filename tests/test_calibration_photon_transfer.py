@@ -386,3 +386,25 @@ def test_two_frames_leave_the_noise_unbiased(tmp_path: Path) -> None:
     assert np.count_nonzero(transfer.maps.bad_pixels) <= 2
     assert transfer.noise.read_noise_DN.value == pytest.approx(5.0, rel=0.03)
     assert transfer.levels[0].photon_transfer_slope_DN.value == pytest.approx(2.0, rel=0.06)
+
+
+def test_a_flat_whose_dark_was_taken_off_lies_on_the_line_of_raw_ones(tmp_path):
+    rng = np.random.default_rng(11)
+    path = tmp_path / "mixed.h5"
+    with write_acquisition(path, Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0)) as writer:
+        dark = flat_frames(0.0, rng=rng)
+        writer.add_series("dark", kind="dark", frames=as_adc(dark), setting=Setting(kV=40.0, exposure_ms=20.0))
+        for power, corrected in ((5.0, ()), (10.0, ()), (20.0, ("offset",)), (40.0, ())):
+            setting = Setting(kV=40.0, power_W=power, exposure_ms=20.0)
+            level = DN_PER_MAS * setting.tube_load_mAs
+            frames = as_adc(flat_frames(level, rng=rng))
+            if corrected:
+                frames = frames.astype(np.float32) - dark.mean(axis=0).astype(np.float32)
+            writer.add_series(f"flat_{power:g}W", kind="flat", frames=frames, setting=setting, corrected=corrected)
+    found = transfer_of(path)
+    (level,) = found.levels
+    assert len(level.series) == 4
+    assert level.rate_DN_per_mAs.value == pytest.approx(DN_PER_MAS, rel=2e-3)
+    for point in found.points:
+        assert point.used
+        assert point.signal_DN == pytest.approx(DN_PER_MAS * point.load_mAs, rel=5e-3)

@@ -502,6 +502,11 @@ class Line:
             count = round(self.effects["bad_pixels"] / 100.0 * self.of.shape[0] * self.of.shape[1])
             self.changed_gain.flat[rng.choice(self.of.shape[0] * self.of.shape[1], count, replace=False)] = 0.0
         self.direction = rng.uniform(0.0, 2.0 * math.pi)
+        self.scenes = self.placed()
+
+    def placed(self) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
+        """Kind and path lengths, mm, of what stands in the beam, by scene."""
+        return scenes(self.of)
 
     def signals(self, arriving: np.ndarray, energies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance, DN and DN^2, of photons (row, column, energy)."""
@@ -533,26 +538,38 @@ class Line:
             arriving = arriving * np.exp(-along * thick_mm * tungsten)
         return energies, arriving
 
-    def light(
-        self,
-        kV: float,
-        mAs: float,
-        copper_mm: float,
-        scene: dict[str, np.ndarray],
-        far: bool,
-        on: dict,
-        exposure_ms: float,
-    ) -> tuple:
-        """Mean and variance of one exposure before the spread of light, DN and DN^2, and K photons and what they leave."""
-        energies, arriving = self.open_light(kV, mAs, copper_mm, on)
-        open_DN, _ = self.signals(arriving, energies)
+    def transmitted(self, scene: str, energies: np.ndarray, on: dict, exposure_ms: float) -> np.ndarray:
+        """Share of the photons (row, column, energy) that gets through a scene."""
         depth = np.zeros((*self.of.shape, 1))
         apart_px = [on.get("misregistration", 0.0) * turn(self.direction) for turn in (math.cos, math.sin)]
-        for material, stated_mm in scene.items():
+        for material, stated_mm in self.scenes[scene][1].items():
             thickness_mm = shift(stated_mm, apart_px, order=1, mode="nearest")
             denser = 1.0 + on.get("composition_error", 0.0) / 100.0 if material == "H2O" else 1.0
             depth = depth + denser * thickness_mm[..., None] * attenuation_per_mm(material, energies)
-        arriving = arriving * np.exp(-depth)
+        return np.exp(-depth)
+
+    def blurred(
+        self, signal: np.ndarray, variance: np.ndarray, far: bool, on: dict, exposure_ms: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What focal spot and motion make of a scene's picture and its variance, DN and DN^2."""
+        if "focal_spot" in on:
+            magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
+            width_px = on["focal_spot"] * magnified / self.of.pixel_mm / math.sqrt(8.0 * math.log(2.0))
+            signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
+        if "motion_blur" in on:
+            places = np.linspace(-0.5, 0.5, 9) * on["motion_blur"] * exposure_ms / 50.0
+            signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
+        return signal, variance
+
+    def light(self, kV: float, mAs: float, copper_mm: float, scene: str, on: dict, exposure_ms: float) -> tuple:
+        """Mean and variance of one exposure before the spread of light, DN and DN^2, and K photons and what they leave.
+
+        scene: what stands in the beam; empty: nothing.
+        """
+        energies, arriving = self.open_light(kV, mAs, copper_mm, on)
+        open_DN, _ = self.signals(arriving, energies)
+        if scene:
+            arriving = arriving * self.transmitted(scene, energies, on, exposure_ms)
         remote = None
         if "k_fluorescence" in on:
             share = np.where(energies > self.of.edge_keV, on["k_fluorescence"] / 100.0, 0.0)
@@ -562,15 +579,11 @@ class Line:
         signal, variance = self.signals(arriving, energies)
         if scene and "object_scatter" in on:
             source = signal * -np.log(np.clip(signal / open_DN, 1e-6, 1.0))
-            added = on["object_scatter"] / 100.0 * self.scattered(source) / 0.38 * (0.55 if far else 1.0)
+            added = on["object_scatter"] / 100.0 * self.scattered(source) / 0.38
+            added = added * (0.55 if scene.endswith("far") else 1.0)
             signal, variance = signal + added, variance * (1.0 + added / signal)
-        if scene and "focal_spot" in on:
-            magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
-            width_px = on["focal_spot"] * magnified / self.of.pixel_mm / math.sqrt(8.0 * math.log(2.0))
-            signal, variance = gaussian_filter(signal, width_px), gaussian_filter(variance, width_px)
-        if scene and "motion_blur" in on:
-            places = np.linspace(-0.5, 0.5, 9) * on["motion_blur"] * exposure_ms / 50.0
-            signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
+        if scene:
+            signal, variance = self.blurred(signal, variance, scene.endswith("far"), on, exposure_ms)
         if "veiling_glare" in on:
             share = on["veiling_glare"] / 100.0
             wide = [gaussian_filter(signal, length_mm / self.of.pixel_mm) for length_mm in (4.0, 12.0)]
@@ -673,16 +686,15 @@ def make_session(
         bits=of.bits,
         readout_ms=of.readout_ms if of.declared else None,
     )
-    known, highest_kV = scenes(of), max(of.current_mA)
+    known, highest_kV = line.scenes, max(of.current_mA)
     with write_acquisition(path, instrument) as writer:
 
         def add(name, kind, exposure_ms, *, kV=None, copper_mm=0.0, scene="", after=False):
             lit = None
             current_mA = None if kV is None else of.current_mA[kV] * (of.copper_times if copper_mm else 1.0)
             if kV is not None:
-                thickness_mm = known[scene][1] if scene else {}
                 mAs = current_mA * exposure_ms / 1000.0
-                lit = line.light(kV, mAs, copper_mm, thickness_mm, scene.endswith("far"), line.on(after), exposure_ms)
+                lit = line.light(kV, mAs, copper_mm, scene, line.on(after), exposure_ms)
             writer.add_series(
                 name,
                 kind=kind,

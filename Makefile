@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-generator validation-prediction blind-check benchmark benchmark-memory check format clean
+.PHONY: demo stories test test-slow validation validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -42,6 +42,12 @@ validation-generator: $(READY)
 validation-prediction: $(READY)
 	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
 	for kind in nominal departing; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --repeats 3 --first 2000 --systems 40 --processes 2 --json build/prediction_limit/$${kind}_repeated.json || exit 1; done
+
+# the diagnosis on sessions of other programs, a quarter of an hour a line (gvxr and gecatsim are installed apart; without one its lines are left out)
+validation-simulators: $(READY)
+	for line in usual coarse hard soft three even counting; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
+	for line in csi gos "flat panel"; do OMP_NUM_THREADS=1 $(BIN)/python validation/catsim_sessions.py --line "$$line" --json "build/catsim_$$line.json" || exit 1; done
+	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
 
 # the diagnosis on sealed cases, hours: `make blind-check SEED=...` with one that nobody has looked at; a stopped run goes on
 CASES ?= 600

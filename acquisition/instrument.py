@@ -12,6 +12,7 @@ LAYER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover", "interl
 TEXT_FIELDS = ("anode", "detector", "belt_axis", "binning_adds")
 WHOLE_FIELDS = ("bits", "tdi_stages")
 BOOLEAN_FIELDS = ("counting", "readout_overlaps")
+_SAME_PITCH = 0.01  # relative: pitches are stated to so much
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,6 +118,19 @@ class Instrument:
         return replace(
             self, detector_cover=before, scintillator=self.back_scintillator, interlayer=None, back_scintillator=None
         )
+
+    def unlike(self, other: "Instrument") -> tuple[str, str] | None:
+        """What shows that another instrument is not this one: its word and this one's; None: nothing that both state.
+
+        Pitch, bits, anode and whether photons are counted: what no change of setting or distance changes.
+        """
+        if self.pixel_mm and other.pixel_mm and abs(math.log(other.pixel_mm / self.pixel_mm)) > _SAME_PITCH:
+            return f"pixels of {other.pixel_mm:g} mm", f"{self.pixel_mm:g} mm"
+        for name, text in (("bits", "{} bits"), ("anode", "an anode of {}"), ("counting", "counting = {}")):
+            own, there = getattr(self, name), getattr(other, name)
+            if own is not None and there is not None and own != there:
+                return text.format(there), text.format(own)
+        return None
 
     @property
     def magnification(self) -> float | None:

@@ -180,6 +180,14 @@ def validate_twin(
             expected=f"the twin's detector of {twin.maps.shape} pixels",
             remedy="validate against flats of the same detector",
         )
+    other = twin.instrument.unlike(acquisition.instrument)
+    if other is not None:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=other[0],
+            expected=f"the twin's: {other[1]}",
+            remedy="validate against flats of the same tube and detector, or correct what the file states of them",
+        )
     good = twin.maps.bad_pixels == 0
     axis = noise_autocovariance_1d(twin.noise.psf_model, twin.noise.psf_sigma_px.value, _LAGS) ** 2
     squared_correlations = float((axis[0] + 2.0 * axis[1:].sum()) / axis[0]) ** 2

@@ -449,7 +449,8 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         respond=partial(_respond, session, [part.probes for part in parts]),
         side=compared.side,
     )
-    return beside_known(problem, -responses[len(responses) - compared.known :])
+    known = responses[len(responses) - compared.known :]
+    return beside_known(problem, -known, [item.id for item in problem.base.effects])
 
 
 def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:

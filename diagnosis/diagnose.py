@@ -31,8 +31,8 @@ def diagnose(
     """Diagnose a session.
 
     Args:
-        acquisition: open acquisition file, anything from two flats with darks to the full protocol; without a given twin,
-            frames of more than LARGEST_PIXELS are compared as means of squares of pixels.
+        acquisition: open acquisition file, anything from two flats with darks to the full protocol; frames of more than
+            LARGEST_PIXELS are compared as means of squares of pixels.
         twin: calibrated elsewhere; absent, the session's own calibrating series make it. Effects that it has are part of what is
             expected: the gap is what they leave.
         rng: source of randomness.
@@ -44,7 +44,7 @@ def diagnose(
         InputError: nothing in the session can be judged.
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-    had = already_there(session.twin.effects)
+    had = {} if twin is None else already_there(twin.effects)
     left_out = (*without, *had, *(UNSEEN if session.factor > 1 else ()))
 
     try:
@@ -76,9 +76,11 @@ def diagnose(
         result = _doubted(result, session.twin, suspects)
     if session.factor == 1:
         return result
-    if progress is not None:
-        progress("calibration with all pixels")
-    return in_pixels(result, twin=calibrated_twin(session.all_pixels, rng=rng), factor=session.factor)
+    if twin is None:
+        if progress is not None:
+            progress("calibration with all pixels")
+        twin = calibrated_twin(session.all_pixels, rng=rng)
+    return in_pixels(result, twin=twin, factor=session.factor)
 
 
 def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
 from ..generator.twin import Twin
@@ -17,6 +18,7 @@ from .doubts import doubts_of
 from .held_out import held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from .known_effects import with_found
+from .known_laws import KnownStrength, known_strengths
 from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
@@ -47,7 +49,8 @@ def judge(
     """The answer to an assembled problem."""
     tell = progress or (lambda stage: None)
     nuisances = LocalNuisances(problem.factors, problem.blocks)
-    weighed = _weigh(problem, priors=priors or Priors(), tell=tell)
+    known = known_strengths(problem, nuisances)
+    weighed = _weigh(problem, priors=priors or Priors(), changed=known[:1], tell=tell)
     problem = weighed.problem
     verdict = _verdict_of(weighed.hypotheses)
     tell("held-out data")
@@ -62,6 +65,7 @@ def judge(
     marginal = _by_effect(verdict.hypotheses)
     added = tuple(applied_at_best(problem, leading, effect) for effect in named)
     ambiguous = verdict.word == "ambiguous"
+    strained = _strained(problem, leading, nuisances)
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
@@ -80,9 +84,9 @@ def judge(
         named=named,
         problem=problem,
         warnings=tuple(problem.skipped),
-        notes=_beyond_plausible(leading),
+        notes=(*_beyond_plausible(leading), *_changed_strengths(problem, leading, nuisances, strained)),
         not_tested=weighed.out_of_reach,
-        strained=_strained(problem, leading, nuisances),
+        strained=strained,
     )
 
 
@@ -95,14 +99,20 @@ class _Weighed:
     out_of_reach: dict[str, str]
 
 
-def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> _Weighed:
-    """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
+def _weigh(
+    problem: Problem, *, priors: Priors, changed: Sequence[KnownStrength], tell: Callable[[str], None]
+) -> _Weighed:
+    """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones.
+
+    changed: effects of the twin that may have another strength in this session, which no effect of the catalogue is.
+    """
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
     places = problem.places
     unknown = unknown_evidence(residual, shared, problem.parts, problem.part_names)
+    unknown = max([unknown, *((item.log_evidence, item.location) for item in changed)], key=lambda item: item[0])
     doubts = doubts_of(problem)
 
     def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
@@ -291,12 +301,29 @@ def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
-    """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
+def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
+    """What the leading explanation leaves of the residual (probe,)."""
     left = problem.residual.copy()
     for effect, curve in leading.variants.items():
         left -= curve.response(leading.strengths[effect][0])
-    found = zip(problem.factor_names, nuisances.fitted(left), strict=True)
+    return left
+
+
+def _changed_strengths(
+    problem: Problem,
+    leading: Hypothesis,
+    nuisances: LocalNuisances,
+    strained: Sequence[tuple[str, float]],
+) -> tuple[str, ...]:
+    """What to say of effects of the twin that lie far from its strength, beside the leading explanation."""
+    far = {name for name, _ in strained}
+    known = known_strengths(replace(problem, residual=_left(problem, leading)), nuisances)
+    return tuple(item.note for item in known if item.location in far)
+
+
+def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
+    """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
+    found = zip(problem.factor_names, nuisances.fitted(_left(problem, leading)), strict=True)
     far = [
         (name, float(value))
         for name, value in found

@@ -1,7 +1,11 @@
-"""Laws of the effects that a twin has: they are off as any effect's may be, and the gap beside them is doubted by as much."""
+"""Laws of the effects that a twin has: they are off as any effect's may be, and the gap beside them is doubted by as much.
 
+A session may also show that such an effect is no longer there, or of another strength.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +22,8 @@ if TYPE_CHECKING:
 
 _LAW_ERROR = LAW_ERRORS[0][0]
 _STRENGTH_SD = 0.12  # relative: as far as intervals of strengths are widened
+_CHANGED_SD = 1.0  # the same where a strength may be any, 0 among them
+_STRENGTH_OF = "strength of {}, which the twin has"
 
 
 def without_each(base: Twin) -> list[Change]:
@@ -31,23 +37,26 @@ def without_each(base: Twin) -> list[Change]:
     ]
 
 
-def beside_known(problem: "Problem", responses: NDArray[np.float64]) -> "Problem":
+def beside_known(problem: "Problem", responses: NDArray[np.float64], effects: Sequence[str]) -> "Problem":
     """The problem with what the laws of effects in its base leave open: strength, a share in each group of probes and in each probe.
 
     Args:
         problem: whose residual these effects are taken off.
         responses: of each of these effects (effect, probe), in standard deviations.
+        effects: their ids.
     """
     if not len(responses):
         return problem
-    factors = [problem.factors]
+    factors, names = [problem.factors], list(problem.factor_names)
     left = LocalNuisances(problem.factors, problem.blocks).solve_all(responses)
     own = np.ones(responses.shape[1])
-    for response, effective in zip(responses, left, strict=True):
-        factors += [_STRENGTH_SD * response[:, None], group_factors(effective, problem.groups, _LAW_ERROR).toarray().T]
+    for effect, response, effective in zip(effects, responses, left, strict=True):
+        of_groups = group_factors(effective, problem.groups, _LAW_ERROR).toarray().T
+        factors += [_STRENGTH_SD * response[:, None], of_groups]
+        names.append(_STRENGTH_OF.format(effect))
+        names += [f"law of {effect}, which the twin has, {number}" for number in range(of_groups.shape[1])]
         own = own + (LAW_PROBE_SHARE * _LAW_ERROR * effective) ** 2
     widened = np.concatenate(factors, axis=1)
-    names = [f"law of what the twin has, {number}" for number in range(widened.shape[1] - problem.factors.shape[1])]
     root, ask = np.sqrt(own), problem.respond
 
     def respond(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
@@ -58,9 +67,78 @@ def beside_known(problem: "Problem", responses: NDArray[np.float64]) -> "Problem
         problem,
         residual=problem.residual / root,
         factors=widened / root[:, None],
-        factor_names=(*problem.factor_names, *names),
+        factor_names=tuple(names),
         curves=tuple(curve.over(root) for curve in problem.curves),
         sd=problem.sd * root,
         noise=problem.noise / root,
         respond=respond,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownStrength:
+    """How strong a session shows an effect that the twin has, in units of the twin's strength: value and 95 % interval.
+
+    log_evidence: of any strength over the twin's own.
+    """
+
+    effect: str
+    times: tuple[float, float, float]
+    log_evidence: float
+
+    @property
+    def location(self) -> str:
+        """The place of an unknown effect that it is."""
+        return _STRENGTH_OF.format(self.effect)
+
+    @property
+    def note(self) -> str:
+        """What to say of it."""
+        value, low, high = (max(one, 0.0) for one in self.times)
+        return (
+            f"the twin has {self.effect}, and this session shows {value:.2f} ({low:.2f} to {high:.2f}) times as much of it: leave"
+            " --twin out, or give the twin as it was before, to have it sought anew"
+        )
+
+
+def changed_effect(location: str) -> str | None:
+    """The effect of the twin whose strength this place of an unknown effect is; None: it is another place."""
+    before, after = _STRENGTH_OF.split("{}")
+    if not (location.startswith(before) and location.endswith(after)):
+        return None
+    return location.removeprefix(before).removesuffix(after)
+
+
+def known_strengths(problem: "Problem", nuisances: LocalNuisances) -> tuple[KnownStrength, ...]:
+    """How strong a session shows each effect that its base has, where any strength is possible, the farthest from the twin's first.
+
+    With f the strength's nuisance, C the probes' covariance with it, q = f^T C^-1 f and b = f^T C^-1 r, a prior w times as wide adds
+
+        -log(1 + (w^2 - 1) q) / 2 + (w^2 - 1) b^2 / (2 (1 + (w^2 - 1) q))
+
+    to the log evidence; q is one less the nuisance's variance once the probes are seen, and b its most probable value.
+
+    Args:
+        problem: after `beside_known`.
+        nuisances: of the problem.
+    """
+    wider = (_CHANGED_SD / _STRENGTH_SD) ** 2
+    places = {name: number for number, name in enumerate(problem.factor_names)}
+    own = [
+        (item.id, places[_STRENGTH_OF.format(item.id)])
+        for item in problem.base.effects
+        if _STRENGTH_OF.format(item.id) in places
+    ]
+    if not own:
+        return ()
+    best, variance = nuisances.fitted(problem.residual), nuisances.variance
+    found = []
+    for effect, place in own:
+        seen = min(max(1.0 - float(variance[place]), 0.0), 1.0 - 1e-12)
+        grown = 1.0 + (wider - 1.0) * seen
+        value = wider * float(best[place]) / grown
+        sd = math.sqrt(wider * (1.0 - seen) / grown)
+        times = [1.0 + _STRENGTH_SD * (value + way * sd) for way in (0.0, -1.959964, 1.959964)]
+        evidence = -0.5 * math.log(grown) + 0.5 * (wider - 1.0) * float(best[place]) ** 2 / grown
+        found.append(KnownStrength(effect=effect, times=(times[0], times[1], times[2]), log_evidence=evidence))
+    return tuple(sorted(found, key=lambda item: -item.log_evidence))

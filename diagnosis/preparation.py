@@ -15,6 +15,7 @@ from ..calibration.repeated_frames import beam_of
 from ..errors import FitError, InputError, RaytwinError
 from ..generator.twin import Twin
 from .coarse import LEAST_SIDE, coarse_factor
+from .coarse_twin import twin_in_squares
 from .origin import made_of
 from .plausibility import check_plausibility
 from .readings import Suspect
@@ -70,7 +71,7 @@ def prepare_session(
 ) -> PreparedSession:
     """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
 
-    Without a given twin frames of more than LARGEST_PIXELS become means of squares of pixels.
+    Frames of more than LARGEST_PIXELS become means of squares of pixels, and a given twin that of such squares.
 
     Raises:
         InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
@@ -81,7 +82,8 @@ def prepare_session(
     left_out += cut_off
     if not all_pixels.series:
         raise _nothing_left(acquisition, left_out)
-    factor = 1 if twin is not None else coarse_factor(all_pixels.series[0].shape)
+    factor = coarse_factor(all_pixels.series[0].shape)
+    twin = None if twin is None else twin_in_squares(twin, factor)
     acquisition = coarser(all_pixels, factor)
     names = calibrating_names(acquisition.series)
     found = check_plausibility(
@@ -205,6 +207,14 @@ def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[Acqu
             received=f"frames of {rows} x {columns}",
             expected=f"the twin's detector of {shape[0]} x {shape[1]}",
             remedy="diagnose sessions of the detector that the twin was calibrated from, or leave --twin out",
+        )
+    other = None if twin is None else twin.instrument.unlike(acquisition.instrument)
+    if other is not None:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=other[0],
+            expected=f"the twin's: {other[1]}",
+            remedy="diagnose sessions of the line that the twin was calibrated from, or leave --twin out",
         )
     if min(shape) < LEAST_SIDE:
         raise InputError(

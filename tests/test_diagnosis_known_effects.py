@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.known_effects import already_there, lasting, with_found
-from raytwin.diagnosis.known_laws import beside_known
+from raytwin.diagnosis.known_laws import beside_known, changed_effect, known_strengths
+from raytwin.diagnosis.local_nuisances import LocalNuisances
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.generator.effects import AppliedEffect
 
@@ -46,6 +48,7 @@ class Few:
     sd: np.ndarray
     noise: np.ndarray
     respond: Callable
+    base: SimpleNamespace
 
 
 @pytest.fixture
@@ -71,6 +74,7 @@ def few():
         sd=np.full(probes, 2.0),
         noise=np.full(probes, 0.8),
         respond=lambda asked: {0: np.ones((1, probes))},
+        base=SimpleNamespace(effects=()),
     )
 
 
@@ -83,7 +87,7 @@ def test_a_law_that_is_off_by_a_tenth_in_some_probes_leaves_no_gap(few):
     off = np.where(few.groups == 1, 0.1, -0.05) * response
     wrong = Few(**{**few.__dict__, "residual": few.residual + off})
     assert square(wrong) > 1e4
-    found = beside_known(wrong, response[None, :])
+    found = beside_known(wrong, response[None, :], ["mtf_tail"])
     assert square(found) < 1.5 * 60
     # all that is counted in standard deviations is counted in the wider ones
     root = found.sd / few.sd
@@ -95,8 +99,57 @@ def test_a_law_that_is_off_by_a_tenth_in_some_probes_leaves_no_gap(few):
     assert len(found.factor_names) == found.factors.shape[1]
     # and what is no law's error stays
     other = Few(**{**few.__dict__, "residual": few.residual + np.where(np.arange(60) == 7, 5000.0, 0.0)})
-    assert square(beside_known(other, response[None, :])) > 1e4
+    assert square(beside_known(other, response[None, :], ["mtf_tail"])) > 1e4
 
 
 def test_a_twin_without_effects_is_left_as_it_is(few):
-    assert beside_known(few, np.zeros((0, 60))) is few
+    assert beside_known(few, np.zeros((0, 60)), []) is few
+
+
+def known(few, times, seed=3):
+    """How strong a session shows a motion that the twin has, where it has so many times as much."""
+    # seen at 40 standard deviations
+    response = 5.0 * np.random.default_rng(seed).standard_normal(60)
+    fields = {**few.__dict__, "base": SimpleNamespace(effects=(effect("motion_blur", 6.0),))}
+    shown = Few(**{**fields, "residual": few.residual + (times - 1.0) * response})
+    problem = beside_known(shown, response[None, :], ["motion_blur"])
+    (found,) = known_strengths(problem, LocalNuisances(problem.factors, problem.blocks))
+    return problem, found
+
+
+@pytest.mark.parametrize("times", [0.0, 0.4, 1.0, 2.5])
+def test_the_strength_of_what_the_twin_has_is_read(few, times):
+    problem, found = known(few, times)
+    value, low, high = found.times
+    assert low < times < high
+    assert value == pytest.approx(times, abs=0.3)
+    assert high - low < 1.0
+    assert (found.log_evidence > 5.0) == (times != 1.0)
+    assert found.location in problem.factor_names
+
+
+def test_the_evidence_of_another_strength_is_that_of_a_wider_prior(few):
+    problem, found = known(few, 0.3)
+    place = problem.factor_names.index(found.location)
+    wide = problem.factors.copy()
+    wide[:, place] *= 1.0 / 0.12
+    covariances = [np.eye(60) + factors @ factors.T for factors in (problem.factors, wide)]
+    likelihood = [
+        -0.5 * np.linalg.slogdet(one)[1] - 0.5 * problem.residual @ np.linalg.solve(one, problem.residual)
+        for one in covariances
+    ]
+    assert found.log_evidence == pytest.approx(likelihood[1] - likelihood[0], rel=1e-9)
+    fitted = wide[:, place] @ np.linalg.solve(covariances[1], problem.residual)
+    assert found.times[0] == pytest.approx(1.0 + fitted, rel=1e-9)
+
+
+def test_a_twin_without_effects_has_no_strength_to_read(few):
+    assert known_strengths(few, LocalNuisances(few.factors, few.blocks)) == ()
+
+
+def test_the_place_of_another_strength_names_the_effect(few):
+    _, found = known(few, 0.0)
+    assert changed_effect(found.location) == "motion_blur"
+    assert changed_effect("sharpness of object edge") is None
+    assert found.note.startswith("the twin has motion_blur, and this session shows 0.")
+    assert "-0" not in found.note

@@ -258,7 +258,7 @@ def _plan(arguments: argparse.Namespace, twin: "Twin | None") -> int:
         suspects = tuple(item for item in session.suspects if not item.or_effects)
         if suspects:
             raise mislabelled(acquisition, suspects)
-        unseen = {**already_there(session.twin.effects), **(UNSEEN if session.factor > 1 else {})}
+        unseen = {**({} if twin is None else already_there(twin.effects)), **(UNSEEN if session.factor > 1 else {})}
         problem = build_problem(
             session.acquisition,
             session.twin,

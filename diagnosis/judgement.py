@@ -18,7 +18,7 @@ from .doubts import doubts_of
 from .held_out import held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from .known_effects import with_found
-from .known_laws import KnownStrength, known_strengths
+from .known_laws import CHANGED_FROM, CHANGED_SD, KnownStrength, known_strengths, with_any_strength
 from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
@@ -50,14 +50,21 @@ def judge(
     tell = progress or (lambda stage: None)
     nuisances = LocalNuisances(problem.factors, problem.blocks)
     known = known_strengths(problem, nuisances)
-    weighed = _weigh(problem, priors=priors or Priors(), changed=known[:1], tell=tell)
+    changed = [item.effect for item in known if item.log_evidence > CHANGED_FROM]
+    if changed:
+        problem = with_any_strength(problem, changed)
+        nuisances = LocalNuisances(problem.factors, problem.blocks)
+    weighed = _weigh(problem, priors=priors or Priors(), tell=tell)
     problem = weighed.problem
-    verdict = _verdict_of(weighed.hypotheses)
+    hypotheses = weighed.hypotheses
+    if changed:
+        hypotheses = _of_another_strength(hypotheses, known_strengths(problem, nuisances, of=changed, sd=CHANGED_SD))
+    verdict = _verdict_of(hypotheses)
     tell("held-out data")
     gap, by_axis, shares = held_out(problem, verdict.leading, nuisances, rng)
     if verdict.leading.effects not in ((), (UNKNOWN,)) and is_refused(problem, gap, verdict.leading):
         # the best of the wrong ones
-        refused = vetoed(weighed.hypotheses)
+        refused = vetoed(hypotheses)
         verdict = _Verdict(word="unknown_effect", hypotheses=refused, leading=refused[0])
         gap, by_axis, shares = held_out(problem, verdict.leading, nuisances, rng)
     verdict = verdict.doubted()
@@ -65,7 +72,8 @@ def judge(
     marginal = _by_effect(verdict.hypotheses)
     added = tuple(applied_at_best(problem, leading, effect) for effect in named)
     ambiguous = verdict.word == "ambiguous"
-    strained = _strained(problem, leading, nuisances)
+    beside = replace(problem, residual=_left(problem, leading))
+    others = [item for item in known_strengths(beside, nuisances, of=changed, sd=CHANGED_SD) if item.is_another]
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
@@ -84,9 +92,9 @@ def judge(
         named=named,
         problem=problem,
         warnings=tuple(problem.skipped),
-        notes=(*_beyond_plausible(leading), *_changed_strengths(problem, leading, nuisances, strained)),
+        notes=(*_beyond_plausible(leading), *(item.note for item in others)),
         not_tested=weighed.out_of_reach,
-        strained=strained,
+        strained=_strained(problem, leading, nuisances),
     )
 
 
@@ -99,20 +107,14 @@ class _Weighed:
     out_of_reach: dict[str, str]
 
 
-def _weigh(
-    problem: Problem, *, priors: Priors, changed: Sequence[KnownStrength], tell: Callable[[str], None]
-) -> _Weighed:
-    """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones.
-
-    changed: effects of the twin that may have another strength in this session, which no effect of the catalogue is.
-    """
+def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> _Weighed:
+    """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
     residual = whitening.apply(problem.residual[None, :])[0]
     shared = Nuisances(whitening.factors)
     places = problem.places
     unknown = unknown_evidence(residual, shared, problem.parts, problem.part_names)
-    unknown = max([unknown, *((item.log_evidence, item.location) for item in changed)], key=lambda item: item[0])
     doubts = doubts_of(problem)
 
     def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
@@ -164,6 +166,23 @@ def _weigh(
         ),
         out_of_reach=_out_of_reach(problem, whitened, shared),
     )
+
+
+def _of_another_strength(hypotheses: tuple[Hypothesis, ...], known: Sequence[KnownStrength]) -> tuple[Hypothesis, ...]:
+    """Hypotheses where the base has an effect of another strength than the session: to want no other effect is no agreement."""
+    others = [item for item in known if item.is_another]
+    none = next(item for item in hypotheses if not item.effects)
+    if not others or none is not hypotheses[0]:
+        return hypotheses
+    found = [
+        replace(item, probability=0.0)
+        if item is none
+        else replace(item, probability=item.probability + none.probability, location=others[0].location)
+        if item.effects == (UNKNOWN,)
+        else item
+        for item in hypotheses
+    ]
+    return tuple(sorted(found, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -307,18 +326,6 @@ def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
     for effect, curve in leading.variants.items():
         left -= curve.response(leading.strengths[effect][0])
     return left
-
-
-def _changed_strengths(
-    problem: Problem,
-    leading: Hypothesis,
-    nuisances: LocalNuisances,
-    strained: Sequence[tuple[str, float]],
-) -> tuple[str, ...]:
-    """What to say of effects of the twin that lie far from its strength, beside the leading explanation."""
-    far = {name for name, _ in strained}
-    known = known_strengths(replace(problem, residual=_left(problem, leading)), nuisances)
-    return tuple(item.note for item in known if item.location in far)
 
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 _LAW_ERROR = LAW_ERRORS[0][0]
 _STRENGTH_SD = 0.12  # relative: as far as intervals of strengths are widened
-_CHANGED_SD = 1.0  # the same where a strength may be any, 0 among them
+CHANGED_SD = 1.0  # the same where a strength may be any, 0 among them
+_APART = 1.96 * _STRENGTH_SD
+CHANGED_FROM = 8.0  # log evidence from which a strength counts as another one's
 _STRENGTH_OF = "strength of {}, which the twin has"
 
 
@@ -87,6 +89,12 @@ class KnownStrength:
     log_evidence: float
 
     @property
+    def is_another(self) -> bool:
+        """Another one than the twin's, which is known to its own interval."""
+        _, low, high = self.times
+        return not low - _APART <= 1.0 <= high + _APART
+
+    @property
     def location(self) -> str:
         """The place of an unknown effect that it is."""
         return _STRENGTH_OF.format(self.effect)
@@ -109,8 +117,10 @@ def changed_effect(location: str) -> str | None:
     return location.removeprefix(before).removesuffix(after)
 
 
-def known_strengths(problem: "Problem", nuisances: LocalNuisances) -> tuple[KnownStrength, ...]:
-    """How strong a session shows each effect that its base has, where any strength is possible, the farthest from the twin's first.
+def known_strengths(
+    problem: "Problem", nuisances: LocalNuisances, *, of: Sequence[str] | None = None, sd: float = _STRENGTH_SD
+) -> tuple[KnownStrength, ...]:
+    """How strong a session shows each effect that its base has, where any strength is possible, the likeliest change first.
 
     With f the strength's nuisance, C the probes' covariance with it, q = f^T C^-1 f and b = f^T C^-1 r, a prior w times as wide adds
 
@@ -121,14 +131,13 @@ def known_strengths(problem: "Problem", nuisances: LocalNuisances) -> tuple[Know
     Args:
         problem: after `beside_known`.
         nuisances: of the problem.
+        of: effects to read (None: all).
+        sd: relative, that the problem gives these strengths.
     """
-    wider = (_CHANGED_SD / _STRENGTH_SD) ** 2
+    wider = (CHANGED_SD / sd) ** 2
     places = {name: number for number, name in enumerate(problem.factor_names)}
-    own = [
-        (item.id, places[_STRENGTH_OF.format(item.id)])
-        for item in problem.base.effects
-        if _STRENGTH_OF.format(item.id) in places
-    ]
+    effects = [item.id for item in problem.base.effects if of is None or item.id in of]
+    own = [(effect, places[_STRENGTH_OF.format(effect)]) for effect in effects if _STRENGTH_OF.format(effect) in places]
     if not own:
         return ()
     best, variance = nuisances.fitted(problem.residual), nuisances.variance
@@ -136,9 +145,15 @@ def known_strengths(problem: "Problem", nuisances: LocalNuisances) -> tuple[Know
     for effect, place in own:
         seen = min(max(1.0 - float(variance[place]), 0.0), 1.0 - 1e-12)
         grown = 1.0 + (wider - 1.0) * seen
-        value = wider * float(best[place]) / grown
-        sd = math.sqrt(wider * (1.0 - seen) / grown)
-        times = [1.0 + _STRENGTH_SD * (value + way * sd) for way in (0.0, -1.959964, 1.959964)]
+        value, left = wider * float(best[place]) / grown, math.sqrt(wider * (1.0 - seen) / grown)
+        times = [1.0 + sd * (value + way * left) for way in (0.0, -1.959964, 1.959964)]
         evidence = -0.5 * math.log(grown) + 0.5 * (wider - 1.0) * float(best[place]) ** 2 / grown
         found.append(KnownStrength(effect=effect, times=(times[0], times[1], times[2]), log_evidence=evidence))
     return tuple(sorted(found, key=lambda item: -item.log_evidence))
+
+
+def with_any_strength(problem: "Problem", effects: Sequence[str]) -> "Problem":
+    """The problem with these effects of its base as strong as the session shows them, 0 among that."""
+    names = {_STRENGTH_OF.format(effect) for effect in effects}
+    scale = np.array([CHANGED_SD / _STRENGTH_SD if name in names else 1.0 for name in problem.factor_names])
+    return replace(problem, factors=problem.factors * scale)

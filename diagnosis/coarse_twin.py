@@ -18,6 +18,7 @@ from ..generator.psf import blur_variance_share
 from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
 from .coarse import pixels_in_square
 
+_MODEL = "sampled"
 _WIDEST = 8.0  # squares that light may spread over
 _STEPS = 50  # of a bisection
 
@@ -26,7 +27,9 @@ def twin_in_squares(twin: Twin, factor: int) -> Twin:
     """The twin of means over factor x factor pixels; rows and columns that fill no square are left out as of frames.
 
     With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread is the
-    one that leaves the same share of the quantum variance in a square (`binned_variance_share`), as light of any place in it.
+    one that leaves the same share of the quantum variance in a square (`binned_variance_share`), quanta counted per square, which
+    is how averaged frames calibrate where light spreads over less than a square: with light of any place in it, edges of squares
+    that an object cuts are drawn too sharp, and a panel of 760 x 956 without effect showed a tail (log evidence 37; so none).
     Squares with a bad pixel are bad. `evidence` stays that of the pixels.
 
     Args:
@@ -78,16 +81,16 @@ def _noise(noise: NoiseModel, factor: int) -> NoiseModel:
         alone = math.sqrt(noise.read_variance_DN2) / factor
         read = Estimate(value=alone, low=alone, high=alone)
     return replace(
-        noise, psf_model="aperture", psf_sigma_px=noise.psf_sigma_px.times(wider), read_noise_DN=read, quantised=False
+        noise, psf_model=_MODEL, psf_sigma_px=noise.psf_sigma_px.times(wider), read_noise_DN=read, quantised=False
     )
 
 
 def _width_that_leaves(share: float) -> float:
-    """Spread, in squares, of light of any place in a square that leaves this share of the quantum variance there."""
+    """Spread, in squares, of quanta counted per square that leaves this share of their variance there."""
     low, high = 0.0, _WIDEST
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        if blur_variance_share("aperture", middle) > share:
+        if blur_variance_share(_MODEL, middle) > share:
             low = middle
         else:
             high = middle

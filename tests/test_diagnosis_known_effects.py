@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis.curves import Curve
+from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.judgement import _of_another_strength
 from raytwin.diagnosis.known_effects import already_there, lasting, with_found
-from raytwin.diagnosis.known_laws import beside_known, changed_effect, known_strengths
+from raytwin.diagnosis.known_laws import (
+    CHANGED_SD,
+    beside_known,
+    changed_effect,
+    known_strengths,
+    with_any_strength,
+)
 from raytwin.diagnosis.local_nuisances import LocalNuisances
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.generator.effects import AppliedEffect
@@ -145,6 +153,32 @@ def test_the_evidence_of_another_strength_is_that_of_a_wider_prior(few):
 
 def test_a_twin_without_effects_has_no_strength_to_read(few):
     assert known_strengths(few, LocalNuisances(few.factors, few.blocks)) == ()
+
+
+def test_a_session_that_wants_nothing_but_another_strength_is_no_agreement(few):
+    _, found = known(few, 0.0)
+    none, tail = (
+        Hypothesis(effects=name, probability=p, log_evidence=0.0) for name, p in (((), 0.6), (("mtf_tail",), 0.3))
+    )
+    other = Hypothesis(effects=(UNKNOWN,), probability=0.1, log_evidence=-3.0, location="noise of dark")
+    first, *rest = _of_another_strength((none, tail, other), [found])
+    assert (first.effects, first.location) == ((UNKNOWN,), found.location)
+    assert first.probability == pytest.approx(0.7)
+    assert [item.probability for item in rest] == [0.3, 0.0]
+    # as strong as the twin has it, or with an effect that leads: as they were
+    _, same = known(few, 1.0)
+    assert not same.is_another
+    assert _of_another_strength((none, tail, other), [same]) == (none, tail, other)
+    assert _of_another_strength((tail, none, other), [found]) == (tail, none, other)
+
+
+def test_strengths_left_free_are_read_with_their_own_prior(few):
+    problem, before = known(few, 0.2)
+    free = with_any_strength(problem, ["motion_blur"])
+    (after,) = known_strengths(free, LocalNuisances(free.factors, free.blocks), of=["motion_blur"], sd=CHANGED_SD)
+    assert after.times == pytest.approx(before.times, rel=1e-6)
+    assert after.log_evidence == pytest.approx(0.0, abs=1e-9)
+    assert after.is_another
 
 
 def test_the_place_of_another_strength_names_the_effect(few):

@@ -28,6 +28,7 @@ from .nuisance_columns import Columns
 from .placing import place_scenes
 from .probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from .responses import Asked, Moved, SeriesModel, SessionModel, session_model
+from .seen import Blocks, Responder
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
 from .session import SessionSeries, only_own_noise, read_session
@@ -39,6 +40,7 @@ _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance i
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
 _NEAR_A_POINT = 0.2
 _PLACES = "places of scenes"
+_WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +92,7 @@ class Problem:
     skipped: tuple[str, ...]
     missing_effects: dict[str, str]
     conditions: dict[str, float]
-    respond: Callable[[Sequence[Variant]], dict[int, NDArray[np.float64]]]
+    respond: Responder
     side: int = 1
 
     @property
@@ -105,10 +107,19 @@ class Problem:
             dtype=np.intp,
         )
 
+    @property
+    def asked_in_blocks(self) -> Blocks:
+        """Series that share local nuisances, and what it costs to ask the forward model for them."""
+        costs = np.zeros(int(self.blocks.max()) + 1)
+        for number, first in zip(*np.unique(self.series_of, return_index=True), strict=True):
+            scene = self.views[number].session.series.kind == "object"
+            costs[self.blocks[first]] += 1.0 if scene else _WITHOUT_SCENE
+        return Blocks(of=self.blocks, costs=costs)
+
     def released(self) -> "Problem":
         """Without the frames' projections that `respond` holds."""
 
-        def spent(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+        def spent(asked: Sequence[Variant], wanted: NDArray[np.bool_] | None = None) -> dict[int, NDArray[np.float64]]:
             raise RuntimeError(f"{len(asked)} variants asked of a problem whose projections were released")
 
         return replace(self, respond=spent)
@@ -518,15 +529,24 @@ def _curves(
 
 
 def _respond(
-    session: SessionModel, probes: Sequence[SeriesProbes], variants: Sequence[Variant]
+    session: SessionModel,
+    probes: Sequence[SeriesProbes],
+    variants: Sequence[Variant],
+    wanted: NDArray[np.bool_] | None = None,
 ) -> dict[int, NDArray[np.float64]]:
-    """Responses (strength, probe) of further variants, by their place among them; failed ones are left out."""
+    """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
+
+    Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
+    """
     asked = [
         session.ask(session.model.change(variant, strength)) for variant in variants for strength in variant.strengths
     ]
     responses = np.zeros((len(asked), sum(map(len, probes))))
     start = 0
     for one in probes:
+        if wanted is not None and not wanted[start : start + len(one)].any():
+            start += len(one)
+            continue
         moved = [(row, found) for row, found in enumerate(session.moved(one.series, asked)) if found is not None]
         if moved:
             stop = start + len(one)

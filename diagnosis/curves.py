@@ -66,6 +66,16 @@ class Curve:
         """Response (probe,) at one strength."""
         return np.asarray(self.weights(np.array([strength]))[0] @ self.responses)
 
+    def of_probes(self, probes: NDArray[np.bool_]) -> "Curve":
+        """The curve of some of its probes (probe,)."""
+        return replace(
+            self,
+            responses=self.responses[:, probes],
+            spread=None if self.spread is None else self.spread[probes],
+            jitter=None if self.jitter is None else self.jitter[probes],
+            exact=None if self.exact is None else self.exact[probes],
+        )
+
     def over(self, root: NDArray[np.float64]) -> "Curve":
         """The curve of probes whose standard deviations are `root` (probe,) times as large."""
         return replace(

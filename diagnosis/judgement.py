@@ -151,6 +151,7 @@ def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> 
         places=places,
         respond=problem.respond,
         whitener=whitening,
+        blocks=problem.asked_in_blocks,
     )
     if closer:
         problem = problem.with_variants(closer)

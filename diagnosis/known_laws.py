@@ -61,8 +61,8 @@ def beside_known(problem: "Problem", responses: NDArray[np.float64], effects: Se
     widened = np.concatenate(factors, axis=1)
     root, ask = np.sqrt(own), problem.respond
 
-    def respond(asked: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
-        found: Mapping[int, NDArray[np.float64]] = ask(asked)
+    def respond(asked: Sequence[Variant], wanted: NDArray[np.bool_] | None = None) -> dict[int, NDArray[np.float64]]:
+        found: Mapping[int, NDArray[np.float64]] = ask(asked, wanted=wanted)
         return {number: response / root for number, response in found.items()}
 
     return replace(

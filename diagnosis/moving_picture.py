@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.series import ExpectedSeries
+from ._moving_loops import own_parts, sums_of_lines, sums_of_products
 from .scalar_context import ScalarContext
 from .summaries import LEAST_NOISE_DN2, PIECE_FRAMES
 
@@ -34,29 +35,37 @@ class MovingPicture:
         if not expected.trend_DN:
             return _STILL
         good, areas = context.good, context.areas
-        shape: NDArray[np.float64] | float = 1.0
-        kept, courses = [], []
+        changing = [
+            (image, np.asarray(course, dtype=np.float64))
+            for image, course in expected.trend_DN
+            if np.size(course) > 1 and float(np.ptp(course)) > 0.0
+        ]
+        if not changing:
+            return _STILL
+        pixels = np.empty((len(changing), areas.order.size))
+        for row, (image, _) in zip(pixels, changing, strict=True):
+            row[:] = areas.pixels(image)
+        shape = np.ones(areas.order.size)
         if context.kind in ("flat", "object"):
-            signal = np.broadcast_to(expected.signal_DN, good.shape).ravel()[areas.order]
-            shape = signal / max(float(signal.mean()), 1e-12)
-        for image, course in expected.trend_DN:
-            whole = np.broadcast_to(np.asarray(image, dtype=np.float64), good.shape).ravel()[areas.order]
-            own = whole - float(whole.mean()) * shape
-            profile = np.asarray(course, dtype=np.float64)
-            # a hundredth of a DN adds nothing to any variance
-            if profile.size > 1 and float(np.abs(own).max()) * float(np.ptp(profile)) > 0.01:
-                kept.append(own)
-                courses.append(profile - profile.mean())
+            shape *= areas.pixels(expected.signal_DN)
+            shape /= max(float(shape.mean()), 1e-12)
+        largest = own_parts(pixels, shape)
+        # a hundredth of a DN adds nothing to any variance
+        kept = [at for at, (_, course) in enumerate(changing) if largest[at] * float(np.ptp(course)) > 0.01]
         if not kept:
             return _STILL
-        pixels, profiles = np.stack(kept), np.stack(courses)
-        whole = np.zeros((len(kept), *good.shape))
-        whole.reshape(len(kept), -1)[:, areas.order] = pixels
-        means = [whole.sum(axis=axis) / np.maximum(good.sum(axis=axis - 1), 1) for axis in (2, 1)]
+        pixels = pixels[kept]
+        profiles = np.stack([changing[at][1] - changing[at][1].mean() for at in kept])
+        # those without label lie before the first
+        starts = np.array([0, *(part.start for part in areas.parts), areas.order.size], dtype=np.intp)
+        sums = sums_of_products(pixels, starts)
+        counts = np.maximum(np.diff(starts), 1)[1:, None, None]
+        lines = sums_of_lines(pixels, areas.order, *good.shape)
+        means = [own / np.maximum(good.sum(axis=axis), 1) for own, axis in zip(lines, (1, 0), strict=True)]
         steps = np.diff(profiles, axis=1)
         stride = max(areas.order.size // _KURTOSIS_PIXELS, 1)
         return MovingPicture(
-            tuple(_mean_product(pixels[:, part]) for part in (slice(None), *areas.parts)),
+            (sums.sum(axis=0) / max(areas.order.size, 1), *(sums[1:] / counts)),
             tuple(_mean_product(one) for one in means),
             0.5 * steps @ steps.T / steps.shape[1],
             profiles,

@@ -33,6 +33,12 @@ class Nuisances:
         every = of_laws if self.of_laws is None else vstack([self.of_laws, of_laws], format="csc")
         return Nuisances(wider * inverse[:, None], _scaled(every, inverse))
 
+    def of_probes(self, probes: NDArray[np.bool_]) -> "Nuisances":
+        """Of some of its probes (probe,)."""
+        return Nuisances(
+            self.factors[probes], None if self.of_laws is None else self.of_laws[:, np.flatnonzero(probes)]
+        )
+
     def project(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """z (vector, factor) with a^T C^-1 b = a.b - z_a.z_b for vectors (vector, probe)."""
         from scipy.linalg import solve_triangular

@@ -49,6 +49,11 @@ class Areas:
         self.known[:] = [(image, found), *self.known[:1]]
         return found
 
+    def pixels(self, image: NDArray[np.floating]) -> NDArray[np.floating]:
+        """A map (row, column) at the good pixels (pixel,); one of a single value as it is (1,)."""
+        flat = image.ravel()
+        return flat if flat.size == 1 else flat[self.order]
+
     def mean(self, image: NDArray[np.floating] | float) -> float:
         """Mean of a map over all good pixels."""
         whole = np.asarray(image)

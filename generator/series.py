@@ -613,33 +613,76 @@ def _pause_s(law: LagLaw, request: SeriesRequest, clock_s: float) -> float:
 
 
 def _paused(law: LagLaw, trapped: FloatArray, pause_s: float) -> tuple[FloatArray, FloatArray]:
-    """Charge in the traps (trap, row, column) after a pause, and what the next exposure reads of that released in it."""
-    left = trapped * _decays(law, max(pause_s, 0.0))[:, None, None]
+    """Charge in the traps (trap, ...) after a pause, and what the next exposure reads of that released in it."""
+    left = (trapped.T * _decays(law, max(pause_s, 0.0))).T
     return left, law.pause_share * np.sum(trapped - left, axis=0)
 
 
-def _trapped_before(
-    twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Choice, cache: ModelCache
-) -> tuple[FloatArray, FloatArray]:
-    """Charge in the traps (trap, row, column) at the begin of the series, and what its first exposure finds, DN."""
-    trapped = np.zeros((len(law.trapped), 1, 1))
-    share = np.asarray(law.trapped)[:, None, None]
+@dataclass(frozen=True, slots=True)
+class _Trapped:
+    """What earlier exposures have left behind, as sums of what each of them brought.
+
+    Fields: pictures, each (row, column) or (1, 1), DN; held (trap, picture): shares of them in the traps; found (picture,): shares
+    that the first exposure finds.
+    """
+
+    pictures: tuple[FloatArray, ...]
+    held: FloatArray
+    found: FloatArray
+
+    def images(self) -> tuple[FloatArray, FloatArray]:
+        """Charge in the traps (trap, row, column) and what the first exposure finds (row, column), DN."""
+        none = np.zeros((1, 1))
+        held = [
+            sum((share * one for share, one in zip(shares, self.pictures, strict=True)), none) for shares in self.held
+        ]
+        found = sum((share * one for share, one in zip(self.found, self.pictures, strict=True)), none)
+        return np.stack(held), found
+
+
+def _trapped_before(twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Choice, cache: ModelCache) -> _Trapped:
+    """Charge in the traps at the begin of the series, and what its first exposure finds."""
+    share = np.asarray(law.trapped)
+    pictures: list[FloatArray] = []
+    trapped = np.zeros((len(law.trapped), len(request.previous)))
     clock: float | None = None
     for earlier in request.previous:
         interval = earlier.interval_s(twin.instrument.readout_ms)
         exposures = earlier.frames * earlier.exposures_per_frame
         if clock is not None:
             trapped, _ = _paused(law, trapped, _pause_s(law, earlier, clock))
-        decay = _decays(law, interval)[:, None, None]
+        decay = _decays(law, interval)
         left = decay**exposures
-        trapped = trapped * left
+        trapped = trapped * left[:, None]
         if earlier.beam_on:
-            brought = choice.line(twin, earlier, cache)[1].mean
-            trapped = trapped + share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12) * brought
+            trapped[:, len(pictures)] = share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12)
+            pictures.append(choice.line(twin, earlier, cache)[1].mean)
         clock = earlier.start_s + exposures * interval
-    if clock is None:
-        return trapped, np.zeros((1, 1))
-    return _paused(law, trapped, _pause_s(law, request, clock))
+    found = np.zeros(trapped.shape[1])
+    if clock is not None:
+        trapped, found = _paused(law, trapped, _pause_s(law, request, clock))
+    return _Trapped(tuple(pictures), trapped[:, : len(pictures)], found[: len(pictures)])
+
+
+def _with_trapped(
+    law: LagLaw, decay: FloatArray, before: _Trapped, own: FloatArray, exposures: int, averaged: int
+) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
+    """Mean signal of a series whose exposures bring `own` (row, column), DN, with lag, and how it changes over the frames.
+
+    y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i], R_i a sum of the pictures of earlier exposures: each picture has one course.
+    """
+    number = np.arange(exposures)
+    fades = np.array([_frame_means(left**number, averaged) for left in decay])
+    courses = [-np.asarray(law.trapped) @ fades, *(((1.0 - decay)[:, None] * before.held).T @ fades)]
+    if law.pause_share > 0:
+        first = _frame_means((number == 0).astype(np.float64), averaged)
+        courses[1:] = [course + share * first for course, share in zip(courses[1:], before.found, strict=True)]
+    signal = own
+    trend = []
+    for picture, course in zip((own, *before.pictures), courses, strict=True):
+        signal = signal + course.mean() * picture
+        trend.append((picture, course - course.mean()))
+    return signal, trend
 
 
 def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
@@ -743,18 +786,8 @@ def expected_series(
     if state.lag is not None:
         law = state.lag
         decay = _decays(law, interval)
-        before, found = _trapped_before(twin, request, law, choice, cache)
-        number = np.arange(exposures)
-        for trapped, left, held in zip(law.trapped, decay, before, strict=True):
-            # y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i]
-            amount = (1.0 - left) * held - trapped * charge.mean
-            course = _frame_means(left**number, averaged)
-            signal = signal + course.mean() * amount
-            trend.append((amount, course - course.mean()))
-        if law.pause_share > 0 and request.previous:
-            course = _frame_means((number == 0).astype(np.float64), averaged)
-            signal = signal + course.mean() * found
-            trend.append((found + np.zeros(charge.mean.shape), course - course.mean()))
+        before = _trapped_before(twin, request, law, choice, cache)
+        signal, trend = _with_trapped(law, decay, before, charge.mean, exposures, averaged)
     covariance = _temporal_covariance(state.lag, decay, averaged)
     bend = state.bend_per_DN
     slope: FloatArray | float = 1.0
@@ -864,7 +897,7 @@ def sample_series(
     if state.lag is not None:
         decay = _decays(state.lag, interval)[:, None, None]
         if carried.trapped_DN is None:
-            trapped, found = _trapped_before(twin, request, state.lag, choice, cache)
+            trapped, found = _trapped_before(twin, request, state.lag, choice, cache).images()
         else:
             trapped, found = _paused(state.lag, carried.trapped_DN, _pause_s(state.lag, request, carried.time_s))
         share = np.asarray(state.lag.trapped)[:, None, None]

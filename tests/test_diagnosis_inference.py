@@ -24,7 +24,9 @@ from raytwin.diagnosis.pairs import (
     Doubts,
     _pair_integral,
 )
-from raytwin.diagnosis.refine import _in_turn, _refined, _Seen, _Slopes, _to_refine
+from raytwin.diagnosis.refine_tasks import tasks_of
+from raytwin.diagnosis.search import _in_turn, _Slopes, searched
+from raytwin.diagnosis.seen import Blocks, Seen
 from raytwin.diagnosis.strengths import _outright
 from raytwin.diagnosis.veto import DOUBT, with_doubt
 from raytwin.diagnosis.whitening import Whitening
@@ -705,12 +707,50 @@ def test_reach_is_sought_before_shape_and_the_stronger_of_a_leading_pair_alone_a
             variants={name: one_node(name, np.ones(PROBES)) for name in strengths},
         )
 
-    pair, alone = explanation(weak=1.0, strong=9.0), explanation(strong=8.0)
-    asked = [(effect, [(curve.effect, at) for curve, at in beside]) for effect, beside in _to_refine([pair, alone])]
-    assert asked == [("strong", []), ("strong", [("weak", 1.0)]), ("weak", [("strong", 9.0)])]
-    # a pair behind a single effect: what led alone is asked once more, beside the other
-    asked = [(effect, [(curve.effect, at) for curve, at in beside]) for effect, beside in _to_refine([alone, pair])]
-    assert asked == [("strong", []), ("strong", [("weak", 1.0)]), ("weak", [("strong", 9.0)])]
+    def asked(*hypotheses):
+        return [(task.effect, task.beside and (task.beside[0].effect, task.beside[1])) for task in tasks_of(hypotheses)]
+
+    pair, alone, other = explanation(weak=1.0, strong=9.0), explanation(strong=8.0), explanation(weak=2.0)
+    wins = replace(pair, log_evidence=12.0)
+    assert asked(wins, alone, other) == [("strong", None), ("strong", ("weak", 1.0)), ("weak", ("strong", 9.0))]
+    # behind a single effect, what led alone is not asked once more beside the other
+    assert asked(alone, replace(pair, log_evidence=9.0), other) == [
+        ("strong", None),
+        ("weak", None),
+        ("weak", ("strong", 9.0)),
+    ]
+
+
+def test_a_search_asks_the_series_that_tell_most_for_what_they_cost():
+    blocks = Blocks(of=np.repeat(np.arange(6), 10), costs=np.array([0.1, 3.0, 3.0, 3.0, 3.0, 1.0]))
+    tells = np.repeat([0.0, 50.0, 10.0, 5.0, 5.0, 30.0], 10)
+    # what costs next to nothing says what nuisances do; the dear ones by what they tell for it
+    kept = blocks.telling(tells)
+    assert sorted(set(blocks.of[kept])) == [0, 1, 5]
+    assert kept.sum() == 30
+    assert blocks.telling(np.ones(60)) is None  # nearly all are needed
+    # what nuisances take back counts as nothing
+    kept = blocks.telling(np.repeat([0.0, 50.0, -10.0, -5.0, 0.0, 30.0], 10))
+    assert sorted(set(blocks.of[kept])) == [0, 1, 5]
+
+
+def test_curves_and_nuisances_of_some_probes_are_those_of_these():
+    rng = np.random.default_rng(5)
+    some = rng.random(PROBES) < 0.5
+    curve = one_node(
+        "a", rng.standard_normal(PROBES), spread=rng.standard_normal((PROBES, 2)), jitter=rng.random(PROBES)
+    )
+    factors, of_laws = rng.standard_normal((PROBES, 3)), group_factors(rng.standard_normal(PROBES), GROUPS, 0.4)
+    residual = rng.standard_normal(PROBES)
+    part = Nuisances(factors, of_laws).of_probes(some)
+    whole = (
+        factors[some] @ factors[some].T + of_laws.toarray().T[some] @ of_laws.toarray()[:, some] + np.eye(some.sum())
+    )
+    np.testing.assert_allclose(part.solve(residual[some]), np.linalg.solve(whole, residual[some]), atol=1e-9)
+    cut = curve.of_probes(some)
+    np.testing.assert_array_equal(cut.response(2.0), curve.response(2.0)[some])
+    np.testing.assert_array_equal(cut.spread, curve.spread[some])
+    np.testing.assert_array_equal(cut.jitter, curve.jitter[some])
 
 
 def test_effects_weaker_and_stronger_than_is_plausible_are_found_and_told():
@@ -763,27 +803,28 @@ def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
         high=5.0,
         strengths=(3.0, 5.0),
     )
-    seen = _Seen(
-        residual=9.0 * response + 0.1 * rng.standard_normal(PROBES),
-        nuisances=Nuisances(np.zeros((PROBES, 1))),
-        groups=GROUPS,
-        places=None,
-        whitener=SimpleNamespace(apply=np.asarray),
-    )
     asked = []
 
-    def respond(variants):
+    def respond(variants, wanted=None):
         asked.append(variants[0].strengths)
         # the spectrum ends at 10 %
         return {0: np.outer(variants[0].strengths, response)} if max(variants[0].strengths) < 10.0 else {}
 
+    seen = Seen(
+        residual=9.0 * response + 0.1 * rng.standard_normal(PROBES),
+        nuisances=Nuisances(np.zeros((PROBES, 1))),
+        groups=GROUPS,
+        places=None,
+        respond=respond,
+        whitener=SimpleNamespace(apply=np.asarray),
+    )
     fit = seen.fit(grid)
     assert fit.best == pytest.approx(7.5)  # as far as the grid is believed
-    found = _refined(variant, fit, seen, respond)
+    found = searched(variant, fit, seen)
     assert found is not None
     assert max(found[0].strengths) == pytest.approx(9.0, rel=0.03)
     assert any(max(strengths) > 10.0 for strengths in asked)
-    assert _refined(variant, fit, seen, lambda variants: {}) is None
+    assert searched(variant, fit, replace(seen, respond=lambda variants, wanted=None: {})) is None
 
 
 @pytest.mark.parametrize(("strength", "told"), [(0.1, "weaker"), (3.0, ""), (9.0, "stronger")])

@@ -81,7 +81,7 @@ def few():
         blocks=np.repeat(np.arange(3), 20),
         sd=np.full(probes, 2.0),
         noise=np.full(probes, 0.8),
-        respond=lambda asked: {0: np.ones((1, probes))},
+        respond=lambda asked, wanted=None: {0: np.ones((1, probes))},
         base=SimpleNamespace(effects=()),
     )
 

@@ -20,6 +20,7 @@ from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.probes import ALONG_ROWS
 from raytwin.diagnosis.refine import refine
+from raytwin.diagnosis.seen import Blocks
 from raytwin.diagnosis.series_block import jitter_of
 from raytwin.diagnosis.veto import Misfit, is_refused, leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
@@ -125,10 +126,12 @@ def test_nodes_are_joined_by_cubics():
     assert node_weights(nodes[1:2], at) @ (3.0 * nodes[1:2]) == pytest.approx(3.0 * at)
 
 
-def refined(variants, law, residual):
+def refined(variants, law, residual, blocks=None, asked_of=None):
     """What refinement makes of variants whose responses (probe,) are `law(parameters, strength)`."""
 
-    def answer(asked):
+    def answer(asked, wanted=None):
+        if asked_of is not None:
+            asked_of.append(wanted)
         return {
             number: np.stack([law(item.parameters, strength) for strength in item.strengths])
             for number, item in enumerate(asked)
@@ -147,7 +150,31 @@ def refined(variants, law, residual):
         groups=groups,
         respond=answer,
         whitener=SimpleNamespace(apply=lambda vectors: vectors),
+        blocks=blocks,
     )
+
+
+def test_refinement_asks_the_series_that_tell_most_and_all_of_them_in_the_end():
+    x = np.linspace(0.0, 3.0, PROBES)
+
+    def law(parameters, strength):
+        return 40.0 * strength * np.exp(-((x - np.log(parameters["length_mm"])) ** 2))
+
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    lengths = [item.parameters["length_mm"] for item in variants]
+    true = float(np.sqrt(lengths[0] * lengths[-1]))
+    residual = law({"length_mm": true}, 2.0) + np.random.default_rng(1).standard_normal(PROBES)
+    of = np.arange(PROBES) * 10 // PROBES
+    asked: list = []
+    found = refined(variants, law, residual, Blocks(of=of, costs=np.ones(10)), asked)
+    everywhere = refined(variants, law, residual)
+    parts = [wanted for wanted in asked if wanted is not None]
+    assert len(parts) > 3
+    assert all(0.2 < wanted.mean() <= 0.7 for wanted in parts)
+    assert asked[-1] is None  # the curve that is kept holds all probes
+    assert found[0][1].shape == everywhere[0][1].shape
+    lengths_found = [item[0][0].parameters["length_mm"] for item in (found, everywhere)]
+    assert lengths_found[0] == pytest.approx(lengths_found[1], rel=0.02)
 
 
 def test_refinement_finds_an_inner_parameter_between_the_grid_s():

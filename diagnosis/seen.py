@@ -1,0 +1,140 @@
+"""What refinement fits an effect to: the residual less what others explain, of all series or of those that tell most."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .changes import Variant
+from .curve_fits import CurveFit, fit_curve
+from .curves import Curve
+from .inexact_laws import Widened, widened_for
+from .nuisances import Nuisances
+
+LAW_ERROR = 0.1
+_TELLS = 0.8  # share of what tells an effect, its law off by LAW_ERROR, that the series of a search hold
+_WORTH = 0.7  # share of all series' cost from which a search asks all of them
+
+
+class Responder(Protocol):
+    """Responses (strength, probe) of variants, by their place; those that cannot be asked are left out.
+
+    `wanted` (probe,) says which probes are; others may be 0.
+    """
+
+    def __call__(
+        self, asked: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
+    ) -> Mapping[int, NDArray[np.float64]]: ...
+
+
+class Whitener(Protocol):
+    """Responses with the local nuisances integrated out."""
+
+    def apply(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Series that share local nuisances: `of` (probe,) is the block of each probe, `costs` (block,) how long it takes to ask it."""
+
+    of: NDArray[np.intp]
+    costs: NDArray[np.float64]
+
+    def telling(self, tells: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+        """Probes (probe,) of the blocks that tell most for what they cost; None: nearly all are needed.
+
+        Blocks that cost less than a tenth of the dearest are always among them: they say what nuisances do.
+
+        Args:
+            tells: what each probe tells (probe,).
+        """
+        of_block = np.maximum(np.bincount(self.of, weights=tells, minlength=len(self.costs)), 0.0)
+        kept = self.costs < 0.1 * self.costs.max()
+        for block in np.argsort(-of_block / self.costs):
+            if float(of_block[kept].sum()) >= _TELLS * float(of_block.sum()):
+                break
+            kept[block] = True
+        if float(self.costs[kept].sum()) > _WORTH * float(self.costs.sum()):
+            return None
+        return np.asarray(kept[self.of])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """What one effect is fitted to, in units of what other effects' laws leave uncertain.
+
+    Fields: residual (probe,), nuisances, groups and places as weighed; respond: the forward model; whitener of its responses; root
+    (probe,): standard deviations of the probes, in whitened ones (None: 1); blocks of series (None: all are asked); wanted: which of
+    all probes these are (None: all).
+    """
+
+    residual: NDArray[np.float64]
+    nuisances: Nuisances
+    groups: NDArray[np.intp]
+    places: NDArray[np.intp] | None
+    respond: Responder
+    whitener: Whitener
+    root: NDArray[np.float64] | None = None
+    blocks: Blocks | None = None
+    wanted: NDArray[np.bool_] | None = None
+
+    def beside(self, curve: Curve, strength: float) -> "Seen":
+        """The same once another effect stands at a strength, its law off by LAW_ERROR."""
+        found = self.widened(curve, strength)
+        root = found.root if self.root is None else self.root * found.root
+        rest = (self.residual - curve.response(strength)) / found.root
+        return replace(self, residual=rest, nuisances=found.nuisances, root=root)
+
+    def where_told(self, fit: CurveFit) -> "Seen":
+        """The same of the series that tell most of a fitted curve in these units; itself where nearly all are needed."""
+        if self.blocks is None:
+            return self
+        found = self.widened(fit.curve, fit.best)
+        response = fit.curve.response(fit.best) / found.root
+        kept = self.blocks.telling(response * found.nuisances.solve(response))
+        if kept is None:
+            return self
+        return replace(
+            self,
+            residual=self.residual[kept],
+            nuisances=self.nuisances.of_probes(kept),
+            groups=self.groups[kept],
+            places=None if self.places is None else self.places[kept],
+            root=None if self.root is None else self.root[kept],
+            blocks=None,
+            wanted=kept,
+        )
+
+    def widened(self, curve: Curve, strength: float) -> Widened:
+        """What may vary beside a curve at a strength, its law off by LAW_ERROR."""
+        return widened_for(self.residual, curve, strength, self.nuisances, self.groups, LAW_ERROR, places=self.places)
+
+    def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+        """Responses (strength, probe) of variants by their place, whitened and in these units."""
+        return {number: self.own(found) for number, found in self.respond(variants, wanted=self.wanted).items()}
+
+    def own(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses of all probes as the forward model gives them, whitened and in these units."""
+        whitened = self.whitener.apply(responses)
+        if self.wanted is not None:
+            whitened = whitened[:, self.wanted]
+        return whitened if self.root is None else whitened / self.root
+
+    def scaled(self, curve: Curve) -> Curve:
+        """A whitened curve of all probes in these units."""
+        own = self.cut(curve)
+        return own if self.root is None else own.over(self.root)
+
+    def cut(self, curve: Curve) -> Curve:
+        """A curve of all probes, of these."""
+        return curve if self.wanted is None else curve.of_probes(self.wanted)
+
+    def fit(self, curve: Curve) -> CurveFit:
+        """A whitened curve of all probes, fitted."""
+        return self.fit_scaled(self.scaled(curve))
+
+    def fit_scaled(self, curve: Curve) -> CurveFit:
+        """A curve in these units, fitted."""
+        return fit_curve(self.residual, curve, self.nuisances, self.groups, places=self.places)

@@ -14,9 +14,10 @@ from .changes import catalogue_variants
 from .coarse import UNSEEN
 from .inference import UNKNOWN, Hypothesis, Priors
 from .judgement import judge
-from .known_effects import already_there
+from .known_effects import already_there, lasting
 from .preparation import calibrated_twin, mislabelled, prepare_session
 from .readings import Suspect
+from .sought_anew import is_to_be_asked, with_sought_anew
 
 
 def diagnose(
@@ -45,12 +46,12 @@ def diagnose(
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
     had = {} if twin is None else already_there(twin.effects)
-    left_out = (*without, *had, *(UNSEEN if session.factor > 1 else ()))
+    unseen = UNSEEN if session.factor > 1 else ()
 
-    try:
+    def judged(with_effects: Twin, left_out: Sequence[str]) -> Diagnosis:
         problem = build_problem(
             session.acquisition,
-            session.twin,
+            with_effects,
             variants=catalogue_variants(without=left_out, side=session.factor),
             calibrated_elsewhere=session.calibrated_elsewhere,
             exposed=session.exposed,
@@ -59,13 +60,23 @@ def diagnose(
             side=session.factor,
             progress=progress,
         )
+        return judge(problem, with_effects, rng=rng, priors=priors, progress=progress)
+
+    try:
+        result = judged(session.twin, (*without, *had, *unseen))
     except InputError as error:
         if session.suspects:
             raise mislabelled(acquisition, session.suspects) from error
         raise
-    result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
+    if had and not session.suspects and is_to_be_asked(result, session.twin.effects):
+        if progress is not None:
+            progress("effects of the twin sought anew")
+        rest = tuple(item for item in session.twin.effects if item not in lasting(session.twin.effects))
+        anew = judged(replace(session.twin, effects=rest), (*without, *unseen))
+        result = with_sought_anew(result, anew, session.twin.effects)
     result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
-    result = replace(result, not_tested={**had, **result.not_tested})
+    still = {effect: why for effect, why in had.items() if effect not in result.named}
+    result = replace(result, not_tested={**still, **result.not_tested})
     cleared = [item for item in session.suspects if _clears(result, item)]
     notes = tuple(
         f"{item.text}, or with {' and '.join(result.named)}, which explains the rest as well" for item in cleared

@@ -26,6 +26,7 @@ CHANGED_SD = 1.0  # the same where a strength may be any, 0 among them
 _APART = 1.96 * _STRENGTH_SD
 CHANGED_FROM = 8.0  # log evidence from which a strength counts as another one's
 _STRENGTH_OF = "strength of {}, which the twin has"
+_SHOWN = "the twin has {}, and this session shows"
 
 
 def without_each(base: Twin) -> list[Change]:
@@ -104,9 +105,14 @@ class KnownStrength:
         """What to say of it."""
         value, low, high = (max(one, 0.0) for one in self.times)
         return (
-            f"the twin has {self.effect}, and this session shows {value:.2f} ({low:.2f} to {high:.2f}) times as much of it: leave"
+            f"{_SHOWN.format(self.effect)} {value:.2f} ({low:.2f} to {high:.2f}) times as much of it: leave"
             " --twin out, or give the twin as it was before, to have it sought anew"
         )
+
+
+def says_strength(note: str, effect: str) -> bool:
+    """Whether a note is of how strong an effect of the twin is here."""
+    return note.startswith(_SHOWN.format(effect))
 
 
 def changed_effect(location: str) -> str | None:

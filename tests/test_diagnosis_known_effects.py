@@ -1,12 +1,14 @@
 """Effects that a twin has already: what is expected with them, and how far they are trusted."""
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from raytwin.cli import main
 from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
 from raytwin.diagnosis.judgement import _of_another_strength
@@ -20,6 +22,7 @@ from raytwin.diagnosis.known_laws import (
 )
 from raytwin.diagnosis.local_nuisances import LocalNuisances
 from raytwin.diagnosis.nuisances import Nuisances
+from raytwin.diagnosis.sought_anew import is_to_be_asked, with_sought_anew
 from raytwin.generator.effects import AppliedEffect
 
 
@@ -187,3 +190,127 @@ def test_the_place_of_another_strength_names_the_effect(few):
     assert changed_effect("sharpness of object edge") is None
     assert found.note.startswith("the twin has motion_blur, and this session shows 0.")
     assert "-0" not in found.note
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """A gap before and after."""
+
+    before: float
+    after: float
+    shrinks_by: float | None = 0.5
+    left: float = 0.5
+    contradicted: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """The fields of an answer that are changed."""
+
+    verdict: str
+    named: tuple[str, ...]
+    gap: Gap
+    hypotheses: tuple[Hypothesis, ...]
+    causes: tuple[SimpleNamespace, ...] = ()
+    notes: tuple[str, ...] = ()
+    unknown_location: str = ""
+    probability_no_gap: float = 0.0
+    probability_unknown: float = 0.0
+    held_out: tuple = (("brightness", 2.0, 1.0, 0.7),)
+    ambiguous_with: tuple = ()
+    next_measurement: dict | None = None
+    twin: SimpleNamespace | None = None
+    added: tuple = ()
+    strained: tuple = ()
+
+
+def answer(named, *, before, after, strengths=(), verdict="explained", **more):
+    hypotheses = (
+        Hypothesis(effects=tuple(sorted(named)) or (UNKNOWN,), probability=0.9, log_evidence=50.0),
+        Hypothesis(effects=("lag", "object_scatter"), probability=0.06, log_evidence=40.0),
+        Hypothesis(effects=(UNKNOWN,), probability=0.04, log_evidence=10.0),
+    )
+    return Answer(
+        verdict=verdict,
+        named=tuple(named),
+        gap=Gap(before=before, after=after),
+        hypotheses=hypotheses,
+        causes=tuple(SimpleNamespace(effect=name, strength=value) for name, value in dict(strengths).items()),
+        **more,
+    )
+
+
+@dataclass(frozen=True)
+class Line:
+    """A twin's effects."""
+
+    effects: tuple
+
+
+def test_a_gap_beside_what_the_twin_has_is_judged_with_that_sought_anew():
+    had = (effect("object_scatter", 10.8), effect("output_drift", 0.2))
+    note = "the twin has object_scatter, and this session shows 1.20 (1.1 to 1.3) times as much of it"
+    left = answer((), before=1.7, after=1.7, verdict="unknown_effect", notes=(note, "kept"), twin=Line(()))
+    again = {"object_scatter": (11.0, 8.6, 13.9)}
+
+    # as strong as the twin has it, and it explains the session: nothing else
+    found = with_sought_anew(left, answer(["object_scatter"], before=11.3, after=2.8, strengths=again), had)
+    assert (found.verdict, found.named, found.causes) == ("no_gap", (), ())
+    assert found.probability_no_gap == pytest.approx(0.9)
+    assert found.probability_unknown == pytest.approx(0.04)
+    assert [item.effects for item in found.hypotheses] == [(), ("lag",), (UNKNOWN,)]
+    assert (found.gap.before, found.gap.after, found.gap.shrinks_by) == (1.7, 1.7, None)
+    assert found.twin.effects == had
+    assert found.notes[0] == "kept"
+    assert "sought anew" in found.notes[1]
+
+    # beside it another one is seen
+    both = answer(["motion_blur", "object_scatter"], before=11.8, after=3.0, strengths=again)
+    found = with_sought_anew(left, both, had)
+    assert (found.verdict, found.named) == ("explained", ("motion_blur", "object_scatter"))
+    assert "sought anew" in found.notes[-1]
+    # which had been named beside the twin's own already
+    named = answer(["motion_blur"], before=3.0, after=1.0)
+    assert with_sought_anew(named, both, had) is named
+
+    # of another strength, or leaving far more as the twin has it: it is another one now
+    weak = answer(["object_scatter"], before=11.3, after=2.8, strengths={"object_scatter": (4.0, 3.2, 5.0)})
+    assert with_sought_anew(left, weak, had).named == ("object_scatter",)
+    worse = replace(left, gap=Gap(before=9.0, after=9.0))
+    found = with_sought_anew(worse, answer(["object_scatter"], before=11.3, after=2.8, strengths=again), had)
+    assert (found.verdict, found.named) == ("explained", ("object_scatter",))
+
+    # not found, or nothing explains the session: the first answer stands
+    assert with_sought_anew(left, answer(["veiling_glare"], before=11.3, after=2.8), had) is left
+    assert with_sought_anew(left, answer((), before=11.0, after=11.0, verdict="unknown_effect"), had) is left
+
+
+def test_effects_are_sought_anew_where_a_gap_is_left_that_is_not_their_strength():
+    had = (effect("object_scatter", 10.8),)
+    left = answer((), before=1.7, after=1.7, verdict="unknown_effect")
+    assert is_to_be_asked(left, had)
+    assert not is_to_be_asked(left, ())
+    assert not is_to_be_asked(left, (effect("output_drift", 0.2),))  # sought again in any case
+    assert not is_to_be_asked(replace(left, verdict="no_gap"), had)
+    of_strength = replace(left, unknown_location="strength of object_scatter, which the twin has")
+    assert not is_to_be_asked(of_strength, had)
+
+
+@pytest.mark.slow
+def test_a_session_with_the_scatter_that_its_twin_has_shows_no_gap_and_what_came_besides_is_named(tmp_path):
+    lab = ["lab", "--protocol", "full", "--size", "96", "--seed", "2941", "--effect", "object_scatter=12"]
+    first, other = tmp_path / "first.h5", tmp_path / "other.h5"
+    assert main([*lab, "-o", str(first)]) == 0
+    assert main([*lab, "-o", str(other), "--session", "1", "--effect", "motion_blur=3"]) == 0
+    assert main(["diagnose", str(first), "-o", str(tmp_path / "a")]) == 0
+    twin = str(tmp_path / "a" / "twin.h5")
+    for session, verdict, named in (
+        (first, "no_gap", []),
+        (other, "explained", ["motion_blur", "object_scatter"]),
+    ):
+        assert main(["diagnose", str(session), "--twin", twin, "-o", str(tmp_path / session.stem)]) == 0
+        said = json.loads((tmp_path / session.stem / "diagnosis.json").read_text())
+        assert said["verdict"] == verdict
+        likely = sorted(item["effect"] for item in said["causes"] if item["probability"] > 0.9)
+        assert likely == named
+        assert ("object_scatter" in named) is not any(item["effect"] == "object_scatter" for item in said["not_tested"])

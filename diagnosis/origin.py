@@ -14,6 +14,7 @@ _MOST_SERIES = 12  # of each kind that are looked at
 _SURE = 10.0  # standard deviations of a variance of independent pixels; light spreads over a few
 _LEAST_SHARE = 0.05  # of a map's frames that a series must bring to be found
 _NO_NOISE = 1e-9  # DN^2
+_MOST_PAIRS = 8  # of frames that a series' noise is taken from
 
 
 def made_of(twin: Twin, series: Sequence[Series]) -> bool:
@@ -56,18 +57,22 @@ def _flats(twin: Twin, series: Sequence[Series], good: NDArray[np.bool_]) -> Ite
 
 def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
     """Mean frame (row, column), DN, and variance of its noise, DN^2; 0 for a single frame, which shows none."""
-    total, squares, last = np.zeros(item.shape), 0.0, None
+    total, noise_DN2, last = np.zeros(item.shape), [], None
     for piece in item.iter_frames():
         for frame in np.asarray(piece, dtype=np.float64):
             total += frame
-            if last is not None:
-                # what all pixels have in common is no noise of theirs
-                squares += _variance(frame - last, good)
+            if last is not None and len(noise_DN2) < _MOST_PAIRS:
+                noise_DN2.append(_variance(frame - last, good) / 2.0)
             last = frame
-    pairs = item.n_frames - 1
-    return total / item.n_frames, squares / (2.0 * pairs * item.n_frames) if pairs > 0 else 0.0
+    return total / item.n_frames, float(np.mean(noise_DN2)) / item.n_frames if noise_DN2 else 0.0
 
 
 def _variance(image: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
-    """Of the pixels in use."""
-    return float(np.var(image[good])) if good.any() else 0.0
+    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts.
+
+    The picture that a lag left fades from frame to frame: counted as noise, it had let another day's darks pass for those of the map.
+    """
+    from scipy.stats import sigmaclip
+
+    steps = np.diff(image, axis=1)[good[:, 1:] & good[:, :-1]]
+    return float(np.var(sigmaclip(steps).clipped)) / 2.0 if steps.size else 0.0

@@ -281,6 +281,18 @@ def test_a_twin_knows_the_frames_it_was_made_of(line, tmp_path):
         assert not made_of(twin, acquisition.series)
 
 
+def test_a_fading_ghost_is_no_noise_that_another_days_darks_may_lie_within(tmp_path):
+    words = ["--protocol", "full", "--seed", "2942", "--size", "48", "--frames", "4", "--effect", "image_lag=2"]
+    for day in ("0", "1"):
+        assert main(["lab", "-o", str(tmp_path / f"{day}.h5"), *words, "--session", day]) == 0
+    assert main(["calibrate", str(tmp_path / "0.h5"), "-o", str(tmp_path / "twin.h5")]) == 0
+    twin = read_twin(tmp_path / "twin.h5")
+    with open_acquisition(tmp_path / "0.h5") as acquisition:
+        assert made_of(twin, acquisition.series)
+    with open_acquisition(tmp_path / "1.h5") as acquisition:
+        assert not made_of(twin, acquisition.series)
+
+
 def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
     session = tmp_path / "bent.h5"
     words = [

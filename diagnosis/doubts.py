@@ -23,9 +23,6 @@ _LOOSE = {"object_scatter": 0.02}
 # beside 16 scatters of 3 to 40 % alone these gained nothing (a focal spot 2, once 350 of an evidence of 1.5e7), a dark drift up to
 # 3e-3 of scatter's evidence, a tail, K fluorescence and a lag 3e-4
 _SHARP = frozenset(("motion_blur", "misregistration", "focal_spot"))
-# traps are more than a law of two knows: in eight sessions with lags of 0.5-4 % alone a dark drift gained up to 4e-5 of lag's
-# evidence, beside three since the calibration 4e-4, 5e-4 and 2.5e-3
-_LEFT = {("image_lag", "always"): (2e-4, 1.8e-3), ("image_lag", "calibration"): (1e-3, 9e-3)}
 # pixels and codes of their own tell these: a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
 _TOLD = frozenset(("gain_map_error", "bad_pixels", "quantisation"))
 
@@ -37,7 +34,6 @@ def doubts_of(problem: Problem) -> Doubts:
         chance=_SHARP_CHANCE if sharp else _CHANCE,
         loose=_LOOSE,
         sharp=_SHARP,
-        left=_LEFT,
         told=_TOLD,
         elsewhere=_elsewhere(problem),
     )

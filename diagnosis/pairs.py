@@ -30,6 +30,8 @@ PAIR_DOUBT_SHARED = 2.9e-4  # and so much more of it, times the square of the ef
 APART_DOUBT = 5.0  # of a second effect seen where the first cannot act
 _PAIR_NODES = 13
 _LAW_MATTERS = 1.5  # standard deviations by which a law's error must move the probes for it to be carried in a pair
+_TURNED = 2  # pairs, the likeliest, whose variants are chosen by turns
+_MOST_TURNS = 4
 _PAIRS_IN_FULL = 14  # pairs, the likeliest, either order, for which both laws are taken as inexact
 # times the least that is plausible: of twelve seconds named beside one sealed effect, where they were none, eight lay below that
 _AT_BOTTOM = 1.2
@@ -117,17 +119,29 @@ def weigh_pairs(
     starts: list[_PairStart] = []
     for first in ranked[:leading]:
         # the second is looked for in what the first leaves, over all its variants
-        states = _states_of(singles[first].best, observed, table)
+        best = singles[first].best
+        states = _states_of(best.curve, best.best, observed, table)
         for second, single in singles.items():
             if second != first:
                 # of two that lead both orders are tried: what one alone is best with need not be so beside the other
-                starts.append(_start_pair(singles[first], single, states=states, table=table))
-    overlaps = _overlaps(starts, singles, observed.nuisances, table)
+                starts.append(_start_pair(singles[first], single, head=best.curve, states=states, table=table))
     doubt = _SecondDoubted(observed, singles, doubts)
-    ahead = [
-        start.log_evidence - doubt.of(start, overlap, start.log_evidence, start.below, start.strengths)
-        for start, overlap in zip(starts, overlaps, strict=True)
-    ]
+
+    def ahead_of(some: Sequence[_PairStart]) -> tuple[list[float], list[float]]:
+        overlaps = _overlaps(some, singles, observed.nuisances, table)
+        return list(overlaps), [
+            start.log_evidence - doubt.of(start, overlap, start.log_evidence, start.below, start.strengths)
+            for start, overlap in zip(some, overlaps, strict=True)
+        ]
+
+    overlaps, ahead = ahead_of(starts)
+    # nor need what is best beside one that is best alone be best beside one that is not
+    likely = sorted(range(len(starts)), key=lambda number: -ahead[number])[:_TURNED]
+    turned = [_turned(starts[number], observed, singles, table=table) for number in likely]
+    more = [start for start, number in zip(turned, likely, strict=True) if start is not starts[number]]
+    if more:
+        of_more = ahead_of(more)
+        starts, overlaps, ahead = [*starts, *more], [*overlaps, *of_more[0]], [*ahead, *of_more[1]]
     pairs: dict[tuple[str, str], Pair] = {}
     for rank, number in enumerate(sorted(range(len(starts)), key=lambda number: -ahead[number])):
         start = starts[number]
@@ -219,8 +233,8 @@ class _State:
     shift: float
 
 
-def _states_of(leading: CurveFit, observed: Observed, table: _NodeTable) -> list[_State]:
-    """What is left to explain beside an effect, its law exact and off by each of the law errors."""
+def _states_of(curve: Curve, strength: float, observed: Observed, table: _NodeTable) -> list[_State]:
+    """What is left to explain beside an effect of some strength, its law exact and off by each of the law errors."""
 
     def state(model: Nuisances, nodes: NDArray[np.float64], vector: NDArray[np.float64], shift: float) -> _State:
         # a^T C^-1 b of all with all, by one projection
@@ -229,12 +243,11 @@ def _states_of(leading: CurveFit, observed: Observed, table: _NodeTable) -> list
 
     residual, nuisances = observed.residual, observed.nuisances
     result = [state(nuisances, table.nodes, residual, 0.0)]
-    curve = leading.curve
-    effective = curve.weights(np.array([leading.best]))[0] @ nuisances.solve_all(curve.responses)
+    effective = curve.weights(np.array([strength]))[0] @ nuisances.solve_all(curve.responses)
     effective = credible(effective, nuisances.solve(residual), observed.places)
     for law_error, probability in observed.law_errors:
-        extra = law_factors(curve, leading.best, effective, observed.groups, law_error)
-        own = own_variance(curve, leading.best, effective, law_error)
+        extra = law_factors(curve, strength, effective, observed.groups, law_error)
+        own = own_variance(curve, strength, effective, law_error)
         if extra or float(own.max()) >= LEAST_FACTOR:
             moved, nodes, wide, shift = with_law(residual, table.nodes, nuisances, extra, own)
             result.append(state(wide, nodes, moved, shift + math.log(probability)))
@@ -271,9 +284,11 @@ class _PairStart:
         return _by_effect(self.first, self.second, self.grid.below)
 
 
-def _start_pair(first: Single, second: Single, *, states: Sequence[_State], table: _NodeTable) -> _PairStart:
-    """The other's variants weighed beside the first's best one, which stands for all of them, with the first's law only inexact."""
-    a = first.best.curve
+def _start_pair(
+    first: Single, second: Single, *, head: Curve, states: Sequence[_State], table: _NodeTable
+) -> _PairStart:
+    """The other's variants beside one of the first, `head`, which stands for all of them; the first's law alone is inexact."""
+    a = head
     tried: list[tuple[float, _PairGrid, CurveFit]] = []
     stronger = (first if first.log_evidence >= second.log_evidence else second).best.curve.effect
     for fit in second.fits:
@@ -294,6 +309,19 @@ def _start_pair(first: Single, second: Single, *, states: Sequence[_State], tabl
     moves = math.sqrt(max(float(weights_b @ states[0].gram[np.ix_(rows, rows)] @ weights_b), 0.0))
     others = first.log_evidence - first.best.log_evidence
     return _PairStart(first=a, second=b, stronger=stronger, grid=grid, log_evidence=others + mean, moves=moves)
+
+
+def _turned(start: _PairStart, observed: Observed, singles: Mapping[str, Single], *, table: _NodeTable) -> _PairStart:
+    """The pair with either effect's variant chosen anew beside the other's, by turns, for as long as that explains more."""
+    best = start
+    for _ in range(_MOST_TURNS):
+        head, strength = best.second, best.strengths[best.second.effect]
+        states = _states_of(head, strength, observed, table)
+        found = _start_pair(singles[head.effect], singles[best.first.effect], head=head, states=states, table=table)
+        if found.log_evidence <= best.log_evidence:
+            break
+        best = found
+    return best
 
 
 def _overlaps(

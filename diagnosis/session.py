@@ -12,7 +12,7 @@ from ..calibration.repeated_frames import Beam, beam_of
 from ..errors import InputError
 from ..generator.series import SeriesRequest
 
-_REMEMBERED = 3  # series before one's own whose trapped charge may still be there
+_REMEMBERED = 12  # series before one's own whose trapped charge may still be there
 _GAP_S = 1.0  # between series whose times are not stated
 # of what the series last, that all of them must span to be on one clock; two that take turns frame by frame span half
 _LEAST_SPAN = 0.4

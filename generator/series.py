@@ -43,6 +43,7 @@ __all__ = [
 
 KINDS = ("dark", "flat", "object", "afterglow")
 _LAGS = 3
+_FOLLOWED = 2  # pictures exposed before a series' own, the last ones, whose fading is followed one by one
 _BEFORE_EXPOSURE = frozenset(("beam", "arrivals", "object_blur", "quanta", "optics"))
 # what a series is called and when it was taken does not change the light
 _OF_THE_SPREAD = (
@@ -654,9 +655,10 @@ def _trapped_before(twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Ch
         decay = _decays(law, interval)
         left = decay**exposures
         trapped = trapped * left[:, None]
-        if earlier.beam_on:
+        state, charge = choice.line(twin, earlier, cache)
+        if earlier.beam_on and state.lag is not None:
             trapped[:, len(pictures)] = share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12)
-            pictures.append(choice.line(twin, earlier, cache)[1].mean)
+            pictures.append(charge.mean)
         clock = earlier.start_s + exposures * interval
     found = np.zeros(trapped.shape[1])
     if clock is not None:
@@ -670,16 +672,25 @@ def _with_trapped(
     """Mean signal of a series whose exposures bring `own` (row, column), DN, with lag, and how it changes over the frames.
 
     y_n = x - sum_i a_i^n [phi_i x - (1 - a_i) R_i], R_i a sum of the pictures of earlier exposures: each picture has one course.
+    Those of long ago, of which only slow traps hold some still, fade together.
     """
     number = np.arange(exposures)
     fades = np.array([_frame_means(left**number, averaged) for left in decay])
-    courses = [-np.asarray(law.trapped) @ fades, *(((1.0 - decay)[:, None] * before.held).T @ fades)]
+    courses = ((1.0 - decay)[:, None] * before.held).T @ fades
     if law.pause_share > 0:
-        first = _frame_means((number == 0).astype(np.float64), averaged)
-        courses[1:] = [course + share * first for course, share in zip(courses[1:], before.found, strict=True)]
+        courses = courses + before.found[:, None] * _frame_means((number == 0).astype(np.float64), averaged)
+    long_ago = max(len(before.pictures) - _FOLLOWED, 0)
+    moving = [
+        (own, -np.asarray(law.trapped) @ fades),
+        *zip(before.pictures[long_ago:], courses[long_ago:], strict=True),
+    ]
+    shares = courses[:long_ago].mean(axis=1)
+    if shares.any():
+        faint = sum(share * one for share, one in zip(shares, before.pictures[:long_ago], strict=True))
+        moving.append((np.asarray(faint), courses[:long_ago].sum(axis=0) / shares.sum()))
     signal = own
     trend = []
-    for picture, course in zip((own, *before.pictures), courses, strict=True):
+    for picture, course in moving:
         signal = signal + course.mean() * picture
         trend.append((picture, course - course.mean()))
     return signal, trend

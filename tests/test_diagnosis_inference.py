@@ -508,6 +508,26 @@ def test_a_pair_has_the_variant_that_is_best_beside_the_other_and_not_the_one_th
     assert pair.strengths["gain_map"][0] == pytest.approx(5.0, rel=0.1)
 
 
+def test_a_pair_of_which_neither_variant_is_the_best_alone_is_found_by_turns():
+    u, w, x, y = np.zeros((4, PROBES))
+    u[:200], w[200:400], x[400:500], y[500:] = 1.0, 1.0, 1.0, 1.0
+    made = [
+        one_node("glare", u, variant="right", high=500.0),
+        one_node("glare", u + 0.3 * w + 0.2 * x, variant="wrong", high=500.0),
+        one_node("gain_map", w, variant="right", high=500.0),
+        one_node("gain_map", w + 0.3 * u + 0.2 * y, variant="wrong", high=500.0),
+    ]
+    residual = 20.0 * u + 15.0 * w + np.random.default_rng(2).standard_normal(PROBES)
+    found = weigh(residual, np.zeros((PROBES, 1)), made)
+    for effect in ("glare", "gain_map"):
+        alone = next(item for item in found if item.effects == (effect,))
+        assert alone.variants[effect].variant == "wrong"
+    pair = next(item for item in found if set(item.effects) == {"glare", "gain_map"})
+    assert {effect: curve.variant for effect, curve in pair.variants.items()} == {"glare": "right", "gain_map": "right"}
+    assert pair.strengths["glare"][0] == pytest.approx(20.0, rel=0.05)
+    assert pair.strengths["gain_map"][0] == pytest.approx(15.0, rel=0.05)
+
+
 def test_an_effect_that_moves_probes_by_chance_alone_is_found_with_its_strength():
     rng = np.random.default_rng(12)
     spread = np.zeros((PROBES, 40))

@@ -26,6 +26,7 @@ from raytwin.generator.series import (
     SeriesRequest,
     beam_conditions,
     expected_series,
+    final_state,
     sample_series,
     session_conditions,
     with_conditions,
@@ -600,6 +601,45 @@ def test_a_ghost_of_the_last_object_lies_in_the_next_flat(series_line):
     ghost = expect(series_line, asked, effect).signal_DN / expect(series_line, asked).signal_DN
     behind = expect(series_line, earlier).signal_DN
     assert np.corrcoef(ghost.ravel(), behind.ravel())[0, 1] > 0.99
+
+
+def test_what_many_exposures_before_left_is_the_sum_of_what_each_left(series_line):
+    effect = applied("image_lag", 3.0, release_s=2.0, spread=5.0, charge_ratio=0.8)
+    earlier = []
+    for number in range(6):
+        scene = BEHIND if number % 2 else {}
+        earlier.append(request(**{**scene, "frames": 20 + 10 * number, "start_s": 5.0 * number}))
+    asked = request("dark", setting=None, frames=8, start_s=32.0, previous=tuple(earlier))
+    found = expect(series_line, asked, effect)
+    frames = [found.signal_DN + sum(image * course[n] for image, course in found.trend_DN) for n in range(8)]
+    # frame by frame, trap by trap
+    law = final_state(series_line, asked, effects=effect).lag
+    times, caught = np.array(law.time_s)[:, None, None], np.array(law.trapped)[:, None, None]
+    held, clock = np.zeros((4, *SHAPE)), 0.0
+    for one in earlier:
+        held *= np.exp(-(one.start_s - clock) / times)
+        brought = expect(series_line, one).signal_DN
+        for _ in range(one.frames):
+            held = held * np.exp(-0.022 / times) + caught * brought
+        clock = one.start_s + one.frames * 0.022
+    held *= np.exp(-(asked.start_s - clock) / times)
+    known = []
+    for _ in range(8):
+        known.append(((1.0 - np.exp(-0.022 / times)) * held).sum(axis=0))
+        held = held * np.exp(-0.022 / times)
+    np.testing.assert_allclose(found.signal_DN, np.mean(known, axis=0), rtol=1e-9)
+    # those of long ago fade together: within a hundredth of how much all fade
+    np.testing.assert_allclose(frames, known, atol=0.01 * float(np.max(known[0] - known[-1])))
+
+
+def test_exposures_before_a_lag_set_in_leave_nothing(series_line):
+    earlier = request(frames=100, after_calibration=False)
+    asked = request("dark", setting=None, frames=4, start_s=3.0, previous=(earlier,))
+    always, since = (applied("image_lag", 3.0, release_s=1.0, since=since) for since in ("always", "calibration"))
+    assert expect(series_line, asked, always).signal_DN.mean() > 1.0
+    assert not expect(series_line, asked, since).signal_DN.any()
+    later = replace(asked, previous=(replace(earlier, after_calibration=True),))
+    assert expect(series_line, later, since).signal_DN.mean() > 1.0
 
 
 def test_sampled_lag_conserves_what_the_frames_and_the_traps_hold(series_line):

@@ -44,6 +44,11 @@ _SHARES_OF = {
 }
 _MOST_VARIANTS = 4
 _PAUSE = next(item for item in EFFECTS["image_lag"].parameters if item.name == "idle_s")
+# what besides is open where an effect came after the calibration
+_IF_LATER = {
+    effect: tuple(item for item in EFFECTS[effect].parameters if item.name in names)
+    for effect, names in {"image_lag": ("before_share",)}.items()
+}
 _PAUSES_S = (1.0, 20.0)  # in which quick traps still hold charge, and in which slow ones have lost most
 _CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
     "misregistration": [
@@ -254,17 +259,18 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
             label = f"{label}, negative".strip(", ")
         if since != usual:
             label = f"{label}, {'always' if since == 'always' else 'since the calibration'}".strip(", ")
+        later = _IF_LATER.get(effect.id, ()) if since == "calibration" else ()
         result.append(
             Variant(
                 effect=effect.id,
                 name=label,
-                parameters=choice,
+                parameters={**choice, **{item.name: 0.5 * (item.low + item.high) for item in later}},
                 sign=sign,
                 since=since,
                 low=low,
                 high=high,
                 strengths=nodes,
-                fitted=tuple(inner),
+                fitted=(*inner, *later),
             )
         )
     return result

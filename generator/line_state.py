@@ -50,13 +50,15 @@ class LagLaw:
     """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,).
 
     pause_share: of what is released in a pause between series, the share that the next series' first exposure reads. idle_s: length
-    of the pauses that a session does not state.
+    of the pauses that a session does not state. before_share: of what exposures before the lag set in would have left, the share that
+    is there.
     """
 
     trapped: tuple[float, ...]
     time_s: tuple[float, ...]
     pause_share: float
     idle_s: float
+    before_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

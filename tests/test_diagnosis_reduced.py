@@ -528,6 +528,10 @@ def test_pauses_that_no_session_states_are_sought_with_a_lag_and_those_it_states
     assert {item.name for item in plain[0].fitted} == {item.name for item in asking[0].fitted} - {"idle_s"}
     assert len(asking) == 2 * len(plain)
     assert {item.parameters["idle_s"] for item in asking} == {1.0, 20.0}
+    # whether its traps were full before is open where it came after the calibration alone
+    later = [item for item in plain if item.since == "calibration"]
+    assert 0 < len(later) < len(plain)
+    assert all((item in later) == ("before_share" in {one.name for one in item.fitted}) for item in plain)
 
 
 @pytest.mark.parametrize("bright_DN", [4100, 9000])

@@ -638,6 +638,11 @@ def test_exposures_before_a_lag_set_in_leave_nothing(series_line):
     always, since = (applied("image_lag", 3.0, release_s=1.0, since=since) for since in ("always", "calibration"))
     assert expect(series_line, asked, always).signal_DN.mean() > 1.0
     assert not expect(series_line, asked, since).signal_DN.any()
+    # unless its traps were full already
+    full = applied("image_lag", 3.0, release_s=1.0, since="calibration", before_share=0.5)
+    np.testing.assert_allclose(
+        expect(series_line, asked, full).signal_DN, 0.5 * expect(series_line, asked, always).signal_DN, rtol=1e-9
+    )
     later = replace(asked, previous=(replace(earlier, after_calibration=True),))
     assert expect(series_line, later, since).signal_DN.mean() > 1.0
 

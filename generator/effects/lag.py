@@ -33,6 +33,7 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
         time_s=times,
         pause_share=parameters["pause_share"],
         idle_s=parameters["idle_s"],
+        before_share=parameters["before_share"],
     )
     return replace(state, lag=law)
 
@@ -105,6 +106,17 @@ IMAGE_LAG = Effect(
             default=1.0,
             source="pause before each series of a session that states no times; diagnoses of such sessions fit it",
             log=True,
+            fitted=False,
+        ),
+        Parameter(
+            name="before_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="of what exposures before the lag set in would have left; 0: its traps are new, 1: they were full already."
+            " Diagnoses fit it where a lag came after the calibration",
+            log=False,
             fitted=False,
         ),
     ),

@@ -65,8 +65,6 @@ class Doubts:
         loose: effects whose law leaves something where it predicts nothing, and the share of their log evidence, in place of
             PAIR_DOUBT, that a second effect beside them must bring wherever it acts.
         sharp: effects that change edges alone, which nothing that such a law leaves looks like: not doubted for it.
-        left: shares of its log evidence that what is wrong with its law may give a second one, by effect and onset, where they are
-            not PAIR_DOUBT_STRONG, elsewhere, and PAIR_DOUBT_SHARED, more where both act.
         told: effects that pixels or codes of their own tell, which no other effect's law can leave: found at the least that is
             plausible they are doubted no more than elsewhere.
         elsewhere: probes (probe,) that it cannot move, however wrong its law; what a second effect gains there is not doubted.
@@ -75,7 +73,6 @@ class Doubts:
     chance: Mapping[str, float] = field(default_factory=dict)
     loose: Mapping[str, float] = field(default_factory=dict)
     sharp: frozenset[str] = frozenset()
-    left: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     elsewhere: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
@@ -193,8 +190,7 @@ class _SecondDoubted:
         at_bottom = weak not in doubts.told and strengths[weak] < _AT_BOTTOM * curves[weak].low
         if not loose and not at_bottom:
             doubt *= PAIR_DOUBT_ELSEWHERE + (1.0 - PAIR_DOUBT_ELSEWHERE) * overlap
-            apart, shared = doubts.left.get((strong, curves[strong].since), (PAIR_DOUBT_STRONG, PAIR_DOUBT_SHARED))
-            leaves = (apart + shared * overlap**2) * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
+            leaves = (PAIR_DOUBT_STRONG + PAIR_DOUBT_SHARED * overlap**2) * min(1.0, stronger / PAIR_DOUBT_FADES) ** 2
             doubt = min(doubt, PAIR_DOUBT_LEAST + leaves * stronger)
         gain = evidence - self._singles[strong].log_evidence
         if strong in doubts.elsewhere and gain > 0.0:

@@ -655,11 +655,12 @@ def _trapped_before(twin: Twin, request: SeriesRequest, law: LagLaw, choice: _Ch
         decay = _decays(law, interval)
         left = decay**exposures
         trapped = trapped * left[:, None]
-        state, charge = choice.line(twin, earlier, cache)
-        caught = 1.0 if state.lag is not None else law.before_share
-        if earlier.beam_on and caught > 0.0:
-            trapped[:, len(pictures)] = caught * share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12)
-            pictures.append(charge.mean)
+        if earlier.beam_on:
+            state, charge = choice.line(twin, earlier, cache)
+            caught = 1.0 if state.lag is not None else law.before_share
+            if caught > 0.0:
+                trapped[:, len(pictures)] = caught * share * (1.0 - left) / np.maximum(1.0 - decay, 1e-12)
+                pictures.append(charge.mean)
         clock = earlier.start_s + exposures * interval
     found = np.zeros(trapped.shape[1])
     if clock is not None:

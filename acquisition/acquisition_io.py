@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
@@ -53,7 +53,7 @@ class Series:
     (empty: none); layer (`front`, `back` of a dual-layer panel, or None); session (0, or its number where several were
     merged); corrected (subset of `offset`, `gain`, `defects`, `log`; empty = raw); role (`calibration`,
     `evaluation`, or None for either); setting (None where kV or exposure is unknown); n_frames; shape (row, column);
-    time_s (n_frames,) or None.
+    time_s (n_frames,) or None; left_out (indices of stored frames that are passed over).
     """
 
     name: str
@@ -82,6 +82,12 @@ class Series:
     _where: str
     layer: str | None = None
     session: int = 0
+    left_out: frozenset[int] = frozenset()
+
+    def without_frames(self, indices: Iterable[int]) -> "Series":
+        """The series without some of its frames (by index): `iter_frames` passes them over, and `n_frames` counts the rest."""
+        gone = frozenset(indices) | self.left_out
+        return replace(self, left_out=gone, n_frames=self.n_frames - len(gone - self.left_out))
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -104,8 +110,15 @@ class Series:
             frame_bytes=pixels * max(self.dtype.itemsize, self._frames.dtype.itemsize),
             maximum_bytes=maximum_bytes,
         )
-        for start in range(0, self.n_frames, step):
-            yield self._read(start, min(start + step, self.n_frames))
+        stored = self.n_frames + len(self.left_out)
+        for start in range(0, stored, step):
+            piece = self._read(start, min(start + step, stored))
+            if self.left_out:
+                kept = [place for place in range(len(piece)) if start + place not in self.left_out]
+                if not kept:
+                    continue
+                piece = piece[kept]
+            yield piece
 
     def read_frames(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Frames `start` up to but without `stop` (DN), one array (m, row, column); negative numbers as in a slice."""

@@ -23,6 +23,7 @@ from raytwin.generator import (
     SpectralPosterior,
     Twin,
     estimate_from_sd,
+    gaussian_spread,
     noise_kernel_1d,
     project_polychromatic,
     sample_frames,
@@ -63,8 +64,7 @@ def line(shape: tuple[int, int]) -> Twin:
             bad_pixels=np.zeros(shape, dtype=np.uint8),
         ),
         noise=NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(0.6, 0.01),
+            spread=gaussian_spread("aperture", estimate_from_sd(0.6, 0.01)),
             white_fraction=0.02,
             read_noise_DN=estimate_from_sd(12.9, 0.1),
             quantised=True,

@@ -21,6 +21,7 @@ from raytwin.generator import (
     SpectralPosterior,
     Twin,
     estimate_from_sd,
+    gaussian_spread,
     predict_flatfield,
     spectral_model_of,
 )
@@ -71,8 +72,7 @@ def line() -> Twin:
         bad_pixels=np.zeros((2, 2), dtype=np.uint8),
     )
     noise = NoiseModel(
-        psf_model="aperture",
-        psf_sigma_px=estimate_from_sd(0.5, 0.01),
+        spread=gaussian_spread("aperture", estimate_from_sd(0.5, 0.01)),
         white_fraction=0.01,
         read_noise_DN=estimate_from_sd(10.0, 0.1),
         quantised=True,

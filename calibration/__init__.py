@@ -24,12 +24,10 @@ if TYPE_CHECKING:
         NextMeasurement,
         rank_measurements,
     )
-    from .noise_covariance import (
-        NoiseCovariance,
-        SpreadFit,
-        compute_noise_covariance,
-        fit_spread,
-        sampling_covariance,
+    from .noise_power import (
+        NoisePower,
+        compute_difference_power,
+        compute_noise_power,
     )
     from .photon_transfer import (
         PhotonTransfer,
@@ -44,6 +42,10 @@ if TYPE_CHECKING:
         fit_spectrum,
         geometry_factor,
     )
+    from .spread_fit import (
+        SpreadFit,
+        fit_spread,
+    )
     from .validate import (
         Validation,
         ValidationRow,
@@ -53,26 +55,26 @@ if TYPE_CHECKING:
 _LAZY = {
     "FrameSums": "frame_sums",
     "NextMeasurement": "next_measurement",
-    "NoiseCovariance": "noise_covariance",
+    "NoisePower": "noise_power",
     "PRIORS": "priors",
     "PhotonTransfer": "photon_transfer",
     "Prior": "priors",
     "SeriesPoint": "flat_levels",
     "SpectralFit": "spectral_fit",
-    "SpreadFit": "noise_covariance",
+    "SpreadFit": "spread_fit",
     "Validation": "validate",
     "ValidationRow": "validate",
     "calibrate_twin": "calibrate",
     "calibration_answer": "calibrate",
-    "compute_noise_covariance": "noise_covariance",
+    "compute_difference_power": "noise_power",
+    "compute_noise_power": "noise_power",
     "compute_photon_transfer": "photon_transfer",
     "effective_frames": "frame_sums",
     "fit_spectrum": "spectral_fit",
-    "fit_spread": "noise_covariance",
+    "fit_spread": "spread_fit",
     "geometry_factor": "spectral_fit",
     "merge_frame_sums": "frame_sums",
     "rank_measurements": "next_measurement",
-    "sampling_covariance": "noise_covariance",
     "sum_frames": "frame_sums",
     "validate_twin": "validate",
 }
@@ -81,7 +83,7 @@ __all__ = [
     "PRIORS",
     "FrameSums",
     "NextMeasurement",
-    "NoiseCovariance",
+    "NoisePower",
     "PhotonTransfer",
     "Prior",
     "SeriesPoint",
@@ -91,7 +93,8 @@ __all__ = [
     "ValidationRow",
     "calibrate_twin",
     "calibration_answer",
-    "compute_noise_covariance",
+    "compute_difference_power",
+    "compute_noise_power",
     "compute_photon_transfer",
     "effective_frames",
     "fit_spectrum",
@@ -99,7 +102,6 @@ __all__ = [
     "geometry_factor",
     "merge_frame_sums",
     "rank_measurements",
-    "sampling_covariance",
     "sum_frames",
     "validate_twin",
 ]

@@ -12,7 +12,7 @@ from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
-from ..generator.twin import BAD_PIXEL_CODES, Estimate, Twin
+from ..generator.twin import BAD_PIXEL_CODES, Estimate, SpreadEstimate, Twin
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
     DEFAULT_MODEL,
@@ -213,6 +213,20 @@ def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
     }
 
 
+def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
+    """The optical spread as the answer has it: family, model, and each parameter with its interval."""
+    value = spread.value
+    return {
+        "family": spread.family,
+        "model": value.model,
+        **{
+            name: (spread.intervals[name].as_dict() if name in spread.intervals else getattr(value, name))
+            for name in ("sigma_px", "aspect", "tail_share", "tail_px")
+        },
+        "variance_share": value.variance_share,
+    }
+
+
 def calibration_answer(twin: Twin) -> dict[str, Any]:
     """The answer of `raytwin calibrate --json`."""
 
@@ -228,13 +242,17 @@ def calibration_answer(twin: Twin) -> dict[str, Any]:
             draws = np.exp(spectral.column("log_output"))
             low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
             flux = Estimate(value=float(middle), low=float(low), high=float(high))
+    if twin.noise.spread.gaussian_px is None:
+        warnings.append(
+            "psf_sigma_px is null: most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`"
+        )
     if filtration is None:
         warnings.append("inherent_filtration_mm_Al is null: the twin has no spectral part")
     if flux is None:
         warnings.append("flux_scale is null: it needs kV and tube load")
     return {
-        "psf_sigma_px": plain(twin.noise.psf_sigma_px),
-        "psf_model": twin.noise.psf_model,
+        "psf_sigma_px": plain(twin.noise.spread.gaussian_px),
+        "spread": spread_answer(twin.noise.spread),
         "read_noise_DN": plain(twin.noise.read_noise_DN),
         "dark_DN": plain(twin.dark_DN),
         "inherent_filtration_mm_Al": plain(filtration),

@@ -45,6 +45,23 @@ class DarkFrames:
         """The dark frame (row, column) of a series, DN: of its own session where that has darks; 0 where it is taken off."""
         return np.zeros(item.shape) if "offset" in item.corrected else self.at(item.session, item.exposure_ms)
 
+    def key_of(self, item: Series) -> tuple[int, float | None] | None:
+        """Session and exposure of the dark frame that `of` takes or grows from; None where it is taken off already."""
+        if "offset" in item.corrected or not self.sums:
+            return None
+        sessions = sorted({key[0] for key in self.by_exposure}, key=lambda one: (abs(one - item.session), one))
+        exposures = [key[1] for key in self.by_exposure if key[0] == sessions[0]]
+        known = [exposure for exposure in exposures if exposure is not None]
+        if item.exposure_ms in exposures or item.exposure_ms is None or not known:
+            return (sessions[0], item.exposure_ms if item.exposure_ms in exposures else exposures[0])
+        wanted = item.exposure_ms
+        return (sessions[0], min(known, key=lambda exposure: abs(exposure - wanted)))
+
+    def exposures_of(self, item: Series) -> int:
+        """How many exposures the dark frame of a series is the mean of; 0 where it is taken off already."""
+        key = self.key_of(item)
+        return sum(total.frames * one.averaged for one, total in self.sums if (one.session, one.exposure_ms) == key)
+
     def at(self, session: int, exposure_ms: float | None) -> NDArray[np.float64]:
         """The dark frame (row, column) of an exposure time, DN: measured, or grown from the nearest that was."""
         sessions = sorted({key[0] for key in self.by_exposure}, key=lambda one: (abs(one - session), one))

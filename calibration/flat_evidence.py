@@ -12,7 +12,10 @@ from ..acquisition.setting import text_from_filters
 from .dark_frames import DarkFrames
 from .flat_levels import SeriesPoint, load_mAs_of
 from .noise_of_flats import FlatNoise
+from .noise_power import correlation_of_quanta
 from .repeated_frames import beam_of
+
+_POOR_FIT = 2.0  # chi-square a degree of freedom: five standard deviations for 50 degrees
 
 
 def flat_evidence(
@@ -54,10 +57,11 @@ def flat_evidence(
             "signal departs from a line in tube load or exposure by up to"
             f" {linearity['largest_departure_percent']:.2g} %"
         )
-    if fit.degrees > 0 and fit.chi_square / fit.degrees > 2.0:
+    misfit = fit.chi_square / max(fit.degrees, 1.0)
+    if misfit > _POOR_FIT:
         warnings.append(
-            f"the noise covariances do not look like a Gaussian spread (chi-square {fit.chi_square / fit.degrees:.1f}"
-            " per degree of freedom); gains are sums of covariances, and the images generated from this twin have a Gaussian spread"
+            f"no kernel family describes the noise power (chi-square {misfit:.1f} per degree of freedom of the best, {fit.family});"
+            " the intervals are widened by the misfit"
         )
     dark_levels = [
         {
@@ -69,19 +73,14 @@ def flat_evidence(
         }
         for item, total in darks.sums
     ]
-    neighbour = [c for c, g in zip(noise.covariances, noise.groups, strict=True) if g < 0]
-    dark_correlation = None
-    if neighbour:
-        centre = neighbour[0].radius
-        zero = sum(c.covariance_DN2[centre, centre] for c in neighbour)
-        dark_correlation = {
-            "row_direction": float(sum(c.covariance_DN2[centre + 1, centre] for c in neighbour) / zero)
-            if zero
-            else 0.0,
-            "column_direction": float(sum(c.covariance_DN2[centre, centre + 1] for c in neighbour) / zero)
-            if zero
-            else 0.0,
-        }
+    sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
+    in_use = [source for source in sources if source.in_fit]
+    white_DN2 = fit.read_variance_DN2 - fit.row_variance_DN2 - fit.column_variance_DN2
+    correlation = correlation_of_quanta(
+        [source.power for source in in_use if source.group >= 0],
+        [power for source, power in zip(in_use, fit.expected_DN2, strict=True) if source.group >= 0],
+        white_DN2=white_DN2,
+    )
     evidence = {
         "stack_over_pair_variance": ratio,
         "drift_percent_per_series": {p.series: p.drift_percent for p in used},
@@ -89,18 +88,30 @@ def flat_evidence(
         "repeated_settings": repeats,
         "linearity": linearity,
         "dark": dark_levels,
-        "dark_neighbour_correlation": dark_correlation,
+        "line_noise_DN": {
+            "rows": math.sqrt(fit.row_variance_DN2),
+            "columns": math.sqrt(fit.column_variance_DN2),
+        },
+        "noise_correlation": correlation,
         "spread_fit": {
-            "model": fit.model,
-            "chi_square_per_degree": fit.chi_square / max(fit.degrees, 1),
+            "family": fit.family,
+            "chi_square_per_degree": misfit,
             "degrees": fit.degrees,
-            "other_model_chi_square_excess": fit.chi_square_other - fit.chi_square,
-            "other_model_sigma_px": fit.sigma_other_px,
+            "criteria": fit.criteria,
             "white_fraction": [float(value) for value in fit.white_fraction],
+            "gain_by_extrapolation_over_fit": _finite_pair(fit.other_route),
+            "slow_changes": [
+                {"variance_at_lowest_frequency_DN2": float(value)} for value in fit.excess_DN2 if value > 0
+            ],
         },
         "photon_transfer": [point.as_dict() for point in points],
     }
     return evidence, warnings
+
+
+def _finite_pair(route: tuple[float, float]) -> dict[str, float] | None:
+    value, sd = route
+    return {"value": value, "low": value - 1.959964 * sd, "high": value + 1.959964 * sd} if math.isfinite(sd) else None
 
 
 def session_evidence(

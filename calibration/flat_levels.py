@@ -14,9 +14,8 @@ from ..generator.twin import Estimate, Level, estimate_from_sd
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames, shrinkage
 from .frame_sums import effective_frames
-from .noise_covariance import NoiseCovariance
 from .noise_of_flats import FlatNoise
-from .repeated_frames import RepeatedFrames, beam_of
+from .repeated_frames import beam_of
 
 _SERIES_REPRODUCIBILITY = 1e-3  # of the level: what series of one setting are weighted by, beside their noise
 
@@ -78,7 +77,7 @@ def series_points(
     for item, total, reason in sums:
         signal = total.mean_DN - darks.of(item)
         index = order.get(item.name)
-        covariance = noise.covariances[index] if index is not None else None
+        source = noise.of_stacks[index] if index is not None else None
         means = total.frame_mean_DN
         drift = 0.0
         typical = float(np.mean(signal[good]))
@@ -86,7 +85,7 @@ def series_points(
             position = np.linspace(-0.5, 0.5, total.frames)
             drift = 100.0 * float(np.polyfit(position, means, 1)[0]) / typical
         why = reason
-        if index is not None and not noise.in_fit[index]:
+        if source is not None and not source.in_fit:
             why = "bends away from the photon-transfer line" if item.name in noise.bent else "no signal above dark"
         points.append(
             SeriesPoint(
@@ -106,38 +105,31 @@ def series_points(
                 used=not why,
                 masked=why,
                 drift_percent=drift,
-                common_mode_percent=100.0 * math.sqrt(covariance.common_mode) if covariance else 0.0,
+                common_mode_percent=100.0 * math.sqrt(source.power.common_mode) if source else 0.0,
             )
         )
     return tuple(points)
 
 
-def with_noise_of_others(
-    points: Sequence[SeriesPoint],
-    others: Sequence[RepeatedFrames],
-    covariances: Sequence[NoiseCovariance],
-    read_DN2: float,
-) -> tuple[SeriesPoint, ...]:
-    """Single-frame flats with the variance of one exposure, and the rms output noise, that other series of their beam show."""
+def with_noise_of_others(points: Sequence[SeriesPoint], noise: FlatNoise) -> tuple[SeriesPoint, ...]:
+    """Single-frame flats with the variance of one exposure and the output noise that others of their beam show."""
     result = []
     for point in points:
         beam = (point.kV, tuple(sorted(str(layer) for layer in point.filters)))
-        mine = [item for other, item in zip(others, covariances, strict=True) if other.beam == beam]
-        if point.used and point.frames < 2 and mine:
-            weights = [item.samples for item in mine]
-            slopes = [(item.covariance_DN2[item.radius, item.radius] - read_DN2) / item.signal_DN for item in mine]
-            variance = float(np.average(slopes, weights=weights)) * point.mean_signal_DN + read_DN2
-            common = float(np.average([item.common_mode for item in mine], weights=weights))
-            result.append(
-                replace(
-                    point,
-                    pair_variance_DN2=variance,
-                    stack_variance_DN2=variance,
-                    common_mode_percent=100.0 * math.sqrt(common),
-                )
-            )
-        else:
+        known = noise.slope_of_single(beam) if point.used and point.frames < 2 else None
+        if known is None:
             result.append(point)
+            continue
+        slope_DN, common = known
+        variance = slope_DN * point.mean_signal_DN + noise.fit.read_variance_DN2
+        result.append(
+            replace(
+                point,
+                pair_variance_DN2=variance,
+                stack_variance_DN2=variance,
+                common_mode_percent=100.0 * math.sqrt(common),
+            )
+        )
     return tuple(result)
 
 

@@ -1,8 +1,9 @@
-"""Noise of a session's darks and flats: covariances of neighbours, and one spread and gain through all of them."""
+"""Noise of a session's darks and flats: noise power of each series, and one spread and gain through all of them."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +12,47 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
-from .noise_covariance import NoiseCovariance, SpreadFit, compute_noise_covariance, fit_spread
-from .repeated_frames import Beam, RepeatedFrames, beam_of, bounded_read_variance, most_read_variance, widened
+from .frame_sums import effective_frames
+from .noise_power import NoisePower, compute_difference_power, compute_noise_power
+from .repeated_frames import Beam, RepeatedFrames, beam_of, most_read_variance, widened
+from .spread_fit import SpreadFit, fit_spread
 
-COVARIANCE_FRAMES = 400
+POWER_FRAMES = 400
 PIECE_BYTES = 8 * 2**20
-_COVARIANCE_SAMPLES = 6e7  # pixels x frames a series; the gain is then known to about 0.05 %
+_POWER_SAMPLES = 3e7  # pixels x frames a series; the gain is then known to about 0.1 %
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlatPair:
+    """Two single (averaged) flats of one beam, in different series, whose normalised difference holds noise.
+
+    Fields: beam; first, second: series with their sums; share: of an independent difference that it counts as, less than 1
+    where a flat stands in two of them.
+    """
+
+    beam: Beam
+    first: tuple[Series, KeptSums]
+    second: tuple[Series, KeptSums]
+    share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseSource:
+    """Noise power of one source, the beam's place in the fit's groups (-1: darks), and whether it is in use."""
+
+    power: NoisePower
+    group: int
+    in_fit: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlatNoise:
     """Spread and gain of the beams, and what they were fitted to.
 
-    Fields: fit, its groups the beams in use in their order; beams, in order of voltage; flats, with their sums: those that calibrate;
-    group_of_flat, their beams' places in `beams`; flat_in_fit: whether each is in use; stacks: those of them with noise of their own;
-    covariances of stacks, other series and darks, one after the other; groups of these, -1 for darks; in_fit: which of them are in
-    use; bent: series left out because their variance bends away from the line; warnings.
+    Fields: fit, its groups the beams in use in their order; beams, in order of voltage; flats, with their sums: those that
+    calibrate; group_of_flat, their beams' places in `beams`; flat_in_fit: whether each is in use; stacks: those of them with
+    noise of their own; of_stacks, of_pairs, of_others, of_darks: sources of noise, in the order of stacks, pairs of single
+    flats, other series and repeated darks; bent: series left out because their variance bends away from the line; warnings.
     """
 
     fit: SpreadFit
@@ -35,17 +61,18 @@ class FlatNoise:
     group_of_flat: tuple[int, ...]
     flat_in_fit: tuple[bool, ...]
     stacks: tuple[tuple[Series, KeptSums], ...]
-    covariances: tuple[NoiseCovariance, ...]
-    groups: tuple[int, ...]
-    in_fit: tuple[bool, ...]
+    of_stacks: tuple[NoiseSource, ...]
+    of_pairs: tuple[NoiseSource, ...]
+    of_others: tuple[NoiseSource, ...]
+    of_darks: tuple[NoiseSource, ...]
     bent: frozenset[str]
     warnings: tuple[str, ...]
 
     @property
     def place_in_fit(self) -> dict[int, int]:
         """Where the fit has a group that is in use, by group."""
-        present = sorted({group for group, keep in zip(self.groups, self.in_fit, strict=True) if keep and group >= 0})
-        return {group: place for place, group in enumerate(present)}
+        lit = (*self.of_stacks, *self.of_pairs, *self.of_others)
+        return {group: place for place, group in enumerate(sorted({item.group for item in lit if item.in_fit}))}
 
     @property
     def flats_in_fit(self) -> list[tuple[Series, KeptSums, int]]:
@@ -54,64 +81,58 @@ class FlatNoise:
         every = zip(self.flats, self.group_of_flat, self.flat_in_fit, strict=True)
         return [(item, total, places[group]) for (item, total), group, keep in every if keep]
 
-    @property
-    def covariances_of_others(self) -> tuple[NoiseCovariance, ...]:
-        """Of series that are no flats in use, in their order."""
-        return self.covariances[len(self.stacks) : sum(group >= 0 for group in self.groups)]
+    def slope_of_single(self, beam: Beam) -> tuple[float, float] | None:
+        """Photon-transfer slope (DN) and common factor's variance of a beam without repeated flats; None where it has none."""
+        group = self.beams.index(beam)
+        mine = [item for item in (*self.of_pairs, *self.of_others) if item.group == group and item.in_fit]
+        if not mine or group not in self.place_in_fit:
+            return None
+        common = float(np.average([item.power.common_mode for item in mine], weights=[i.power.samples for i in mine]))
+        return float(self.fit.slope_DN[self.place_in_fit[group]]), common
 
 
 def fit_flat_noise(
     acquisition: AcquisitionFile,
     flats: Sequence[tuple[Series, KeptSums]],
+    pairs: Sequence[FlatPair],
     others: Sequence[RepeatedFrames],
     darks: DarkFrames,
     good: NDArray[np.bool_],
     *,
-    radius: int,
     estimator: str,
     tell: Callable[[str], None],
 ) -> FlatNoise:
-    """Spread and gain through flats, darks, and other series that stand for single-frame flats.
+    """Spread and gain through flats, darks, and what stands for the noise of single-frame flats.
 
     Args:
         acquisition: of the series, for messages.
         flats: with their sums: those that calibrate.
+        pairs: of single flats of one beam.
         others: what was repeated at the beams of single-frame flats.
         darks: dark frames.
         good: pixels in use (row, column).
-        radius: largest lag, px; a wider spread takes more.
         estimator: as in `compute_photon_transfer`.
         tell: called with the name of the stage.
 
     Raises:
         InputError: no flat has signal above dark.
     """
-    tell("noise covariances")
+    tell("noise power")
     beams = sorted({beam_of(item) for item, _ in flats}, key=lambda key: (key[0] is None, key[0] or 0.0, str(key[1])))
     group_of = {beam: index for index, beam in enumerate(beams)}
     stacks = [(item, total) for item, total in flats if total.pairs > 0]
-    groups = [
-        *(group_of[beam_of(item)] for item, _ in stacks),
-        *(group_of[other.beam] for other in others),
-        *(-1 for _ in darks.repeated),
-    ]
 
-    def collect(reach: int) -> list[NoiseCovariance]:
-        def of_series(item: Series, total: KeptSums, mask: NDArray[np.bool_]) -> NoiseCovariance:
-            signal = total.mean_DN - darks.of(item)
-            return _covariance(item, total, signal, good=mask, radius=reach, estimator=estimator)
+    def of_series(item: Series, total: KeptSums, mask: NDArray[np.bool_]) -> NoisePower:
+        return _power(item, total, total.mean_DN - darks.of(item), good=mask, estimator=estimator)
 
-        def of_dark(item: Series, total: KeptSums) -> NoiseCovariance:
-            return _covariance(item, total, np.zeros(good.shape), good=good, radius=reach, estimator=estimator)
-
-        return [
-            *(of_series(item, total, good) for item, total in stacks),
-            *(other.covariance(of_series) for other in others),
-            *(of_dark(item, total) for item, total in darks.repeated),
-        ]
-
-    covariances = collect(radius)
-    in_fit = [item.signal_DN > 0 or group < 0 for item, group in zip(covariances, groups, strict=True)]
+    found = [(of_series(item, total, good), group_of[beam_of(item)]) for item, total in stacks]
+    found += [(_pair_power(pair, darks, good), group_of[pair.beam]) for pair in pairs]
+    found += [(other.power(of_series), group_of[other.beam]) for other in others]
+    dark_signal = np.zeros(good.shape)
+    found += [(_power(item, total, dark_signal, good=good, estimator=estimator), -1) for item, total in darks.repeated]
+    powers = [power for power, _ in found]
+    groups = [group for _, group in found]
+    in_fit = [item.signal_DN > 0 or group < 0 for item, group in found]
     warnings = [
         f"left out of the fit: {item.name} (no signal above dark)"
         for (item, _), keep in zip(stacks, in_fit, strict=False)
@@ -125,30 +146,38 @@ def fit_flat_noise(
             remedy="check that the series' kinds are not swapped",
         )
     tell("spread and gain")
-    fit = _fit(covariances, groups, in_fit, radius)
-    most = (min(good.shape) - 1) // 4
-    wider = min(math.ceil(4 * math.sqrt(2) * fit.sigma_px), most, *(item.reach for item in others))
-    if wider > radius:
-        radius = wider
-        covariances = collect(radius)
-        fit = _fit(covariances, groups, in_fit, radius)
+    # darks that are single means bound the read noise by their difference
+    means = [(total.mean_DN, total.frames * item.averaged) for item, total in darks.sums]
+    most_read = most_read_variance(means, good) if darks.effective == 0 else None
+    fit = _fit(powers, groups, in_fit, most_read)
     # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
     bent: list[str] = []
-    of_others = range(len(stacks), len(stacks) + len(others))
     while True:
-        worst = _bent(covariances, groups, [keep and i not in of_others for i, keep in enumerate(in_fit)], fit)
+        expected = iter(fit.expected_DN2)
+        variances = [
+            item.variance_DN2(next(expected)) if keep else 0.0 for item, keep in zip(powers, in_fit, strict=True)
+        ]
+        worst = _bent(powers, variances, groups, [keep and i < len(stacks) for i, keep in enumerate(in_fit)], fit)
         if worst is None:
             break
         in_fit[worst] = False
         bent.append(stacks[worst][0].name)
-        fit = _fit(covariances, groups, in_fit, radius)
+        fit = _fit(powers, groups, in_fit, most_read)
     warnings += [
         f"left out of the fit: {name} (its variance bends away from the photon-transfer line)" for name in bent
     ]
     if others:
-        fit = _with_others(fit, groups, in_fit, {group_of[item.beam]: item.where for item in others}, darks, good)
+        present = sorted({group for group, keep in zip(groups, in_fit, strict=True) if keep and group >= 0})
+        wheres = {group_of[item.beam]: item.where for item in others}
+        fit = widened(fit, {present.index(group): where for group, where in wheres.items() if group in present})
     left_out = {item.name for (item, _), keep in zip(stacks, in_fit, strict=False) if not keep}
     fitted = {group for group, keep in zip(groups, in_fit, strict=True) if keep}
+    sources = [
+        NoiseSource(power=power, group=group, in_fit=keep)
+        for power, group, keep in zip(powers, groups, in_fit, strict=True)
+    ]
+    ends = np.cumsum([0, len(stacks), len(pairs), len(others), len(darks.repeated)])
+    parts = [tuple(sources[start:end]) for start, end in pairwise(ends)]
     return FlatNoise(
         fit=fit,
         beams=tuple(beams),
@@ -156,25 +185,52 @@ def fit_flat_noise(
         group_of_flat=tuple(group_of[beam_of(item)] for item, _ in flats),
         flat_in_fit=tuple(item.name not in left_out and group_of[beam_of(item)] in fitted for item, _ in flats),
         stacks=tuple(stacks),
-        covariances=tuple(covariances),
-        groups=tuple(groups),
-        in_fit=tuple(in_fit),
+        of_stacks=parts[0],
+        of_pairs=parts[1],
+        of_others=parts[2],
+        of_darks=parts[3],
         bent=frozenset(bent),
         warnings=tuple(warnings),
     )
 
 
-def _covariance(
+def pairs_of_singles(flats: Sequence[tuple[Series, KeptSums]]) -> tuple[FlatPair, ...]:
+    """Successive single flats of each beam as pairs, in the order in which they were taken."""
+    by_beam: dict[Beam, list[tuple[Series, KeptSums]]] = {}
+    for item, total in sorted(flats, key=lambda flat: (flat[0].session, flat[0].index)):
+        by_beam.setdefault(beam_of(item), []).append((item, total))
+    return tuple(
+        FlatPair(beam=beam, first=first, second=second, share=effective_frames(len(members)) / (len(members) - 1))
+        for beam, members in by_beam.items()
+        for first, second in pairwise(members)
+    )
+
+
+def _pair_power(pair: FlatPair, darks: DarkFrames, good: NDArray[np.bool_]) -> NoisePower:
+    """Noise power of one exposure from a pair of single flats, DN^2."""
+    (first, first_sum), (second, second_sum) = pair.first, pair.second
+    counts = (darks.exposures_of(first), darks.exposures_of(second))
+    found = compute_difference_power(
+        first_sum.mean_DN - darks.of(first),
+        second_sum.mean_DN - darks.of(second),
+        exposures=(first_sum.frames * first.averaged, second_sum.frames * second.averaged),
+        dark_exposures=counts,
+        same_dark=darks.key_of(first) == darks.key_of(second),
+        good=good,
+    )
+    return replace(found, modes=pair.share * found.modes)
+
+
+def _power(
     item: Series,
     total: KeptSums,
     signal: NDArray[np.float64],
     *,
     good: NDArray[np.bool_],
-    radius: int,
     estimator: str,
-) -> NoiseCovariance:
-    """Neighbour covariances of a series in one exposure, DN^2."""
-    most = int(min(total.frames, COVARIANCE_FRAMES, max(2, _COVARIANCE_SAMPLES // good.size)))
+) -> NoisePower:
+    """Noise power of a series in one exposure, DN^2."""
+    most = int(min(total.frames, POWER_FRAMES, max(2, _POWER_SAMPLES // good.size)))
 
     def pieces() -> Iterator[NDArray[np.generic]]:
         left = most
@@ -184,37 +240,38 @@ def _covariance(
             if left <= 0:
                 return
 
-    result = compute_noise_covariance(
-        pieces(),
-        signal_DN=signal,
-        good=good,
-        radius=radius,
-        about=(total.mean_DN, total.frames) if estimator == "stack" else None,
-    )
-    return replace(result, covariance_DN2=result.covariance_DN2 * item.averaged)
+    about = (total.mean_DN, total.frames) if estimator == "stack" else None
+    found = compute_noise_power(pieces(), signal_DN=signal, good=good, about=about)
+    return found.times(float(item.averaged))
 
 
 def _fit(
-    covariances: Sequence[NoiseCovariance], groups: Sequence[int], usable: Sequence[bool], radius: int
+    powers: Sequence[NoisePower], groups: Sequence[int], usable: Sequence[bool], most_read_DN2: float | None
 ) -> SpreadFit:
-    """The fit to the usable covariances; groups of them numbered anew."""
+    """The fit to the usable powers; groups of them numbered anew."""
     kept = [index for index, keep in enumerate(usable) if keep]
     present = sorted({groups[index] for index in kept if groups[index] >= 0})
     renumbered = {old: new for new, old in enumerate(present)} | {-1: -1}
     return fit_spread(
-        [covariances[index] for index in kept], group=[renumbered[groups[index]] for index in kept], radius=radius
+        [powers[index] for index in kept],
+        group=[renumbered[groups[index]] for index in kept],
+        most_read_DN2=most_read_DN2,
     )
 
 
 def _bent(
-    covariances: Sequence[NoiseCovariance], groups: Sequence[int], usable: Sequence[bool], fit: SpreadFit
+    powers: Sequence[NoisePower],
+    variances_DN2: Sequence[float],
+    groups: Sequence[int],
+    usable: Sequence[bool],
+    fit: SpreadFit,
 ) -> int | None:
     """Index of the brightest flat of a group if its variance lies 6 sigma and 5 % below the line through the others."""
     present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
     # the bent flat is in the fit and moves its read variance, so that of the darks is taken where there are any
-    darks = [c for c, group in zip(covariances, groups, strict=True) if group < 0]
+    darks = [i for i, group in enumerate(groups) if group < 0]
     read = (
-        float(np.average([c.covariance_DN2[c.radius, c.radius] for c in darks], weights=[c.samples for c in darks]))
+        float(np.average([variances_DN2[i] for i in darks], weights=[powers[i].samples for i in darks]))
         if darks
         else fit.read_variance_DN2
     )
@@ -222,45 +279,19 @@ def _bent(
         members = [i for i, g in enumerate(groups) if g == group and usable[i]]
         if len(members) < 3:
             continue
-        brightest = max(members, key=lambda i: covariances[i].signal_DN)
+        brightest = max(members, key=lambda i: powers[i].signal_DN)
         others = [i for i in members if i != brightest]
-
-        def zero_lag(i: int) -> float:
-            centre = covariances[i].radius
-            return float(covariances[i].covariance_DN2[centre, centre]) - read
-
-        signal = np.array([covariances[i].signal_DN for i in others])
-        variance = np.array([zero_lag(i) for i in others])
-        sd = np.array([math.sqrt(2.0 / covariances[i].samples) * (zero_lag(i) + read) for i in others])
+        signal = np.array([powers[i].signal_DN for i in others])
+        variance = np.array([variances_DN2[i] - read for i in others])
+        sd = np.array([math.sqrt(2.0 / powers[i].samples) * variances_DN2[i] for i in others])
         weight = signal**2 / sd**2
         ratio = variance / signal
         slope = float(np.sum(weight * ratio) / np.sum(weight))
         scatter = float(np.sum(weight * (ratio - slope) ** 2)) / max(len(others) - 1, 1)
         slope_sd = math.sqrt(max(scatter, 1.0) / float(np.sum(weight)))
-        item = covariances[brightest]
-        measured = zero_lag(brightest) / item.signal_DN
-        measured_sd = math.sqrt(2.0 / item.samples) * (measured + read / item.signal_DN)
+        item = powers[brightest]
+        measured = (variances_DN2[brightest] - read) / item.signal_DN
+        measured_sd = math.sqrt(2.0 / item.samples) * variances_DN2[brightest] / item.signal_DN
         if measured - slope < -6.0 * math.hypot(slope_sd, measured_sd) and measured < 0.95 * slope:
             return brightest
     return None
-
-
-def _with_others(
-    fit: SpreadFit,
-    groups: Sequence[int],
-    usable: Sequence[bool],
-    wheres: Mapping[int, str],
-    darks: DarkFrames,
-    good: NDArray[np.bool_],
-) -> SpreadFit:
-    """The fit with what the noise of other series leaves open; a read variance without darks' noise is kept between 0 and
-    what the darks' difference leaves."""
-    present = sorted({group for group, keep in zip(groups, usable, strict=True) if keep and group >= 0})
-    fit = widened(fit, {present.index(group): where for group, where in wheres.items() if group in present})
-    if darks.effective > 0:
-        return fit
-    most = most_read_variance([(total.mean_DN, total.frames * item.averaged) for item, total in darks.sums], good)
-    if most is None:
-        return fit
-    value, sd = bounded_read_variance(fit.read_variance_DN2, fit.read_sd_DN2, most)
-    return replace(fit, read_variance_DN2=value, read_sd_DN2=sd)

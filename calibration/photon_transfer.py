@@ -1,12 +1,12 @@
 """Photon transfer of a session: darks and flats -> dark, read noise, optical spread, gain per kV and filter, maps.
 
-Two passes over the frames: one for the per-pixel sums, one over at most `COVARIANCE_FRAMES` frames a series for the
-neighbour covariances, once the bad pixels are known.
+Three passes over the frames: one for copies and scenes, one for the per-pixel sums, one over at most `POWER_FRAMES` frames a
+series for the noise power, once the bad pixels are known.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
-from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, estimate_from_sd
+from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
 from ._kept_sums import KeptSums, SumsKeeper
 from .bad_pixels import cluster_evidence, find_bad_pixels
 from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_map, sum_darks
 from .flat_evidence import flat_evidence, session_evidence
 from .flat_levels import SeriesPoint, gain_map_of, levels_of, series_points, with_noise_of_others
+from .frame_checks import repeated_frame_indices, same_scene
 from .frame_sums import sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
-from .noise_covariance import SpreadFit
-from .noise_of_flats import PIECE_BYTES, FlatNoise, fit_flat_noise
+from .noise_of_flats import PIECE_BYTES, FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
 from .repeated_frames import (
     Beam,
     RepeatedFrames,
@@ -33,6 +33,7 @@ from .repeated_frames import (
     series_of_beams,
     warning_of,
 )
+from .spread_fit import SpreadFit
 
 ESTIMATORS = ("pairs", "stack")
 _SINGLE = "a single frame has no noise"
@@ -59,7 +60,6 @@ class PhotonTransfer:
 def compute_photon_transfer(
     acquisition: AcquisitionFile,
     *,
-    radius: int = 5,
     estimator: str = "pairs",
     repeated: Sequence[Series] | None = None,
     progress: Progress | None = None,
@@ -71,7 +71,6 @@ def compute_photon_transfer(
 
     Args:
         acquisition: one session, or several as one (`merge_sessions`): each then has its own darks.
-        radius: largest lag of the noise covariances, px.
         estimator: where variances come from: `pairs` of successive frames, which slow drift leaves alone, or the `stack`
             about its mean, which lag lowers less. The evidence holds both.
         repeated: flats and objects that the noise of beams with single-frame flats may be read from; None: those of the
@@ -84,7 +83,7 @@ def compute_photon_transfer(
     if estimator not in ESTIMATORS:
         raise InputError("estimator", received=estimator, expected="one of " + ", ".join(ESTIMATORS))
     tell = progress or (lambda stage: None)
-    session = _calibrating_series(acquisition)
+    session = _calibrating_series(acquisition, tell)
     with SumsKeeper() as keeper:
 
         def sums_of(item: Series) -> KeptSums:
@@ -95,19 +94,9 @@ def compute_photon_transfer(
         if session.offset_done:
             darks = DarkFrames.taken_off(session.shape, darks if session.darks else None)
         tell("flats")
-        radius = max(1, min(radius, (min(session.shape) - 1) // 4))
-        flats = _sum_flats(
-            session, darks, sums_of, radius=radius, repeated=acquisition.series if repeated is None else repeated
-        )
+        flats = _sum_flats(session, darks, sums_of, repeated=acquisition.series if repeated is None else repeated)
         noise = fit_flat_noise(
-            acquisition,
-            flats.in_use,
-            flats.others,
-            darks,
-            flats.good,
-            radius=radius,
-            estimator=estimator,
-            tell=tell,
+            acquisition, flats.in_use, flats.pairs, flats.others, darks, flats.good, estimator=estimator, tell=tell
         )
         tell("maps")
         return _assembled(session, darks, flats, noise, estimator)
@@ -115,16 +104,34 @@ def compute_photon_transfer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Session:
-    """Series that calibrate: flats and darks of one shape (row, column); offset_done: darks are taken off the flats."""
+    """Series that calibrate: flats and darks of one shape (row, column), copies of frames left out.
+
+    Fields: offset_done: darks are subtracted from the flats, or there is no offset; warnings.
+    """
 
     acquisition: AcquisitionFile
     flats: list[Series]
     darks: list[Series]
     shape: tuple[int, int]
     offset_done: bool
+    warnings: list[str]
 
 
-def _calibrating_series(acquisition: AcquisitionFile) -> _Session:
+def _without_copies(series: Sequence[Series], warnings: list[str]) -> list[Series]:
+    """The series with each exposure once: frames that a grabber repeated are left out."""
+    result = []
+    for item in series:
+        copies = repeated_frame_indices(item.iter_frames(maximum_bytes=PIECE_BYTES)) if item.n_frames > 1 else ()
+        if copies:
+            warnings.append(
+                f"{item.name}: {len(copies)} of {item.n_frames} frames are copies of another frame (first: frame {copies[0]});"
+                " each exposure is counted once"
+            )
+        result.append(item.without_frames(copies) if copies else item)
+    return result
+
+
+def _calibrating_series(acquisition: AcquisitionFile, tell: Progress) -> _Session:
     """Series that may calibrate: not held back for evaluation, not logged or gain-corrected.
 
     Raises:
@@ -145,13 +152,15 @@ def _calibrating_series(acquisition: AcquisitionFile) -> _Session:
             received="no flat series that may calibrate",
             expected="at least one series of kind flat, raw or offset-corrected, whose role is not evaluation",
         )
-    offset_done = all("offset" in item.corrected for item in flats)
+    counting = bool(acquisition.instrument.counting)
+    offset_done = all("offset" in item.corrected for item in flats) or (counting and not darks)
     if not darks and not offset_done:
         raise InputError(
             of,
             received="flats without a dark series",
             expected="at least one series of kind dark with two or more frames",
-            remedy="measure darks (beam off, same exposure) and add them",
+            remedy="measure darks (beam off, same exposure) and add them; a photon counter without darks needs counting = true"
+            " in its instrument",
         )
     binned = [item.name for item in flats if item.setting is not None and item.setting.binning != 1]
     if binned:
@@ -164,21 +173,37 @@ def _calibrating_series(acquisition: AcquisitionFile) -> _Session:
     shapes = {item.shape for item in [*flats, *darks]}
     if len(shapes) > 1:
         raise InputError(of, received=f"frames of shapes {sorted(shapes)}", expected="darks and flats of one shape")
-    return _Session(acquisition=acquisition, flats=flats, darks=darks, shape=shapes.pop(), offset_done=offset_done)
+    tell("copies of frames")
+    warnings: list[str] = []
+    flats, darks = _without_copies(flats, warnings), _without_copies(darks, warnings)
+    if counting and not darks:
+        warnings.append("no darks: a photon counter has no offset, and the dark level counts as 0")
+        flats = [replace(item, corrected=item.corrected | {"offset"}) for item in flats]
+    return _Session(
+        acquisition=acquisition,
+        flats=flats,
+        darks=darks,
+        shape=shapes.pop(),
+        offset_done=offset_done,
+        warnings=warnings,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Flats:
     """Flats summed.
 
-    Fields: sums: each flat with its sums and why it is left out (empty: it is not); others: what was repeated at the beams of
-    single-frame flats; bad: reason codes of pixels (row, column); saturation_DN: full scale that series reach, by name.
+    Fields: sums: each flat with its sums and why it is left out (empty: it is not); pairs: of single flats of one beam;
+    others: what was repeated at the beams of other single flats; bad: reason codes of pixels (row, column);
+    saturation_DN: full scale that series reach, by name; noted: what else is to be said.
     """
 
     sums: list[tuple[Series, KeptSums, str]]
+    pairs: tuple[FlatPair, ...]
     others: tuple[RepeatedFrames, ...]
     bad: NDArray[np.uint8]
     saturation_DN: dict[str, float]
+    noted: list[str]
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -192,7 +217,7 @@ class _Flats:
 
     def warnings(self) -> list[str]:
         """What is left out, and whether too much of the panel is bad."""
-        found = []
+        found = list(self.noted)
         masked = "; ".join(f"{item.name} ({reason})" for item, _, reason in self.sums if reason)
         if masked:
             found.append("left out of the fit: " + masked)
@@ -202,9 +227,17 @@ class _Flats:
         return found
 
 
-def _sum_flats(
-    session: _Session, darks: DarkFrames, sums_of: SumsOf, *, radius: int, repeated: Sequence[Series]
-) -> _Flats:
+def _scene_change(item: Series, offset_DN: float) -> str:
+    """What differs between the frames of a series beyond noise, drift and flicker; empty: nothing that can be seen."""
+    if item.n_frames < 2:
+        return ""
+    found = same_scene(item.iter_frames(maximum_bytes=PIECE_BYTES), offset_DN=offset_DN)
+    if found.same is not False or found.change is None:
+        return ""
+    return f"its frames do not show one scene: {found.change.value} changes from frame {found.frame}"
+
+
+def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeated: Sequence[Series]) -> _Flats:
     """Sums of the flats, what is wrong with some, bad pixels, and series that stand for the noise of single frames.
 
     Raises:
@@ -225,17 +258,33 @@ def _sum_flats(
         elif reaches(total, top):
             saturation_DN[item.name] = top
             reason = f"within 4 standard deviations of the full scale of {top:g} DN"
+        else:
+            reason = _scene_change(item, float(np.median(darks.of(item))))
         sums.append((item, total, reason))
     # beams of single frames alone: their noise is looked for in what was repeated at the same beam
     single = {beam_of(item) for item, _, reason in sums if reason == _SINGLE}
     single -= {beam_of(item) for item, _, reason in sums if not reason}
-    noise_series = series_of_beams(repeated, sorted(single, key=str), session.shape)
+    lone = [
+        (item, total)
+        for item, total, reason in sums
+        if reason == _SINGLE and beam_of(item) in single and float(np.median(total.mean_DN - darks.of(item))) > 0
+    ]
+    pairs = pairs_of_singles(lone)
+    paired = {pair.beam for pair in pairs}
+    noted: list[str] = []
+    noise_series = []
+    for item in series_of_beams(repeated, sorted(single - paired, key=str), session.shape):
+        change = _scene_change(item, float(np.median(darks.of(item))))
+        if change:
+            noted.append(f"{item.name} is not used for noise: {change}; declare each scene as a series of its own")
+        else:
+            noise_series.append(item)
     judged = [
         (item, total) for item, total, reason in sums if not reason or (reason == _SINGLE and beam_of(item) in single)
     ]
-    if all(reason for *_, reason in sums) and not noise_series:
+    if all(reason for *_, reason in sums) and not noise_series and not pairs:
         raise _no_usable_flat(session.acquisition, sums)
-    bad = find_bad_pixels(darks, judged if noise_series else [pair for pair in judged if pair[1].pairs > 0])
+    bad = find_bad_pixels(darks, judged if noise_series or pairs else [pair for pair in judged if pair[1].pairs > 0])
     good = bad == 0
 
     def usable(total: KeptSums, mask: NDArray[np.bool_]) -> bool:
@@ -248,16 +297,15 @@ def _sum_flats(
         dark_of=darks.of,
         usable=usable,
         good=good,
-        radius=radius,
     )
-    if others:
-        beams = {other.beam for other in others}
+    if others or pairs:
+        beams = {other.beam for other in others} | paired
         sums = [(item, total, _reason_beside(item, total, reason, beams, darks, good)) for item, total, reason in sums]
         lit = {beam_of(item) for item, _, reason in sums if not reason}
         others = tuple(item for item in others if item.beam in lit)
     if all(reason for *_, reason in sums):
         raise _no_usable_flat(session.acquisition, sums)
-    return _Flats(sums=sums, others=others, bad=bad, saturation_DN=saturation_DN)
+    return _Flats(sums=sums, pairs=pairs, others=others, bad=bad, saturation_DN=saturation_DN, noted=noted)
 
 
 def _no_usable_flat(acquisition: AcquisitionFile, sums: Sequence[tuple[Series, KeptSums, str]]) -> InputError:
@@ -286,7 +334,7 @@ def _reason_beside(
 def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatNoise, estimator: str) -> PhotonTransfer:
     """Maps, levels and evidence once spread and gain are known."""
     good, fit = flats.good, noise.fit
-    warnings = [*flats.warnings(), *noise.warnings]
+    warnings = [*session.warnings, *flats.warnings(), *noise.warnings]
     # averaged frames are no whole numbers whatever the ADC does
     of_others = [total for other in flats.others for _, total, _ in other.members]
     counted = [*(total for _, total in (*darks.repeated, *noise.stacks)), *of_others]
@@ -299,8 +347,8 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
     if read_DN2 <= 0:
         warnings.append("read noise not seen above the ADC's rounding; set to 0 with its interval")
     points = series_points(flats.sums, noise, darks, good)
-    if flats.others:
-        points = with_noise_of_others(points, flats.others, noise.covariances_of_others, fit.read_variance_DN2)
+    if flats.others or flats.pairs:
+        points = with_noise_of_others(points, noise)
     read_map, read_relative_sd = read_variance_map(darks, good, fit.read_variance_DN2)
     gain_map, gain_sd = gain_map_of(noise, darks, good, read_map=read_map, estimator=estimator)
     last = max(item.session for item in [*session.flats, *session.darks])
@@ -319,6 +367,14 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
     if flats.others:
         evidence["repeated_frames"] = evidence_of(flats.others, good)
         warnings.append(warning_of(evidence["repeated_frames"]))
+    if flats.pairs:
+        evidence["flat_pairs"] = [
+            {"kV": pair.beam[0], "series": [pair.first[0].name, pair.second[0].name]} for pair in flats.pairs
+        ]
+        warnings.append(
+            f"noise comes from {len(flats.pairs)} pairs of single flats: whatever changed in single pixels between the two of a"
+            " pair counts as noise"
+        )
     sessions, found = session_evidence(session.acquisition, session.flats, noise, darks, good)
     warnings += found
     if sessions:
@@ -338,9 +394,8 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
             bad_pixels=flats.bad,
         ),
         noise=NoiseModel(
-            psf_model=fit.model,
-            psf_sigma_px=estimate_from_sd(fit.sigma_px, fit.sigma_sd_px, lowest=0.0),
-            white_fraction=float(np.clip(np.nanmean(fit.white_fraction), 0.0, None)),
+            spread=spread_estimate(fit),
+            white_fraction=float(np.clip(np.nan_to_num(np.nanmean(fit.white_fraction)), 0.0, None)),
             read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2),
             quantised=quantised,
         ),
@@ -350,6 +405,19 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         fit=fit,
         evidence=evidence,
         warnings=tuple(warnings),
+    )
+
+
+def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
+    """The fitted spread with the 95 % intervals of its parameters."""
+    return SpreadEstimate(
+        value=fit.spread,
+        family=fit.family,
+        intervals={
+            name: estimate_from_sd(getattr(fit.spread, name), sd, lowest=0.0)
+            for name, sd in fit.spread_sd.items()
+            if name == "sigma_px" or sd > 0
+        },
     )
 
 

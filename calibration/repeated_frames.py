@@ -5,7 +5,6 @@ beam: other flats over the whole field, objects beside the object or, where too 
 steps. Behind an object the beam is harder and the gain a few percent higher, which the gain's interval then carries.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,21 +16,16 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import text_from_filters
 from ._kept_sums import KeptSums
 from .frame_sums import effective_frames
-from .noise_covariance import NoiseCovariance, SpreadFit
+from .noise_power import NoisePower, holds_squares
+from .spread_fit import SpreadFit
 
 OPEN, BEHIND = "beside objects", "behind objects"
 LATER_SD = 0.01  # relative, of a gain: what has set in since the flats may have changed the noise
 BEHIND_SD = 0.03  # relative, of a gain whose beam an object has hardened
 _BESIDE_PX = 5  # from a shadow's edge: blur, and a thickness map that lies a little off
 _ENOUGH_SAMPLES = 2e4  # frames x pixels: a variance is then known to 1 %
-_WINDOWS = 4.0  # windows of lags that an area must hold to be used
 _FLAT_ENOUGH = 0.03  # of the signal, over `_STEP_PX` pixels
 _STEP_PX = 5
-# Of the samples: edges of an area add to the smallest combinations of lags what the sampling law of a whole field does not
-# have; simulated noise beside products had chi-squares of 1.0 to 2.0 a degree of freedom, the larger the wider the spread.
-_WITHIN_EDGES = 0.55
-_WHOLE_FIELD = 0.9  # share of the pixels
-_INTERCEPT_SD = 0.1  # relative, of a read variance that is an intercept: one of 15 lab sessions lay 3.9 sds off without
 _MARGIN = 1.2  # of a variance that the darks' difference shows: it is itself noisy
 _MOST_SAMPLES = 6e7  # frames x pixels of one beam and exposure: more tells nothing more
 
@@ -54,20 +48,8 @@ class RepeatedFrames:
         """Independent frames x pixels."""
         return sum(effective_frames(total.frames) * int(mask.sum()) for _, total, mask in self.members)
 
-    @property
-    def whole(self) -> bool:
-        """Whether the areas are the field but for single pixels."""
-        return min(float(mask.mean()) for *_, mask in self.members) > _WHOLE_FIELD
-
-    @property
-    def reach(self) -> int:
-        """Largest lag, px, whose window the smallest area of pixels holds."""
-        return min((math.isqrt(int(mask.sum())) - 1) // 2 for *_, mask in self.members)
-
-    def covariance(
-        self, of_series: Callable[[Series, KeptSums, NDArray[np.bool_]], NoiseCovariance]
-    ) -> NoiseCovariance:
-        """The members' covariances as one: the law is linear in signal and covariance, so both are averaged."""
+    def power(self, of_series: Callable[[Series, KeptSums, NDArray[np.bool_]], NoisePower]) -> NoisePower:
+        """The members' noise power as one: the law is linear in signal and power, so both are averaged."""
         found = [of_series(*member) for member in self.members]
         weights = np.array([item.samples for item in found])
         shares = weights / weights.sum()
@@ -75,12 +57,12 @@ class RepeatedFrames:
         def mean(values: Sequence[Any]) -> Any:
             return sum(share * value for share, value in zip(shares, values, strict=True))
 
-        return NoiseCovariance(
-            covariance_DN2=mean([item.covariance_DN2 for item in found]),
-            samples=float(weights.sum()) * (1.0 if self.whole else _WITHIN_EDGES),
+        return replace(
+            found[0],
+            power_DN2=mean([item.power_DN2 for item in found]),
+            modes=np.sum([item.modes for item in found], axis=0),
             signal_DN=float(mean([item.signal_DN for item in found])),
             common_mode=float(mean([item.common_mode for item in found])),
-            pair_share=mean([item.pair_share for item in found]),
         )
 
 
@@ -114,7 +96,6 @@ def find_repeated_frames(
     dark_of: Callable[[Series], NDArray[np.float64]],
     usable: Callable[[KeptSums, NDArray[np.bool_]], bool],
     good: NDArray[np.bool_],
-    radius: int,
 ) -> tuple[RepeatedFrames, ...]:
     """The repeated frames of each beam and exposure, with the pixels that show the beam as it is.
 
@@ -125,9 +106,7 @@ def find_repeated_frames(
         dark_of: dark of a series (row, column), DN.
         usable: whether a series' frames can be used in these pixels (not saturated).
         good: pixels that are not bad (row, column).
-        radius: largest lag of the covariances, px.
     """
-    least = _WINDOWS * (2 * radius + 1) ** 2
     result: list[RepeatedFrames] = []
     for beam in dict.fromkeys(map(beam_of, series)):
         open_groups: dict[Any, list[Any]] = {}
@@ -144,7 +123,7 @@ def find_repeated_frames(
             beside = good & _beside(acquisition, item)
             behind = good & _even(signal)
             for groups, mask in ((open_groups, beside), (behind_groups, behind)):
-                if mask.sum() >= least and float(signal[mask].mean()) > 0 and usable(total, mask):
+                if holds_squares(mask) and float(signal[mask].mean()) > 0 and usable(total, mask):
                     groups.setdefault(key, []).append((item, total, mask))
             taken[key] = taken.get(key, 0.0) + total.frames * good.size
         for where, groups in ((OPEN, open_groups), (BEHIND, behind_groups)):
@@ -192,20 +171,6 @@ def widened(fit: SpreadFit, wheres: Mapping[int, str]) -> SpreadFit:
         gain_sd[group] = np.hypot(gain_sd[group], share * abs(fit.gain_DN[group]))
         slope_sd[group] = np.hypot(slope_sd[group], share * abs(fit.slope_DN[group]))
     return replace(fit, gain_sd_DN=gain_sd, slope_sd_DN=slope_sd)
-
-
-def bounded_read_variance(variance_DN2: float, sd_DN2: float, most_DN2: float) -> tuple[float, float]:
-    """Mean and standard deviation (DN^2) of a read variance between 0 and `most_DN2` of which an intercept is known.
-
-    A photon-transfer line far from zero signal says little of its intercept, and averaged darks how large it is at most.
-    """
-    at = np.linspace(0.0, most_DN2, 2001)
-    # in units of the sd, from the nearest that is allowed: nothing underflows
-    off = (at - variance_DN2) / max(sd_DN2, 1e-9)
-    weight = np.exp(-0.5 * (off**2 - float(np.min(off**2))))
-    mean = float(np.sum(weight * at) / np.sum(weight))
-    sd = float(np.sqrt(np.sum(weight * (at - mean) ** 2) / np.sum(weight)))
-    return mean, float(np.hypot(sd, _INTERCEPT_SD * mean))
 
 
 def most_read_variance(darks: Sequence[tuple[NDArray[np.float64], int]], good: NDArray[np.bool_]) -> float | None:

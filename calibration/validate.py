@@ -18,7 +18,6 @@ from ..files import sha256_of_file
 from ..generator.effects import effect_of
 from ..generator.predict import predict_flatfield
 from ..generator.present_line import present_line
-from ..generator.psf import noise_autocovariance_1d
 from ..generator.twin import Estimate, Twin
 from .frame_sums import effective_frames, sum_frames
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
@@ -189,8 +188,8 @@ def validate_twin(
             remedy="validate against flats of the same tube and detector, or correct what the file states of them",
         )
     good = twin.maps.bad_pixels == 0
-    axis = noise_autocovariance_1d(twin.noise.psf_model, twin.noise.psf_sigma_px.value, _LAGS) ** 2
-    squared_correlations = float((axis[0] + 2.0 * axis[1:].sum()) / axis[0]) ** 2
+    rho = twin.noise.spread.value.noise_autocovariance(_LAGS)
+    squared_correlations = float(np.sum(rho**2)) / float(rho[_LAGS, _LAGS]) ** 2
     darks = {
         item.exposure_ms: sum_frames(item.iter_frames(), name=f"series {item.name}").mean_DN
         for item in acquisition.of_kind("dark")

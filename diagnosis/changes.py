@@ -363,14 +363,16 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             changed = best.copy()
             changed[index] += step
             result.append(TwinChange(name=name, twin=twin, parameters=changed, step_sd=step / sd))
-    sigma = twin.noise.psf_sigma_px
-    sd = max(SPREAD_SD * sigma.value, (sigma.high - sigma.low) / (2 * 1.959964), 0.01)
+    spread = twin.noise.spread
+    sigma_px = spread.value.sigma_px
+    known = spread.intervals.get("sigma_px")
+    sd = max(SPREAD_SD * sigma_px, 0.0 if known is None else (known.high - known.low) / (2 * 1.959964), 0.01)
     step = 0.5 * sd
-    wider = Estimate(value=sigma.value + step, low=sigma.low, high=max(sigma.high, sigma.value + step))
+    wider = replace(spread, value=replace(spread.value, sigma_px=sigma_px + step))
     result.append(
         TwinChange(
             name="optical spread",
-            twin=replace(twin, noise=replace(twin.noise, psf_sigma_px=wider)),
+            twin=replace(twin, noise=replace(twin.noise, spread=wider)),
             parameters=None,
             step_sd=step / sd,
         )

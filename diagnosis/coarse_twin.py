@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.coarser import means_of_squares
-from ..generator.binning import binned_variance_share
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.psf import blur_variance_share
-from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
+from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
 from .coarse import pixels_in_square
 
 _MODEL = "sampled"
@@ -27,7 +26,7 @@ def twin_in_squares(twin: Twin, factor: int) -> Twin:
     """The twin of means over factor x factor pixels; rows and columns that fill no square are left out as of frames.
 
     With n = factor: gain, photon-transfer slope and DN a keV are 1 / n^2 of a pixel's, the electronic variance too; the spread is the
-    one that leaves the same share of the quantum variance in a square (`binned_variance_share`), quanta counted per square, which
+    one that leaves the same share of the quantum variance in a square, quanta counted per square, which
     is how averaged frames calibrate where light spreads over less than a square: with light of any place in it, edges of squares
     that an object cuts are drawn too sharp, and a panel of 760 x 956 without effect showed a tail (log evidence 37; so none).
     Squares with a bad pixel are bad. `evidence` stays that of the pixels.
@@ -73,16 +72,14 @@ def _noise(noise: NoiseModel, factor: int) -> NoiseModel:
     """Noise of the squares, whose rounding is part of the electronic one."""
     read_DN = noise.read_noise_DN.value
     rounded = math.sqrt(noise.read_variance_DN2) / read_DN if read_DN > 0.0 else 1.0
-    share = binned_variance_share(noise.psf_model, noise.psf_sigma_px.value, factor)
-    width = _width_that_leaves(share)
-    wider = width / noise.psf_sigma_px.value if noise.psf_sigma_px.value > 0.0 else 1.0
+    width = _width_that_leaves(noise.spread.value.binned_variance_share(factor))
+    ends = sorted(_width_that_leaves(spread.binned_variance_share(factor)) for spread in noise.spread.ends())
+    sigma = Estimate(value=width, low=min(ends[0], width), high=max(ends[1], width))
     read = noise.read_noise_DN.times(rounded / factor)
     if read_DN == 0.0 and noise.quantised:
         alone = math.sqrt(noise.read_variance_DN2) / factor
         read = Estimate(value=alone, low=alone, high=alone)
-    return replace(
-        noise, psf_model=_MODEL, psf_sigma_px=noise.psf_sigma_px.times(wider), read_noise_DN=read, quantised=False
-    )
+    return replace(noise, spread=gaussian_spread(_MODEL, sigma), read_noise_DN=read, quantised=False)
 
 
 def _width_that_leaves(share: float) -> float:
@@ -101,7 +98,7 @@ def _level(level: Level, noise: NoiseModel, factor: int) -> Level:
     """A measured beam; the slope is what the spread leaves of its quanta in one square, and the white part."""
     gain = level.gain_DN.times(1.0 / factor**2)
     white = noise.white_fraction / (1.0 + noise.white_fraction)
-    left = (1.0 - white) * blur_variance_share(noise.psf_model, noise.psf_sigma_px.value) + white
+    left = (1.0 - white) * noise.spread.value.variance_share + white
     return replace(
         level,
         gain_DN=gain,

@@ -29,7 +29,7 @@ _TOLD = frozenset(("gain_map_error", "bad_pixels", "quantisation"))
 
 def doubts_of(problem: Problem) -> Doubts:
     """What is known of how the catalogue's effects mislead in a session."""
-    sharp = problem.base.noise.psf_sigma_px.value < SHARP_PX
+    sharp = problem.base.noise.spread.value.sigma_px < SHARP_PX
     return Doubts(
         chance=_SHARP_CHANCE if sharp else _CHANCE,
         loose=_LOOSE,

@@ -166,7 +166,7 @@ class ForwardModel:
     @property
     def sharp(self) -> bool:
         """Whether pixels see no farther than themselves."""
-        return self.base.noise.psf_sigma_px.value < SHARP_PX
+        return self.base.noise.spread.value.sigma_px < SHARP_PX
 
     @property
     def beams_differ(self) -> float:

@@ -190,7 +190,7 @@ class ModelCache:
         scene = None
         if request.thickness_mm:
             scene = self._scene(request.thickness_mm, model, twin.maps.shape)
-        fine_wanted = twin.noise.psf_model == "aperture"
+        fine_wanted = twin.noise.spread.value.model == "aperture"
         # drafts are drawn with the cells of the twin's own spectrum
         own = np.asarray(twin.spectral.best, dtype=np.float64).tobytes() if self.draft else None
         whole = (*key, None if scene is None else scene.number, signal_scale, gain_scale, secondary, fine_wanted, own)

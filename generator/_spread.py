@@ -1,6 +1,5 @@
 """Blur and noise correlation of one series: transfer functions on cosine transforms, whose borders mirror."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from ._distortion import distorted
 from ._fine_picture import averaging, cosines_at_pixels, fine_frequencies, kept_cosines, sampled_picture
 from .line_state import FloatArray, LineState
-from .psf import convolve_separable, noise_autocovariance_1d, noise_kernel_1d, sampled_gaussian_1d
+from .psf import Spread, base_transfer_1d, convolve_separable, whole_spectrum
 
 _GRID = 64  # cells of the noise power spectrum per axis
 _REACH = 14  # of the noise kernel where effects change it, px
@@ -70,31 +69,18 @@ class NoisePattern:
 
 
 @lru_cache(maxsize=64)
-def _base_pattern(psf_model: str, psf_sigma_px: float) -> NoisePattern:
-    half = noise_autocovariance_1d(psf_model, psf_sigma_px, _SHOWN - 1)
-    table = np.outer(half, half)
+def _base_pattern(spread: Spread) -> NoisePattern:
+    table = spread.noise_autocovariance(_SHOWN - 1)[_SHOWN - 1 :, _SHOWN - 1 :]
     return NoisePattern(
         share=float(table[0, 0]),
         autocovariance=table / table[0, 0],
-        kernel=np.asarray(noise_kernel_1d(psf_model, psf_sigma_px), dtype=np.float64),
+        kernel=np.asarray(spread.noise_kernel, dtype=np.float64),
     )
 
 
-def base_transfer_1d(psf_model: str, psf_sigma_px: float, frequency: FloatArray) -> FloatArray:
-    """Transfer function of the calibrated spread along one axis, frequency in cycles per pixel."""
-    if psf_model == "sampled":
-        reach = max(3, math.ceil(6 * psf_sigma_px))
-        kernel = sampled_gaussian_1d(psf_sigma_px, reach)[reach:]
-        steps = np.arange(reach + 1)
-        return np.asarray(np.cos(2 * np.pi * frequency[..., None] * steps) @ np.where(steps == 0, kernel, 2 * kernel))
-    return np.asarray(np.exp(-2.0 * (np.pi * psf_sigma_px * frequency) ** 2))
-
-
-def optical_transfer(
-    state: LineState, psf_model: str, psf_sigma_px: float, f_row: FloatArray, f_column: FloatArray
-) -> FloatArray:
+def optical_transfer(state: LineState, spread: Spread, f_row: FloatArray, f_column: FloatArray) -> FloatArray:
     """Transfer function of the light's spread (n, m): the calibrated one, tails in part in its place, and factors."""
-    result = base_transfer_1d(psf_model, psf_sigma_px, f_row) * base_transfer_1d(psf_model, psf_sigma_px, f_column)
+    result = spread.transfer(f_row, f_column)
     if state.tails:
         left = 1.0 - sum(weight for weight, _ in state.tails)
         result = left * result
@@ -105,7 +91,7 @@ def optical_transfer(
     return np.asarray(result)
 
 
-def noise_pattern(psf_model: str, psf_sigma_px: float, state: LineState) -> NoisePattern:
+def noise_pattern(spread: Spread, state: LineState) -> NoisePattern:
     """Noise correlation with the state's spread.
 
     Where nothing changes the calibrated spread it is that of `psf`. Else the power of quanta that land anywhere in a
@@ -113,20 +99,15 @@ def noise_pattern(psf_model: str, psf_sigma_px: float, state: LineState) -> Nois
     calibrated spread is replaced by it.
     """
     if not (state.tails or state.optical_transfers or state.power_transfers):
-        return _base_pattern(psf_model, psf_sigma_px)
+        return _base_pattern(spread)
     frequency = np.arange(_GRID // 2 + 1) / _GRID
-    half = noise_autocovariance_1d(psf_model, psf_sigma_px, _GRID // 2)
-    line = _even_transform(half)
-    power = np.outer(line, line)
-    aliases = 0 if psf_model == "sampled" else 2 if psf_sigma_px > 0.4 else 4
+    power = spread.noise_power(_GRID)
+    aliases = 0 if spread.model == "sampled" else 2 if spread.sigma_px > 0.4 and spread.tail_share == 0 else 4
     order = np.arange(-aliases, aliases + 1)
     every = (frequency[:, None] + order).ravel()
     f_row, f_column = every[:, None], every[None, :]
-    before = (
-        base_transfer_1d(psf_model, psf_sigma_px, every)[:, None]
-        * base_transfer_1d(psf_model, psf_sigma_px, every)[None, :]
-    )
-    change = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column) ** 2
+    before = spread.transfer(f_row, f_column)
+    change = optical_transfer(state, spread, f_row, f_column) ** 2
     for factor in state.power_transfers:
         change = change * factor(f_row, f_column)
     change = change - before**2
@@ -136,8 +117,7 @@ def noise_pattern(psf_model: str, psf_sigma_px: float, state: LineState) -> Nois
         count = order.size
         change = change.reshape(frequency.size, count, frequency.size, count).sum(axis=(1, 3))
     power = np.maximum(power + change, 0.0)
-    whole = np.concatenate([power, power[-2:0:-1]], axis=0)
-    whole = np.concatenate([whole, whole[:, -2:0:-1]], axis=1)
+    whole = whole_spectrum(power)
     covariance = np.fft.ifft2(whole).real
     impulse = np.fft.fftshift(np.fft.ifft2(np.sqrt(whole)).real)
     middle = slice(_GRID // 2 - _REACH, _GRID // 2 + _REACH + 1)
@@ -146,11 +126,6 @@ def noise_pattern(psf_model: str, psf_sigma_px: float, state: LineState) -> Nois
         autocovariance=covariance[:_SHOWN, :_SHOWN] / covariance[0, 0],
         kernel=np.ascontiguousarray(impulse[middle, middle]),
     )
-
-
-def _even_transform(half: FloatArray) -> FloatArray:
-    """Spectrum at 0..n of an even sequence of period 2 n given at 0..n."""
-    return np.asarray(np.fft.fft(np.concatenate([half, half[-2:0:-1]])).real[: half.size])
 
 
 @lru_cache(maxsize=64)
@@ -190,8 +165,7 @@ def spread_maps(
     *,
     state: LineState,
     pattern: NoisePattern,
-    psf_model: str,
-    psf_sigma_px: float,
+    spread: Spread,
     draft: bool = False,
     known: dict[object, Any] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
@@ -208,20 +182,23 @@ def spread_maps(
 
     fine = state.picture
     # a tail holds a share of light that reaches further up than the calibrated spread
-    kept = [kept_cosines(length, 0.0 if state.tails else psf_sigma_px, 1e-3 if draft else 1e-5) for length in shape]
+    narrowest = (
+        0.0 if state.tails or spread.tail_share > 0 else spread.sigma_px * min(spread.aspect, 1 / spread.aspect) ** 0.5
+    )
+    kept = [kept_cosines(length, narrowest, 1e-3 if draft else 1e-5) for length in shape]
     rest = signal_DN if fine is None else None if signal_DN is fine.signal_DN else signal_DN - fine.signal_DN
     blurred: NDArray[np.floating] = np.zeros(shape)
-    if not (state.object_transfers or state.tails or state.optical_transfers):
+    if spread.separable and not (state.object_transfers or state.tails or state.optical_transfers):
 
         def drawn(picture: NDArray[np.floating], counts: Sequence[int]) -> FloatArray:
             rows, columns = (
-                _drawing(length, points, count, psf_model, psf_sigma_px, shift)
+                _drawing(length, points, count, spread.model, spread.sigma_px, shift)
                 for length, points, count, shift in zip(shape, picture.shape, counts, state.shift_px, strict=True)
             )
             return np.asarray(rows @ picture @ columns.T)
 
         if fine is not None:
-            key = (psf_model, psf_sigma_px, state.shift_px, *kept)
+            key = (spread, state.shift_px, *kept)
             if key not in fine.fine.drawn:
                 fine.fine.drawn[key] = drawn(fine.fine.cells, kept)
             blurred = fine.scale * fine.fine.drawn[key]
@@ -235,7 +212,7 @@ def spread_maps(
             if key not in transfers:
                 frequency = [fine_frequencies(length)[:count] for length, count in zip(shape, counts, strict=True)]
                 f_row, f_column = frequency[0][:, None], frequency[1][None, :]
-                whole = optical_transfer(state, psf_model, psf_sigma_px, f_row, f_column)
+                whole = optical_transfer(state, spread, f_row, f_column)
                 blur = _object_transfer(state, f_row, f_column)
                 transfers[key] = whole if blur is None else whole * blur
             return np.asarray(transfers[key])
@@ -254,11 +231,11 @@ def spread_maps(
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
     power = pattern.squared_transfer(f_row, f_column)
     blur = _object_transfer(state, f_row, f_column)
-    spread = sampled_picture(
+    variance = sampled_picture(
         [(dctn(variance_DN2, type=2), power if blur is None else power * blur)], shape, state.shift_px
     )
-    spread = distorted(spread, radial_px=radial_px, turn_px=turn_px)
-    return blurred, np.maximum(spread, 0.0)
+    variance = distorted(variance, radial_px=radial_px, turn_px=turn_px)
+    return blurred, np.maximum(variance, 0.0)
 
 
 def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:

@@ -25,7 +25,7 @@ def published_parameters(twin: Twin) -> dict[str, float]:
     the twin times 2 sqrt(pi) blur; the blur is the width of the autocovariance, sqrt(2) times that of the optical spread.
     Without blur the measured slope and noise stand as they are.
     """
-    blur = math.sqrt(2.0) * twin.noise.psf_sigma_px.value
+    blur = math.sqrt(2.0) * twin.noise.spread.value.sigma_px
     area = 4.0 * math.pi * blur**2 if blur > 0 else 1.0
     return {
         "gain_DN": twin.levels[0].photon_transfer_slope_DN.value * area,

@@ -2,30 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..acquisition.instrument import BINNINGS
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from .psf import noise_autocovariance_1d
-
-
-def binned_variance_share(model: str, sigma_px: float, binning: int) -> float:
-    """Variance of the mean of b x b pixels, times b^2, over the quantum variance before the spread; no unit.
-
-    The noise of neighbours is correlated, so averaging gains less than b^2 in variance:
-
-        share = [ sum_k (b - |k|) rho(k) / b ]^2,   |k| < b
-
-    with rho the autocovariance of unit quanta after the spread along one axis. b = 1 is `blur_variance_share`; for large b
-    the share goes to 1, the quanta themselves.
-
-    Checked against: blurred quanta drawn and binned (tests/test_generator_line_limits.py).
-    """
-    rho = noise_autocovariance_1d(model, sigma_px, binning - 1)
-    weight = binning - np.arange(binning, dtype=np.float64)
-    along = (2.0 * float(weight[1:] @ rho[1:]) + float(weight[0] * rho[0])) / binning
-    return along**2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

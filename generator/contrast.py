@@ -35,7 +35,7 @@ from ..spectra import (
 from .binning import refuse_binning
 from .predict import predict_flatfield
 from .present_line import present_line
-from .psf import PSF_MODELS, blur_variance_share, noise_autocovariance_1d
+from .psf import PSF_MODELS, Spread
 from .spectral_signal import OpenBeam
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
 from .twin_spectrum import spectral_model_of, white_gain_DN
@@ -160,11 +160,10 @@ class Contrast:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Spread:
+class _Detector:
     """What of a frame's noise the detector correlates: quanta after the spread, and white noise."""
 
-    model: str
-    sigma_px: float
+    spread: Spread
     read_variance_DN2: float
     pixel_mm: float
 
@@ -279,17 +278,15 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
     )
 
 
-def _spread_of(line: Twin | UncalibratedLine) -> _Spread:
+def _detector_of(line: Twin | UncalibratedLine) -> _Detector:
     if isinstance(line, UncalibratedLine):
-        return _Spread(
-            model=line.psf_model,
-            sigma_px=line.psf_sigma_px,
+        return _Detector(
+            spread=Spread(model=line.psf_model, sigma_px=line.psf_sigma_px),
             read_variance_DN2=line.read_noise_keV**2,
             pixel_mm=line.pixel_mm,
         )
-    return _Spread(
-        model=line.noise.psf_model,
-        sigma_px=line.noise.psf_sigma_px.value,
+    return _Detector(
+        spread=line.noise.spread.value,
         read_variance_DN2=line.noise.read_variance_DN2,
         pixel_mm=line.instrument.pixel_mm or 0.15,
     )
@@ -314,7 +311,7 @@ def _checked_slabs(product: Filter, foreign_object: Filter, displaces: bool, obj
 def _slabs(
     beam: _Beam,
     setting: Setting,
-    spread: _Spread,
+    detector: _Detector,
     *,
     product: Filter,
     foreign_object: Filter,
@@ -359,8 +356,8 @@ def _slabs(
         secondary_DN = min(beam.secondary_DN, 0.9 * gain_DN)
         # variance of M before the spread: gain S / S^2
         quantum.append((gain_DN - secondary_DN) / signal / setting.averaged)
-        white.append((secondary_DN / signal + spread.read_variance_DN2 / signal**2) / setting.averaged)
-        spreads.append(quantum[-1] * blur_variance_share(spread.model, spread.sigma_px) + white[-1])
+        white.append((secondary_DN / signal + detector.read_variance_DN2 / signal**2) / setting.averaged)
+        spreads.append(quantum[-1] * detector.spread.variance_share + white[-1])
     thin = []
     for layer in (product, foreign_object):
         mu = mu_per_mm(material_from_name(layer.material, library=library), energies, table=table)
@@ -432,19 +429,14 @@ def _variance_of_difference(
     ring: NDArray[np.bool_],
     quantum: tuple[float, float],
     white: tuple[float, float],
-    spread: _Spread,
+    detector: _Detector,
 ) -> float:
     """Variance of the disc's mean less the ring's; quantum and white variance a pixel as (in the disc, in the ring)."""
-    from scipy.ndimage import correlate1d
+    from scipy.signal import oaconvolve
 
     weight = disc / disc.sum() - ring / ring.sum()
-    radius = max(3, math.ceil(6.0 * spread.sigma_px) + 2)
-    half = noise_autocovariance_1d(spread.model, spread.sigma_px, radius)
-    kernel = np.concatenate([half[:0:-1], half])
     amplitude = weight * np.sqrt(np.where(disc, quantum[0], quantum[1]))
-    spread_out = amplitude
-    for axis in (0, 1):
-        spread_out = correlate1d(spread_out, kernel, axis=axis, mode="constant")
+    spread_out = oaconvolve(amplitude, detector.spread.noise_autocovariance(detector.spread.reach_px), mode="same")
     correlated = float(np.sum(amplitude * spread_out))
     return correlated + float(np.sum(weight**2 * np.where(disc, white[0], white[1])))
 
@@ -456,7 +448,7 @@ def _quotients(low: _Slabs, high: _Slabs) -> tuple[FloatArray, FloatArray]:
 def _combined(
     low: _Slabs,
     high: _Slabs,
-    spread: _Spread,
+    detector: _Detector,
     *,
     thickness_ratio: float,
     object_pixels: int,
@@ -484,10 +476,12 @@ def _combined(
         of_quotient(low.white_object, high.white_object, *behind[0]),
         of_quotient(low.white_product, high.white_product, *behind[1]),
     )
-    share = blur_variance_share(spread.model, spread.sigma_px)
+    share = detector.spread.variance_share
     sd_pixel = math.sqrt(quantum[0] * share + white[0])
     disc, ring = masks
-    sd_object = math.sqrt(_variance_of_difference(disc=disc, ring=ring, quantum=quantum, white=white, spread=spread))
+    sd_object = math.sqrt(
+        _variance_of_difference(disc=disc, ring=ring, quantum=quantum, white=white, detector=detector)
+    )
     warnings = list(dict.fromkeys((*low.warnings, *high.warnings)))
     if low.few_photons or high.few_photons:
         warnings.append(
@@ -604,8 +598,8 @@ def _contrasts(
     library: Library | None,
 ) -> tuple[tuple[Contrast, ...], ...]:
     _checked_slabs(product, foreign_object, displaces, object_pixels)
-    spread = _spread_of(line)
-    masks = disc_and_ring(object_pixels, min(dilations_for_pixel(spread.pixel_mm), _WIDEST_RING_PX))
+    detector = _detector_of(line)
+    masks = disc_and_ring(object_pixels, min(dilations_for_pixel(detector.pixel_mm), _WIDEST_RING_PX))
     known: dict[tuple[Setting, str], _Slabs] = {}
     beams: dict[Setting, _Beam] = {}
 
@@ -621,7 +615,7 @@ def _contrasts(
             known[key] = _slabs(
                 beams[setting],
                 setting,
-                spread,
+                detector,
                 product=product,
                 foreign_object=foreign_object,
                 displaces=displaces,
@@ -648,7 +642,7 @@ def _contrasts(
                 _combined(
                     slabs(low, "xraylib"),
                     slabs(high, "xraylib"),
-                    spread,
+                    detector,
                     thickness_ratio=foreign_object.thickness_mm / product.thickness_mm,
                     object_pixels=object_pixels,
                     masks=masks,

@@ -249,8 +249,7 @@ class ChannelModel:
                 gain_relative=self.twin.maps.gain_relative,
                 white_fraction=self.secondary_DN / quanta,
                 read_variance_DN2=effects.read_variance_DN2,
-                psf_model=noise.psf_model,
-                psf_sigma_px=noise.psf_sigma_px.value,
+                spread=noise.spread.value,
                 quantised=noise.quantised,
                 rng=rng,
                 kernel=effects.pattern.kernel,
@@ -265,8 +264,7 @@ class ChannelModel:
             gain_relative=self.twin.maps.gain_relative,
             white_fraction=self.white_behind(gain),
             read_variance_DN2=self.read_variance_DN2,
-            psf_model=noise.psf_model,
-            psf_sigma_px=noise.psf_sigma_px.value,
+            spread=noise.spread.value,
             dark_DN=self.dark_DN,
             bits=self.twin.instrument.bits,
             quantised=noise.quantised,
@@ -315,8 +313,7 @@ def detector_noise(twin: Twin, *, bad_pixels: str = "repaired") -> DetectorNoise
     if bad_pixels == "repaired":
         variance = np.where(bad, np.float32(np.median(variance[~bad])), variance).astype(np.float32)
     return DetectorNoise(
-        psf_model=twin.noise.psf_model,
-        psf_sigma_px=twin.noise.psf_sigma_px.value,
+        spread=twin.noise.spread.value,
         white_fraction=twin.noise.white_fraction,
         slope_share=slope_share(twin),
         gain_relative=twin.maps.gain_relative,

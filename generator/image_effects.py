@@ -17,7 +17,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from ._fine_picture import FineCells, pixel_means
-from ._spread import NoisePattern, base_transfer_1d, blurred_object, noise_pattern, optical_transfer, spread_maps
+from ._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
 from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, effect_of, in_order
 from .flat_change import ABSORBED
@@ -102,12 +102,12 @@ class ImageEffects:
         self.effects, self.warnings = self._usable()
         open_beam = self._through(self._open_state(), self.effects, None)
         self._end = open_beam
-        self.pattern = noise_pattern(self.twin.noise.psf_model, self.twin.noise.psf_sigma_px.value, open_beam)
+        self.pattern = noise_pattern(self.twin.noise.spread.value, open_beam)
         self.open_charge_DN = self._unbent(self.open_signal_DN)
         spread = [item for item in self.effects if item.id in ABSORBED and item.since == "always"]
-        model, sigma_px = self.twin.noise.psf_model, self.twin.noise.psf_sigma_px.value
-        left = noise_pattern(model, sigma_px, self._through(self._open_state(), spread, None)).share
-        self.gain_factor = noise_pattern(model, sigma_px, self._open_state()).share / left
+        base = self.twin.noise.spread.value
+        left = noise_pattern(base, self._through(self._open_state(), spread, None)).share
+        self.gain_factor = noise_pattern(base, self._open_state()).share / left
         self.read_variance_DN2 = self._without_absorbed(self.read_variance_DN2, spread)
         lit = self.open_charge_DN * (open_beam.signal_DN / self.open_level_DN) * open_beam.flat_factor
         self.flat_DN = lit * (1.0 - open_beam.bend_per_DN * lit)
@@ -245,7 +245,7 @@ class ImageEffects:
             variance_DN2=level * self.gain_DN * pixel_means(np.asarray(variance, dtype=np.float64)),
             attenuation_scale=self.attenuation_scale(tuple(thickness_mm)),
         )
-        if self.twin.noise.psf_model == "aperture":
+        if self.twin.noise.spread.value.model == "aperture":
             state = replace(state, picture=FinePicture(fine=FineCells(cells), scale=level, signal_DN=means))
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
         state = self._through(state, later, thickness_mm)
@@ -263,8 +263,7 @@ class ImageEffects:
             state.variance_DN2,
             state=state,
             pattern=self.pattern,
-            psf_model=noise.psf_model,
-            psf_sigma_px=noise.psf_sigma_px.value,
+            spread=noise.spread.value,
         )
         lit = self.open_charge_DN / self.open_level_DN * state.flat_factor
         charge = lit * picture
@@ -335,10 +334,10 @@ class ImageEffects:
         f_row, f_column = np.arange(shape[0])[:, None] / (2.0 * shape[0]), np.arange(shape[1])[None] / (2.0 * shape[1])
         ratio: FloatArray | None = None
         if state.tails or state.optical_transfers:
-            model, sigma_px = self.twin.noise.psf_model, self.twin.noise.psf_sigma_px.value
-            calibrated = base_transfer_1d(model, sigma_px, f_row) * base_transfer_1d(model, sigma_px, f_column)
+            base = self.twin.noise.spread.value
+            calibrated = base.transfer(f_row, f_column)
             # where the calibrated spread leaves nothing there is nothing to put elsewhere
-            ratio = optical_transfer(state, model, sigma_px, f_row, f_column) / np.maximum(calibrated, 1e-3)
+            ratio = optical_transfer(state, base, f_row, f_column) / np.maximum(calibrated, 1e-3)
         for transfer in state.object_transfers:
             part = transfer(f_row, f_column)
             ratio = part if ratio is None else ratio * part

@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .psf import convolve_separable, noise_kernel_1d
+from .psf import Spread, convolve_separable
 
 
 def sample_correlated_quanta(
     variance_DN2: NDArray[np.floating],
     step_DN: NDArray[np.floating] | float,
     *,
-    psf_model: str,
-    psf_sigma_px: float,
+    spread: Spread,
     rng: np.random.Generator,
     kernel: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
@@ -31,7 +30,7 @@ def sample_correlated_quanta(
     Args:
         variance_DN2: variance before the spread (row, column), DN^2, 0 or more.
         step_DN: DN a quantum (row, column) or one number, above 0.
-        psf_model, psf_sigma_px: the spread, see generator.psf.
+        spread: see generator.psf.
         rng: source of randomness.
         kernel: in place of the calibrated spread's, (2 R + 1,) per axis or (2 R + 1, 2 R + 1).
 
@@ -44,7 +43,7 @@ def sample_correlated_quanta(
         raise InputError("quantum variance", received=float(np.nanmin(variance)), expected="0 DN^2 or more everywhere")
     if not np.all(step > 0):
         raise InputError("DN a quantum", received=float(np.nanmin(step)), expected="above 0 DN everywhere")
-    taps = noise_kernel_1d(psf_model, psf_sigma_px) if kernel is None else kernel
+    taps = spread.noise_kernel if kernel is None else kernel
     reach = len(taps) // 2
     mean = np.pad(variance / step**2, reach, mode="edge")
     counts = rng.poisson(mean)
@@ -72,8 +71,7 @@ def sample_frame_noise(
     gain_relative: NDArray[np.floating] | float = 1.0,
     white_fraction: NDArray[np.floating] | float,
     read_variance_DN2: ArrayLike,
-    psf_model: str,
-    psf_sigma_px: float,
+    spread: Spread,
     rng: np.random.Generator,
     quantum_share: float = 1.0,
     third_cumulant_share: float = 1.0,
@@ -101,7 +99,7 @@ def sample_frame_noise(
     total = quantum_share * gain * quanta_signal
     step = gain * (third_cumulant_share / quantum_share if quantum_share > 0 else 1.0)
     noise = sample_correlated_quanta(
-        total / (1.0 + white_fraction), step, psf_model=psf_model, psf_sigma_px=psf_sigma_px, rng=rng, kernel=kernel
+        total / (1.0 + white_fraction), step, spread=spread, rng=rng, kernel=kernel
     ) * relative.astype(np.float32)
     white = relative**2 * total * (white_fraction / (1.0 + white_fraction))
     white = white + read_share * np.asarray(read_variance_DN2, dtype=np.float64)

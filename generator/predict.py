@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Setting, filters_from_text, text_from_filters
 from ..errors import InputError
 from ..spectra import checked_kV
-from .binning import binned_pixel, binned_variance_share
+from .binning import binned_pixel
 from .line_limits import check_count_rate, check_limits
 from .present_line import PresentLine, present_line
-from .psf import blur_variance_share
 from .spectral_signal import OpenBeam
 from .twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_sd
 from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
@@ -76,13 +75,12 @@ class Prediction:
 def binned_over_single(twin: Twin, binning: int) -> float:
     """Photon-transfer slope of the mean of b x b pixels, times b^2, over that of one pixel; no unit, 1 or more."""
     white = twin.noise.white_fraction
-    model, sigma_px = twin.noise.psf_model, twin.noise.psf_sigma_px.value
-    return (binned_variance_share(model, sigma_px, binning) + white) / (blur_variance_share(model, sigma_px) + white)
+    spread = twin.noise.spread.value
+    return (spread.binned_variance_share(binning) + white) / (spread.variance_share + white)
 
 
 def _slope_share_sd(twin: Twin) -> float:
-    sigma = twin.noise.psf_sigma_px
-    ends = [blur_variance_share(twin.noise.psf_model, value) for value in (sigma.low, sigma.high)]
+    ends = [spread.variance_share for spread in twin.noise.spread.ends()]
     return abs(ends[0] - ends[1]) / (2 * 1.959964)
 
 

@@ -16,8 +16,9 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from .describe import Scene
 from .kernels import draw_key, sample_frames
+from .noise import digitise, sample_frame_noise
 from .projection import project_polychromatic
-from .psf import noise_kernel_1d, sampled_gaussian_1d
+from .psf import Spread, sampled_gaussian_1d
 from .shapes import Rays
 from .spectral_signal import OpenBeam
 from .transfer import Channel, DetectorNoise
@@ -319,10 +320,13 @@ def images_of_moments(
         twin, channels, geometry, supersampling: as in `render_expected`.
     """
     focal = geometry.focal_blur_px * supersampling
-    spread = twin.noise.psf_sigma_px.value * supersampling
+    spread = twin.noise.spread.value
     images = []
     for channel, (signal, variance) in zip(channels, moments, strict=True):
-        blurred = _blurred_pixel_means(signal, math.hypot(focal, spread), supersampling)
+        if spread.separable:
+            blurred = _blurred_pixel_means(signal, math.hypot(focal, spread.sigma_px * supersampling), supersampling)
+        else:
+            blurred = _blurred_pixel_means(_spread_out(signal, spread, supersampling), focal, supersampling)
         quanta = _blurred_pixel_means(variance, focal, supersampling)
         images.append(
             ExpectedImage(
@@ -348,6 +352,15 @@ def _blurred_pixel_means(fine: NDArray[np.float32], sigma: float, supersampling:
     return image.astype(np.float64)
 
 
+def _spread_out(fine: NDArray[np.float32], spread: Spread, supersampling: int) -> NDArray[np.float32]:
+    """Sub-pixels (row, column) after a spread of any shape; borders mirror."""
+    from scipy.fft import dctn, idctn
+
+    f_row, f_column = (supersampling * np.arange(length) / (2.0 * length) for length in fine.shape)
+    transfer = spread.transfer(f_row[:, None], f_column[None, :])
+    return np.asarray(idctn(dctn(fine, type=2) * transfer, type=2), dtype=np.float32)
+
+
 def _pixel_means(fine: NDArray[np.generic], supersampling: int) -> Array:
     rows, columns = (length // supersampling for length in fine.shape)
     blocks = fine.reshape(rows, supersampling, columns, supersampling)
@@ -368,17 +381,35 @@ def sample_expected(
         secondary = np.minimum(channel.secondary_DN, 0.9 * gain)
         gain, white = gain - secondary, 0.0
         read_DN2 = np.maximum(read_DN2, 0.0) + secondary * np.maximum(signal, 0.0) * detector.gain_relative
+    read_noise_DN = np.sqrt(np.maximum(read_DN2, 0.0))
+    averaged = channel.setting.averaged
+    if not detector.spread.separable:
+        noise = sample_frame_noise(
+            signal,
+            gain_DN=gain,
+            gain_relative=detector.gain_relative,
+            white_fraction=white,
+            read_variance_DN2=read_noise_DN**2,
+            spread=detector.spread,
+            rng=rng,
+            quantum_share=1.0 / averaged,
+            third_cumulant_share=1.0 / averaged**2,
+            read_share=1.0 / averaged,
+        )
+        return digitise(
+            signal + noise + channel.dark_DN, bits=detector.bits, quantised=detector.quantised, averaged=averaged
+        )
     frame = sample_frames(
         signal,
         gain_DN=gain,
         key=draw_key(rng),
         gain_relative=detector.gain_relative,
         white_fraction=white,
-        kernel_1d=noise_kernel_1d(detector.psf_model, detector.psf_sigma_px),
-        read_noise_DN=np.sqrt(np.maximum(read_DN2, 0.0)),
+        kernel_1d=detector.spread.noise_kernel,
+        read_noise_DN=read_noise_DN,
         dark_DN=channel.dark_DN,
         bits=detector.bits,
         quantised=detector.quantised,
-        averaged=channel.setting.averaged,
+        averaged=averaged,
     )
     return np.asarray(frame, dtype=np.float32)

@@ -505,7 +505,7 @@ def _drawn(
         for applied, effect, numbers in early:
             if effect.stage != "beam":
                 state = effect.change(state, numbers, _context(twin, request, applied, projection, cache))
-        if twin.noise.psf_model != "aperture" and state.shift_px != (0.0, 0.0):
+        if twin.noise.spread.value.model != "aperture" and state.shift_px != (0.0, 0.0):
             # points, not means over pixels: a step between two of them has no place that a transform could move
             state = replace(
                 state,
@@ -576,7 +576,7 @@ def _charge(
     """Light spread over the pixels; `spread` holds what earlier series of the same beam and spread have left."""
     shape, relative = _illumination(twin, request, cache)
     if "pattern" not in spread:
-        spread["pattern"] = noise_pattern(twin.noise.psf_model, twin.noise.psf_sigma_px.value, state)
+        spread["pattern"] = noise_pattern(twin.noise.spread.value, state)
     pattern: NoisePattern = spread["pattern"]
     if not request.beam_on:
         nothing = np.zeros(shape.shape)
@@ -587,8 +587,7 @@ def _charge(
         quanta.variance_DN2,
         state=quanta,
         pattern=pattern,
-        psf_model=twin.noise.psf_model,
-        psf_sigma_px=twin.noise.psf_sigma_px.value,
+        spread=twin.noise.spread.value,
         draft=cache.draft,
         known=spread,
     )

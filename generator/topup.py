@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from .noise import digitise, sample_frame_noise
-from .psf import noise_coupling
+from .psf import Spread
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,8 +105,7 @@ def apply_top_up(
     gain_relative: NDArray[np.floating] | float,
     white_fraction: NDArray[np.floating] | float,
     read_variance_DN2: NDArray[np.floating] | float,
-    psf_model: str,
-    psf_sigma_px: float,
+    spread: Spread,
     dark_DN: NDArray[np.floating],
     bits: int | None,
     quantised: bool,
@@ -128,8 +127,7 @@ def apply_top_up(
         gain_relative=gain_relative,
         white_fraction=white_fraction,
         read_variance_DN2=read_variance_DN2,
-        psf_model=psf_model,
-        psf_sigma_px=psf_sigma_px,
+        spread=spread,
         quantised=quantised,
         rng=rng,
     )
@@ -145,8 +143,7 @@ def topped_up_charge(
     gain_relative: NDArray[np.floating] | float,
     white_fraction: NDArray[np.floating] | float,
     read_variance_DN2: NDArray[np.floating] | float,
-    psf_model: str,
-    psf_sigma_px: float,
+    spread: Spread,
     quantised: bool,
     rng: np.random.Generator,
     kernel: NDArray[np.floating] | None = None,
@@ -164,7 +161,7 @@ def topped_up_charge(
     """
     signal = np.asarray(open_signal_DN, dtype=np.float64) * transmission
     # where the reference's noise is up, more noise is drawn: this couples them in the third moment; it is taken off
-    coupling = 3.0 * plan.quantum * plan.held * noise_coupling(psf_model, psf_sigma_px)
+    coupling = 3.0 * plan.quantum * plan.held * spread.noise_coupling
     third_cumulant = max(plan.third_cumulant - coupling, 0.01 * plan.quantum)
     rounding = 1.0 / 12.0 / plan.averaged if quantised else 0.0
     # rounding comes with digitising below; what the electronics still lack excludes it
@@ -175,8 +172,7 @@ def topped_up_charge(
         gain_relative=gain_relative,
         white_fraction=white_fraction,
         read_variance_DN2=electronic,
-        psf_model=psf_model,
-        psf_sigma_px=psf_sigma_px,
+        spread=spread,
         rng=rng,
         quantum_share=plan.quantum,
         third_cumulant_share=third_cumulant,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from .noise import digitise, sample_correlated_quanta, spread_inside
-from .psf import convolve_separable, noise_coupling, noise_kernel_1d, sampled_gaussian_1d
+from .psf import Spread, convolve_separable, sampled_gaussian_1d
 from .two_material import TwoMaterialTables, solve_two_materials
 
 Array = NDArray[np.float64]
@@ -56,8 +56,7 @@ class DetectorNoise:
     is drawn, where effects have changed the calibrated spread.
     """
 
-    psf_model: str
-    psf_sigma_px: float
+    spread: Spread
     white_fraction: float
     slope_share: float
     gain_relative: NDArray[np.float32] = field(repr=False)
@@ -299,8 +298,8 @@ def transferred_charge(
     geometric = np.sqrt(own[0] * own[1])
     together = np.where(geometric > 0, missing[0, 1] / np.where(geometric > 0, geometric, 1.0), 0.0)
     common = np.minimum(np.abs(together), 1.0)
-    coupling = 3.0 * noise_coupling(detector.psf_model, detector.psf_sigma_px)
-    kernel: Array = noise_kernel_1d(detector.psf_model, detector.psf_sigma_px)
+    coupling = 3.0 * detector.spread.noise_coupling
+    kernel: Array = detector.spread.noise_kernel
     if detector.kernel is not None:
         kernel = detector.kernel
     reach = len(kernel) // 2
@@ -316,8 +315,7 @@ def transferred_charge(
         noise = relative * sample_correlated_quanta(
             seen[c] * alone * one_frame[c] / relative**2,
             pair.gain_DN[c] * np.clip(share, 1e-3, 1e3),
-            psf_model=detector.psf_model,
-            psf_sigma_px=detector.psf_sigma_px,
+            spread=detector.spread,
             rng=rng,
             kernel=kernel,
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from .effects.effect import AppliedEffect
+from .psf import Spread
 from .spectral_signal import SpectrumCorrection
 
 # reason codes of bad pixels; a pixel carries the first that applies
@@ -78,15 +79,52 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NoiseModel:
-    """Noise of the detector: see generator.psf for the two descriptions of the optical spread.
+class SpreadEstimate:
+    """The optical spread: its most probable parameters, the kernel family in words, and intervals of the parameters.
 
-    Fields: psf_model, psf_sigma_px; white_fraction: signal-following white variance over the quantum variance before
+    intervals: of `sigma_px` always, of `aspect`, `tail_share` and `tail_px` where the data were asked for them.
+    """
+
+    value: Spread
+    family: str = "Gaussian"
+    intervals: Mapping[str, Estimate] = field(default_factory=dict)
+
+    @property
+    def gaussian_px(self) -> Estimate | None:
+        """Width of the Gaussian core with its interval, px; None where most of the light is in the tail."""
+        return self.intervals.get("sigma_px") if self.value.tail_share < 0.5 else None
+
+    def ends(self) -> tuple[Spread, Spread]:
+        """The spread with its share of the variance at the ends of the widths' and shares' intervals."""
+        value = self.value
+        exact = Estimate(value=value.sigma_px, low=value.sigma_px, high=value.sigma_px)
+        width = self.intervals.get("sigma_px", exact)
+        share = self.intervals.get("tail_share")
+        low, high = (value.tail_share, value.tail_share) if share is None else (share.low, min(share.high, 1.0))
+        return (
+            replace(value, sigma_px=width.low, tail_share=low),
+            replace(value, sigma_px=width.high, tail_share=high),
+        )
+
+
+def gaussian_spread(model: str, sigma_px: Estimate) -> SpreadEstimate:
+    """A Gaussian spread, alike along rows and columns, of a width with its interval, px."""
+    return SpreadEstimate(
+        value=Spread(model=model, sigma_px=sigma_px.value),
+        family=f"Gaussian ({model})",
+        intervals={"sigma_px": sigma_px},
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseModel:
+    """Noise of the detector: see generator.psf for the optical spread.
+
+    Fields: spread; white_fraction: signal-following white variance over the quantum variance before
     the spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN.
     """
 
-    psf_model: str
-    psf_sigma_px: Estimate
+    spread: SpreadEstimate
     white_fraction: float
     read_noise_DN: Estimate
     quantised: bool

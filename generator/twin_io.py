@@ -13,8 +13,18 @@ from ..acquisition.setting import filters_from_text, text_from_filters
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
 from .effects import AppliedEffect, in_order
+from .psf import Spread
 from .spectral_signal import SpectrumCorrection
-from .twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin
+from .twin import (
+    DetectorMaps,
+    Estimate,
+    Level,
+    NoiseModel,
+    SpectralPosterior,
+    SpreadEstimate,
+    Twin,
+    gaussian_spread,
+)
 
 FORMAT = "raytwin-twin"
 VERSION = 1
@@ -77,10 +87,17 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
         if twin.maps.dark_exposure_ms is not None:
             maps.attrs["dark_exposure_ms"] = twin.maps.dark_exposure_ms
         noise = file.create_group("noise")
-        noise.attrs["psf_model"] = twin.noise.psf_model
+        spread = twin.noise.spread
+        noise.attrs["psf_model"] = spread.value.model
+        noise.attrs["spread_family"] = spread.family
+        for name in ("aspect", "tail_share", "tail_px", "tail_order"):
+            noise.attrs[name] = getattr(spread.value, name)
+            if name in spread.intervals:
+                _put_estimate(noise, f"{name}_interval", spread.intervals[name])
         noise.attrs["white_fraction"] = twin.noise.white_fraction
         noise.attrs["quantised"] = twin.noise.quantised
-        _put_estimate(noise, "psf_sigma_px", twin.noise.psf_sigma_px)
+        exact = Estimate(value=spread.value.sigma_px, low=spread.value.sigma_px, high=spread.value.sigma_px)
+        _put_estimate(noise, "psf_sigma_px", spread.intervals.get("sigma_px", exact))
         _put_estimate(noise, "read_noise_DN", twin.noise.read_noise_DN)
         _put_estimate(noise, "dark_DN", twin.dark_DN)
         levels = file.create_group("levels")
@@ -231,8 +248,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             bad_pixels=_array(maps, "bad_pixels", np.uint8),
         ),
         noise=NoiseModel(
-            psf_model=_text(noise.attrs["psf_model"]),
-            psf_sigma_px=_required(_get_estimate(noise, "psf_sigma_px"), "psf_sigma_px", path),
+            spread=_spread(noise, path),
             white_fraction=float(noise.attrs["white_fraction"]),
             read_noise_DN=_required(_get_estimate(noise, "read_noise_DN"), "read_noise_DN", path),
             quantised=bool(noise.attrs["quantised"]),
@@ -244,6 +260,21 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
         provenance=json.loads(_text(file.attrs["provenance"])),
         effects=_effects_from_text(_text(file.attrs["effects"])) if "effects" in file.attrs else (),
+    )
+
+
+def _spread(noise: Any, path: object) -> SpreadEstimate:
+    """The spread; files of raytwin 0.1 have a Gaussian."""
+    sigma = _required(_get_estimate(noise, "psf_sigma_px"), "psf_sigma_px", path)
+    model = _text(noise.attrs["psf_model"])
+    if "tail_share" not in noise.attrs:
+        return gaussian_spread(model, sigma)
+    shape = {name: float(noise.attrs[name]) for name in ("aspect", "tail_share", "tail_px", "tail_order")}
+    found = {name: _get_estimate(noise, f"{name}_interval") for name in shape}
+    return SpreadEstimate(
+        value=Spread(model=model, sigma_px=sigma.value, **shape),
+        family=_text(noise.attrs["spread_family"]),
+        intervals={"sigma_px": sigma} | {name: known for name, known in found.items() if known is not None},
     )
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from .psf import blur_variance_share
 from .spectral_signal import SpectralModel, attenuation_scale_name
 from .twin import Level, NoiseModel, Twin
 
@@ -78,7 +77,7 @@ def slope_share(twin: Twin) -> float:
     ]
     if known:
         return math.exp(sum(known) / len(known))
-    share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    share = twin.noise.spread.value.variance_share
     white = twin.noise.white_fraction
     return (share + white) / (1.0 + white)
 
@@ -101,7 +100,7 @@ def slope_over_gain(
         return None
     slopes, gains = np.log(np.array(known)).mean(axis=0)
     share, mean_gain = math.exp(slopes - gains), math.exp(gains)
-    left = blur_variance_share(noise.psf_model, noise.psf_sigma_px.value)
+    left = noise.spread.value.variance_share
     white = (share - left) / (1.0 - left) if left < 0.999 else 0.0
     if not 0.0 <= white <= _LARGEST_SECONDARY:
         white = 0.0  # no noise of secondary quanta, but a spread that is not Gaussian
@@ -126,7 +125,7 @@ def gain_of_slope(twin: Twin, slope_DN: float) -> tuple[float, float]:
 
     gain = (slope - w) / h + w: after the spread, which leaves a share h of the quanta's variance, one pixel has the slope.
     """
-    left = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    left = twin.noise.spread.value.variance_share
     white = min(white_gain_DN(twin, slope_DN / slope_share(twin)), 0.9 * max(slope_DN, 0.0))
     return (slope_DN - white) / left + white, white
 
@@ -145,7 +144,7 @@ def secondary_gain_DN(twin: Twin, setting: Setting | None = None) -> float | Non
     Returns:
         0 or more; None where the twin has no levels.
     """
-    share = blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value)
+    share = twin.noise.spread.value.variance_share
     own = None if setting is None else twin.level_at(setting)
     levels = twin.levels if own is None else (own,)
     if not levels or share > 0.999:

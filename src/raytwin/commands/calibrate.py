@@ -120,7 +120,7 @@ def _text(result: dict[str, Any], path: Path) -> str:
     lines = [
         f"dark                {_interval(result['dark_DN'], ' DN')}",
         f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
-        f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['psf_model']})",
+        f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['spread']['family']})",
         f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
         f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
         f"bad pixels          {result['bad_pixels']['count']} ({result['bad_pixels']['share_percent']:.3g} %)",

@@ -1,0 +1,665 @@
+"""Optical spread, gains and read noise fitted together to the noise power of several series.
+
+P_s(f) = I_s [A_g S(f) + W_g] + r^2 + E_s f_0 / f + F_s (f_0 / f)^2
+
+S: power of unit quanta after the spread (1 at f = 0), so that the gain of a beam g is A_g + W_g; W: white noise that
+follows the signal; r^2: electronic noise; E, F: what is left of slow changes between frames, where the data show any or
+come from two series. The spread is chosen among kernel families by their evidence (Schwarz's criterion), and what the
+choice leaves open is part of the standard deviations. A second route to the gain, which knows no kernel, tests the first.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FitError
+from ..generator.psf import Spread
+from .noise_power import NoisePower, mode_share, smeared, spread_of_bins, usable
+
+FloatArray = NDArray[np.float64]
+# White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
+# quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
+WHITE_FRACTION_PRIOR = (0.003, 0.03)
+_LOW_BAND = 0.2  # cycles a pixel, up to which the second route extrapolates to 0
+_ROUNDING_DN2 = 1.0 / 12.0  # of an ADC in whole numbers
+_MOST_STEPS = 30
+_SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
+_REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
+_BOUNDS = {"sigma_px": (0.0, 12.0), "log_aspect": (-1.6, 1.6), "tail_share": (0.0, 1.0), "log_tail_px": (-1.6, 1.6)}
+# A tail that squares of M px cannot show passes for a smaller gain: it is glare, not spread. The longest reach L is that whose
+# transfer function is still 0.8 at 2 / M, the lowest frequency in full use: 2 pi L (2 / M) = 1/2.
+_LONGEST_TAIL = 1.0 / (8.0 * math.pi)
+_STARTS = {"sigma_px": 0.5, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0}
+_WIDTHS = ("sigma_px", "log_aspect")
+_TAIL = ("tail_share", "log_tail_px")
+_LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
+# description of the pixels, order of the tail, parameters
+_FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
+    "Gaussian, light collected in pixels": ("aperture", _LORENTZIAN, ("sigma_px",)),
+    "Gaussian, quanta counted in pixels": ("sampled", _LORENTZIAN, ("sigma_px",)),
+    "Gaussian with two widths": ("aperture", _LORENTZIAN, _WIDTHS),
+    "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px", *_TAIL)),
+    "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px", *_TAIL)),
+    "two widths with a Lorentzian tail": ("aperture", _LORENTZIAN, (*_WIDTHS, *_TAIL)),
+    "two widths with an exponential tail": ("aperture", _EXPONENTIAL, (*_WIDTHS, *_TAIL)),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpreadFit:
+    """Spread, gains and read noise of several series.
+
+    Fields: spread; family (in words); spread_sd (parameter -> standard deviation, of sigma_px, aspect, tail_share and
+    tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the spread's share restored;
+    slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
+    white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
+    in it, read_sd_DN2; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees: of the fit;
+    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its standard
+    deviation; criteria (family -> Schwarz's criterion above the best); expected_DN2: power of each series.
+    """
+
+    spread: Spread
+    family: str
+    spread_sd: dict[str, float]
+    gain_DN: FloatArray
+    gain_sd_DN: FloatArray
+    slope_DN: FloatArray
+    slope_sd_DN: FloatArray
+    white_fraction: FloatArray
+    read_variance_DN2: float
+    read_sd_DN2: float
+    row_variance_DN2: float
+    column_variance_DN2: float
+    chi_square: float
+    degrees: float
+    excess_DN2: FloatArray
+    other_route: tuple[float, float]
+    criteria: dict[str, float]
+    expected_DN2: tuple[FloatArray, ...] = field(repr=False)
+
+    @property
+    def sigma_px(self) -> float:
+        """Width of the Gaussian core, px."""
+        return self.spread.sigma_px
+
+    @property
+    def sigma_sd_px(self) -> float:
+        """Standard deviation of the core's width, px."""
+        return self.spread_sd["sigma_px"]
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """One family at its best."""
+
+    family: str
+    theta: FloatArray
+    spread: Spread
+    coefficients: FloatArray
+    covariance: FloatArray  # of coefficients and theta
+    chi_square: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return _FAMILIES[self.family][2]
+
+
+@lru_cache(maxsize=16)
+def _cells(side: int) -> tuple[FloatArray, FloatArray]:
+    """Means over cells of frequencies (cell, bin in use), and each cell's share of the modes (cell,).
+
+    Bins are single up to six and wider by a fifth from there: the power of a spread hardly changes inside a cell, and the fit
+    has a tenth of the numbers.
+    """
+    half = side // 2
+    order = np.arange(half + 1)
+    line = np.where(order <= 6, order, 6 + np.floor(np.log(np.maximum(order, 6) / 6.0) / math.log(1.2) + 1e-9)).astype(
+        int
+    )
+    used = usable(side)
+    label = (line[:, None] * (line[-1] + 1) + line[None, :])[used]
+    weight = mode_share(side)[used]
+    found, place = np.unique(label, return_inverse=True)
+    means = np.zeros((found.size, label.size))
+    means[place, np.arange(label.size)] = weight
+    share = means.sum(axis=1)
+    return means / share[:, None], share / share.sum()
+
+
+@dataclass(slots=True)
+class _Normal:
+    """Normal equations of the linear coefficients, and of the spread's parameters where their derivatives are given."""
+
+    matrix: FloatArray
+    right: FloatArray
+    square: float  # of the whitened data
+
+    def solved(self) -> tuple[FloatArray, float]:
+        """Coefficients and chi-square; what no datum tells stays 0."""
+        scale = np.sqrt(np.clip(np.diag(self.matrix), 1e-300, None))
+        scaled = self.matrix / np.outer(scale, scale) + 1e-11 * np.eye(len(scale))
+        found = np.linalg.solve(scaled, self.right / scale) / scale
+        return np.asarray(found), self.square - float(self.right @ found)
+
+    def covariance(self) -> FloatArray:
+        """Inverse of the matrix."""
+        scale = np.sqrt(np.clip(np.diag(self.matrix), 1e-300, None))
+        return np.asarray(np.linalg.pinv(self.matrix / np.outer(scale, scale), rcond=1e-10) / np.outer(scale, scale))
+
+
+class _Problem:
+    """Powers of the series; linear in all but the spread.
+
+    Series of a beam share their shape and differ in signal and weight alone, so that sums over them of weight, weight x signal
+    and weight x signal^2, cell by cell, are all that a fit asks of them.
+    """
+
+    def __init__(self, series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None) -> None:
+        self.series = list(series)
+        self.group = list(group)
+        self.groups = max(group, default=-1) + 1
+        self.sides = sorted({item.square_px for item in series})
+        self.data: list[FloatArray] = []
+        self.modes: list[FloatArray] = []
+        self.independent = 0.0  # bins are correlated: so many of them would be independent
+        for item in series:
+            means, share = _cells(item.square_px)
+            self.data.append(means @ item.power_DN2[item.used])
+            self.modes.append(share * item.modes.sum())
+            # cells of one bin scatter as overlapping squares do, wide ones as their modes say
+            self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
+        self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
+        # white noise is at no frequency more than what was measured there
+        pairs = zip(self.data, self.modes, strict=True)
+        self.most_read_DN2 = min(float(np.min(data * (1.0 + 5.0 / np.sqrt(modes)))) for data, modes in pairs)
+        if most_read_DN2 is not None:
+            self.most_read_DN2 = min(self.most_read_DN2, most_read_DN2)
+        # each series has a level of its own: weights begin from its mean
+        self.weigh([np.full(data.size, max(float(np.mean(data)), 1e-12)) for data in self.data])
+
+    def weigh(self, expected: Sequence[FloatArray]) -> None:
+        """Take the weights from expected powers (cell,) of each series."""
+        self.weights = [modes / power**2 for modes, power in zip(self.modes, expected, strict=True)]
+        self.sums: dict[tuple[int, int], FloatArray] = {}
+        self.square = 0.0
+        for item, group, data, weight in zip(self.series, self.group, self.data, self.weights, strict=True):
+            signal = item.signal_DN if group >= 0 else 0.0
+            rows = np.stack([weight * signal**2, weight * signal, weight * signal * data, weight, weight * data])
+            key = (item.square_px, group)
+            self.sums[key] = self.sums[key] + rows if key in self.sums else rows
+            self.square += float(np.sum(weight * data**2))
+
+    def shapes(self, spread: Spread) -> dict[int, FloatArray]:
+        """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
+        return {side: smeared(spread.noise_power(side)) for side in self.sides}
+
+    def in_cells(self, spread: Spread) -> dict[int, FloatArray]:
+        """The same (cell,)."""
+        return {side: _cells(side)[0] @ shape[usable(side)] for side, shape in self.shapes(spread).items()}
+
+    def normal(
+        self,
+        shapes: Mapping[int, FloatArray],
+        gains: FloatArray | None,
+        quantum: FloatArray | None = None,
+        slopes: Sequence[Mapping[int, FloatArray]] = (),
+    ) -> _Normal:
+        """Normal equations of A_0.., W_0.., r^2, E and F of each drifting series, and of the spread's parameters.
+
+        Args:
+            shapes: power of unit quanta (cell,) by side.
+            gains: (group,) that the white part's prior is relative to; None: no prior.
+            quantum: A (group,), for the spread's parameters.
+            slopes: derivatives of the shapes by these.
+        """
+        groups, read = self.groups, 2 * self.groups
+        drift = read + 1
+        theta = drift + 2 * len(self.drifting)
+        matrix = np.zeros((theta + len(slopes), theta + len(slopes)))
+        right = np.zeros(len(matrix))
+
+        def basis(side: int, group: int) -> tuple[list[int], FloatArray]:
+            """Places and columns (cell, column) of what a beam's signal is multiplied by."""
+            shape = shapes[side]
+            places = [group, groups + group, *range(theta, theta + len(slopes))]
+            moved = [] if quantum is None else [float(quantum[group]) * slope[side] for slope in slopes]
+            return places, np.stack([shape, np.ones_like(shape), *moved], axis=1)
+
+        for (side, group), (squared, single, single_data, plain, plain_data) in self.sums.items():
+            matrix[read, read] += plain.sum()
+            right[read] += plain_data.sum()
+            if group < 0:
+                continue
+            places, columns = basis(side, group)
+            matrix[np.ix_(places, places)] += columns.T @ (columns * squared[:, None])
+            cross = columns.T @ single
+            matrix[places, read] += cross
+            matrix[read, places] += cross
+            right[places] += columns.T @ single_data
+        for order, number in enumerate(self.drifting):
+            item, group = self.series[number], self.group[number]
+            own = [drift + 2 * order, drift + 2 * order + 1]
+            slow = _cells(item.square_px)[0] @ _slow(item.square_px)[:, usable(item.square_px)].T
+            weighted = slow * self.weights[number][:, None]
+            places, columns = basis(item.square_px, group)
+            matrix[np.ix_(own, own)] += slow.T @ weighted
+            cross = item.signal_DN * (columns.T @ weighted)
+            matrix[np.ix_(places, own)] += cross
+            matrix[np.ix_(own, places)] += cross.T
+            matrix[own, read] += weighted.sum(axis=0)
+            matrix[read, own] += weighted.sum(axis=0)
+            right[own] += weighted.T @ self.data[number]
+        if gains is not None:
+            centre, width = WHITE_FRACTION_PRIOR
+            for group, gain in enumerate(gains):
+                row = np.array([-centre, 1.0]) / (max(abs(float(gain)), 1e-12) * width)
+                both = [group, groups + group]
+                matrix[np.ix_(both, both)] += np.outer(row, row)
+        return _Normal(matrix, right, self.square)
+
+    def solve(self, spread: Spread) -> tuple[FloatArray, float]:
+        """Coefficients and chi-square at this spread, with the white part's prior about the gain that the data have."""
+        shapes = self.in_cells(spread)
+        first = self.normal(shapes, None).solved()[0]
+        # the sum is the gain, known even where the two cannot be told apart
+        return self.normal(shapes, self.gains(first)).solved()
+
+    def gains(self, coefficients: FloatArray) -> FloatArray:
+        """A + W (group,), DN."""
+        return np.asarray(coefficients[: self.groups] + coefficients[self.groups : 2 * self.groups])
+
+    def reweight(self, spread: Spread, coefficients: FloatArray) -> None:
+        """Weights from the fitted power: those from the measured one favour bins that came out low."""
+        shapes = self.in_cells(spread)
+        read = 2 * self.groups
+        expected = []
+        for number, (item, group, data) in enumerate(zip(self.series, self.group, self.data, strict=True)):
+            power = np.full(data.size, coefficients[read])
+            if group >= 0:
+                power += item.signal_DN * (
+                    coefficients[group] * shapes[item.square_px] + coefficients[self.groups + group]
+                )
+            if number in self.drifting:
+                place = read + 1 + 2 * self.drifting.index(number)
+                slow = _cells(item.square_px)[0] @ _slow(item.square_px)[:, usable(item.square_px)].T
+                power += slow @ coefficients[place : place + 2]
+            expected.append(np.maximum(power, 0.05 * np.minimum(data, float(np.mean(data)))))
+        self.weigh(expected)
+
+
+@lru_cache(maxsize=16)
+def _slow(side: int) -> FloatArray:
+    """f_0 / f and its square (2, K + 1, K + 1), 1 at the lowest frequency in full use: spectra of most slow processes lie between."""
+    order = np.arange(side // 2 + 1)
+    square = (order[:, None] ** 2 + order[None, :] ** 2).astype(np.float64)
+    square[0, 0] = 1.0
+    return np.stack([np.sqrt(8.0 / square), 8.0 / square])
+
+
+def _spread_of(family: str, theta: FloatArray) -> Spread:
+    model, order, names = _FAMILIES[family]
+    values = dict(zip(names, (float(value) for value in theta), strict=True))
+    return Spread(
+        model=model,
+        sigma_px=max(values["sigma_px"], 0.0),
+        aspect=math.exp(values.get("log_aspect", 0.0)),
+        tail_share=min(max(values.get("tail_share", 0.0), 0.0), 1.0),
+        tail_px=math.exp(values.get("log_tail_px", 0.0)),
+        tail_order=order,
+    )
+
+
+def _fitted(problem: _Problem, family: str, *, start: FloatArray | None = None) -> _Candidate:
+    """A family at its best."""
+    names = _FAMILIES[family][2]
+    bounds = np.array([_BOUNDS[name] for name in names]).T
+    if "log_tail_px" in names:
+        bounds[1, names.index("log_tail_px")] = math.log(_LONGEST_TAIL * max(problem.sides))
+
+    first = np.array([_STARTS[name] for name in names]) if start is None else start
+    first = np.clip(first, bounds[0] + 1e-3, bounds[1] - 1e-3)
+    tried = [_descended(problem, family, first, bounds)]
+    if "tail_share" in names and start is None:
+        wide = first.copy()
+        wide[names.index("tail_share")] = 0.8
+        tried.append(_descended(problem, family, wide, bounds))
+    theta, chi_square = min(tried, key=lambda one: one[1])
+    spread = _spread_of(family, theta)
+    coefficients, _ = problem.solve(spread)
+    slopes = _slopes(problem, family, theta)
+    normal = problem.normal(
+        problem.in_cells(spread), problem.gains(coefficients), coefficients[: problem.groups], slopes
+    )
+    candidate = _Candidate(family, theta, spread, coefficients, normal.covariance(), chi_square)
+    return _within_bounds(problem, candidate)
+
+
+def _slopes(problem: _Problem, family: str, theta: FloatArray) -> list[dict[int, FloatArray]]:
+    """Derivatives of the shapes (cell,), by side, by each parameter of the spread."""
+    found = []
+    for place, name in enumerate(_FAMILIES[family][2]):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = theta.copy()
+            moved[place] = np.clip(theta[place] + sign * 0.005, *_BOUNDS[name])
+            ends.append((moved[place], problem.in_cells(_spread_of(family, moved))))
+        step = max(ends[0][0] - ends[1][0], 1e-9)
+        found.append({side: (ends[0][1][side] - ends[1][1][side]) / step for side in problem.sides})
+    return found
+
+
+def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatArray) -> tuple[FloatArray, float]:
+    """Parameters of the spread at the least chi-square near a start, and that chi-square (Gauss and Newton's steps, halved
+    until they help)."""
+    coefficients, chi_square = problem.solve(_spread_of(family, theta))
+    for _ in range(_MOST_STEPS):
+        normal = problem.normal(
+            problem.in_cells(_spread_of(family, theta)),
+            problem.gains(coefficients),
+            coefficients[: problem.groups],
+            _slopes(problem, family, theta),
+        )
+        step = normal.solved()[0][-len(theta) :]
+        for share in (1.0, 0.5, 0.25, 0.1, 0.03):
+            moved = np.clip(theta + share * step, bounds[0], bounds[1])
+            there, value = problem.solve(_spread_of(family, moved))
+            if value < chi_square:
+                break
+        else:
+            return theta, chi_square
+        gained = chi_square - value
+        theta, coefficients, chi_square = moved, there, value
+        if gained < _SETTLED:
+            break
+    return theta, chi_square
+
+
+def _within_bounds(problem: _Problem, item: _Candidate) -> _Candidate:
+    """The candidate with electronic noise and slow changes kept where they can be.
+
+    Electronic noise is white: not negative, and at no frequency more than the power that was measured. Without repeated darks
+    it is an intercept that flats hardly tell. White noise that follows the signal and slow changes add power. The Gaussian of
+    each is cut at its bounds, and everything else follows by its covariance with it.
+    """
+    read = 2 * problem.groups
+    every, covariance = np.concatenate([item.coefficients, item.theta]), item.covariance
+    limits = {read: max(problem.most_read_DN2, 0.0)} | dict.fromkeys(range(problem.groups, read), math.inf)
+    limits |= dict.fromkeys(range(read + 1, len(item.coefficients)), math.inf)
+    for place, most in limits.items():
+        variance = max(float(covariance[place, place]), 1e-300)
+        value, own = float(every[place]), math.sqrt(variance)
+        mean, sd = _electronic(value, own, most) if place == read else truncated_gaussian(value, own, 0.0, most)
+        along = covariance[:, place] / variance
+        every = every + along * (mean - every[place])
+        covariance = covariance - np.outer(along, along) * (variance - sd**2)
+    coefficients, theta = every[: len(item.coefficients)], every[len(item.coefficients) :]
+    bounds = np.array([_BOUNDS[name] for name in item.names]).T
+    theta = np.clip(theta, bounds[0], bounds[1])
+    spread = _spread_of(item.family, theta)
+    return replace(item, coefficients=coefficients, theta=theta, spread=spread, covariance=covariance)
+
+
+def truncated_gaussian(mean: float, sd: float, low: float, high: float) -> tuple[float, float]:
+    """Mean and standard deviation of a Gaussian that is cut at `low` and `high`, in their unit."""
+    if sd <= 0 or high <= low:
+        return min(max(mean, low), max(high, low)), 0.0
+    # within eight standard deviations of the nearest value allowed nothing underflows
+    nearest = min(max(mean, low), high)
+    at = np.linspace(max(low, nearest - 8.0 * sd), min(high, nearest + 8.0 * sd), 4001)
+    off = (at - mean) / sd
+    weight = np.exp(-0.5 * (off**2 - float(np.min(off**2))))
+    weight /= weight.sum()
+    centre = float(np.sum(weight * at))
+    return centre, float(np.sqrt(np.sum(weight * (at - centre) ** 2)))
+
+
+def _electronic(value: float, sd: float, most: float) -> tuple[float, float]:
+    """Mean and sd (DN^2) of an electronic variance known as a Gaussian, of which nothing else is known but its upper bound.
+
+    The prior of a scale is uniform in its logarithm (Jeffreys), from the rounding of whole numbers up.
+    """
+    least = min(_ROUNDING_DN2, 1e-4 * most)
+    if not most > least > 0:
+        return max(value, 0.0), sd
+    top = min(most, max(value, least) + 8.0 * sd)
+    bottom = max(least, min(value, top) - 8.0 * sd)
+    at = np.geomspace(bottom, top, 4001)
+    off = (at - value) / sd
+    weight = np.exp(-0.5 * (off**2 - float(np.min(off**2))))
+    weight /= weight.sum()
+    centre = float(np.sum(weight * at))
+    return centre, float(np.sqrt(np.sum(weight * (at - centre) ** 2)))
+
+
+def _best(problem: _Problem, families: Sequence[str]) -> tuple[dict[str, _Candidate], str]:
+    """All families at their best, and the one of the highest evidence; the weights are its own."""
+    # the simplest and the most general family set the weights, which hardly depend on the rest
+    found = {family: _fitted(problem, family) for family in dict.fromkeys((families[0], families[-1]))}
+    for _ in range(_REWEIGHTED - 1):
+        best = min(found, key=lambda family: _criterion(problem, found[family]))
+        problem.reweight(found[best].spread, found[best].coefficients)
+        found = {best: _fitted(problem, best, start=found[best].theta)}
+    found = {family: _fitted(problem, family) for family in families}
+    return found, min(found, key=lambda family: _criterion(problem, found[family]))
+
+
+def _criterion(problem: _Problem, candidate: _Candidate) -> float:
+    """Schwarz's criterion (Ann. Stat. 6 (1978) 461): chi-square and ln n for each parameter of the spread."""
+    return candidate.chi_square + len(candidate.names) * math.log(max(problem.independent, 2.0))
+
+
+def fit_spread(
+    series: Sequence[NoisePower],
+    *,
+    group: Sequence[int],
+    most_read_DN2: float | None = None,
+    families: Sequence[str] = tuple(_FAMILIES),
+) -> SpreadFit:
+    """Spread, gains and read noise from the noise power of series (weighted least squares, weights from the fit itself).
+
+    Standard deviations hold: sampling; the misfit, by chi-square where it is above its expectation; what other families
+    say, by their evidence (model averaging); and for gains the second route, where it differs by more than its own noise.
+
+    Args:
+        series: noise powers, darks included (signal 0).
+        group: per series, the index of its kV and filter; -1 for darks.
+        most_read_DN2: read variance that the darks allow at most, where they were not repeated.
+        families: kernel families to try.
+
+    Raises:
+        FitError: no series with signal, or the least-squares problem has no solution.
+
+    Source: model averaging: Buckland, Burnham, Augustin, Biometrics 53 (1997) 603; test of two routes: Hausman,
+    Econometrica 46 (1978) 1251. Checked against: noise of known spread, tests/test_calibration_spread_fit.py.
+    """
+    if not any(index >= 0 for index in group):
+        raise FitError("the noise fit needs at least one flat series with two or more frames")
+    problem = _Problem(series, group, most_read_DN2)
+    found, best = _best(problem, families)
+    drifting = _drifting(problem, found[best])
+    if drifting != problem.drifting:
+        problem.drifting = drifting
+        found, best = _best(problem, families)
+    chosen = found[best]
+    groups = problem.groups
+    if not np.all(np.isfinite(chosen.coefficients)):
+        raise FitError("the noise power has no finite fit; look for saturated or constant frames")
+    inflation = max(1.0, chosen.chi_square / problem.independent)
+    criteria = {family: _criterion(problem, item) for family, item in found.items()}
+    lowest = min(criteria.values())
+    weights = {family: math.exp(-0.5 * (value - lowest) / inflation) for family, value in criteria.items()}
+    total = sum(weights.values())
+
+    def gains_of(item: _Candidate) -> tuple[FloatArray, FloatArray]:
+        quantum, white = item.coefficients[:groups], item.coefficients[groups : 2 * groups]
+        return quantum + white, quantum * item.spread.variance_share + white
+
+    gain, slope = gains_of(chosen)
+    gain_variance, slope_variance = _variances(chosen, groups, inflation)
+    spread_variance = _spread_variances(chosen, inflation)
+    for family, item in found.items():
+        if family == best:
+            continue
+        share = weights[family] / total
+        other_gain, other_slope = gains_of(item)
+        gain_variance = gain_variance + share * (other_gain - gain) ** 2
+        slope_variance = slope_variance + share * (other_slope - slope) ** 2
+        for name in spread_variance:
+            moved = getattr(item.spread, name) - getattr(chosen.spread, name)
+            if name != "tail_px" or min(item.spread.tail_share, chosen.spread.tail_share) > 0:
+                spread_variance[name] += share * moved**2
+    expected = _expected(problem, chosen)
+    other = _other_route(problem, chosen, expected)
+    gain_variance = gain_variance + max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2) * gain**2
+    quantum, white = chosen.coefficients[:groups], chosen.coefficients[groups : 2 * groups]
+    rows, columns, lines_sd = _line_variances(series, group)
+    read = float(chosen.coefficients[2 * groups])
+    excess = np.zeros(len(series))
+    excess[list(problem.drifting)] = chosen.coefficients[2 * groups + 1 :].reshape(-1, 2).sum(axis=1)
+    return SpreadFit(
+        spread=chosen.spread,
+        family=best,
+        spread_sd={name: math.sqrt(value) for name, value in spread_variance.items()},
+        gain_DN=gain,
+        gain_sd_DN=np.sqrt(gain_variance),
+        slope_DN=slope,
+        slope_sd_DN=np.sqrt(slope_variance),
+        white_fraction=white / np.where(quantum > 0, quantum, np.nan),
+        read_variance_DN2=read + rows + columns,
+        read_sd_DN2=math.hypot(
+            math.sqrt(max(inflation * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd
+        ),
+        row_variance_DN2=max(rows, 0.0),
+        column_variance_DN2=max(columns, 0.0),
+        chi_square=chosen.chi_square,
+        degrees=problem.independent,
+        excess_DN2=excess,
+        other_route=other,
+        criteria={family: value - lowest for family, value in criteria.items()},
+        expected_DN2=expected,
+    )
+
+
+def _drifting(problem: _Problem, candidate: _Candidate) -> tuple[int, ...]:
+    """Series with slow changes: differences between series always, others where these stand out (Schwarz's criterion)."""
+    lit = tuple(number for number, group in enumerate(problem.group) if group >= 0)
+    always = problem.drifting
+    problem.drifting = lit
+    coefficients, _ = problem.solve(candidate.spread)
+    covariance = problem.normal(problem.in_cells(candidate.spread), problem.gains(coefficients)).covariance()
+    problem.drifting = always
+    first = 2 * problem.groups + 1
+    needed = math.log(max(problem.independent, 2.0))
+    found = []
+    for order, number in enumerate(lit):
+        place = slice(first + 2 * order, first + 2 * order + 2)
+        own = coefficients[place]
+        gained = float(own @ np.linalg.pinv(covariance[place, place]) @ own)
+        if number in always or (own.sum() > 0 and gained > 2.0 * needed):
+            found.append(number)
+    return tuple(found)
+
+
+def _variances(item: _Candidate, groups: int, inflation: float) -> tuple[FloatArray, FloatArray]:
+    """Sampling variances of gains and slopes (group,), DN^2."""
+    size = len(item.covariance)
+    linear = len(item.coefficients)
+    share = item.spread.variance_share
+    slopes = np.zeros(len(item.theta))
+    for place, name in enumerate(item.names):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = item.theta.copy()
+            moved[place] = np.clip(moved[place] + sign * 0.01, *_BOUNDS[name])
+            ends.append((moved[place], _spread_of(item.family, moved).variance_share))
+        slopes[place] = (ends[0][1] - ends[1][1]) / max(ends[0][0] - ends[1][0], 1e-9)
+    gains, pixel = [], []
+    for g in range(groups):
+        direction = np.zeros(size)
+        direction[g] = direction[groups + g] = 1.0
+        gains.append(max(float(direction @ item.covariance @ direction), 0.0))
+        direction[g] = share
+        direction[linear:] = item.coefficients[g] * slopes
+        pixel.append(max(float(direction @ item.covariance @ direction), 0.0))
+    return inflation * np.array(gains), inflation * np.array(pixel)
+
+
+def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:
+    """Sampling variances of the spread's parameters; those that the family does not have are 0."""
+    linear = len(item.coefficients)
+    own = {
+        name: max(inflation * float(item.covariance[linear + i, linear + i]), 0.0) for i, name in enumerate(item.names)
+    }
+    return {
+        "sigma_px": own.get("sigma_px", 0.0),
+        "aspect": own.get("log_aspect", 0.0) * item.spread.aspect**2,
+        "tail_share": own.get("tail_share", 0.0),
+        "tail_px": own.get("log_tail_px", 0.0) * item.spread.tail_px**2,
+    }
+
+
+def _expected(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
+    """Fitted power (K + 1, K + 1) of each series over all frequencies, slow changes left out."""
+    shapes = problem.shapes(item.spread)
+    groups = problem.groups
+    result = []
+    for one, group in zip(problem.series, problem.group, strict=True):
+        power = np.full(one.power_DN2.shape, float(item.coefficients[2 * groups]))
+        if group >= 0:
+            quantum, white = item.coefficients[group], item.coefficients[groups + group]
+            power = power + one.signal_DN * (quantum * shapes[one.square_px] + white)
+        result.append(power)
+    return tuple(result)
+
+
+def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]) -> tuple[float, float]:
+    """Gain by extrapolation of the low-frequency power to 0, over the fit's, and its standard deviation.
+
+    The ratio of measured to fitted power of the quanta, up to 0.2 cycles a pixel, as 1 + a + b f_row^2 + c f_column^2: it
+    asks no kernel family, only that the ratio is smooth.
+    """
+    rows, weights, values = [], [], []
+    read = float(item.coefficients[2 * problem.groups])
+    lit = list(problem.drifting)
+    for number, (one, group, power) in enumerate(zip(problem.series, problem.group, expected, strict=True)):
+        if group < 0:
+            continue
+        frequency = np.arange(power.shape[0]) / one.square_px
+        square = frequency[:, None] ** 2 + frequency[None, :] ** 2
+        band = one.used & (square < _LOW_BAND**2) & (power > read)
+        if not band.any():
+            continue
+        excess = np.zeros(power.shape)
+        if number in lit:
+            place = 2 * problem.groups + 1 + 2 * lit.index(number)
+            excess = np.tensordot(item.coefficients[place : place + 2], _slow(one.square_px), axes=1)
+        quanta = (power - read)[band]
+        values.append((one.power_DN2 - power - excess)[band] / quanta)
+        weights.append(one.modes[band] * (quanta / power[band]) ** 2)
+        grid = np.broadcast_arrays(frequency[:, None] ** 2, frequency[None, :] ** 2)
+        rows.append(np.column_stack([np.ones(quanta.size), grid[0][band], grid[1][band]]))
+    if not rows:
+        return 1.0, math.inf
+    design, weight, value = np.concatenate(rows), np.concatenate(weights), np.concatenate(values)
+    information = design.T @ (design * weight[:, None])
+    if np.linalg.matrix_rank(information / np.trace(information)) < 3:
+        return 1.0, math.inf
+    covariance = np.linalg.inv(information)
+    ratio = 1.0 + float((covariance @ (design.T @ (weight * value)))[0])
+    return ratio, math.sqrt(float(covariance[0, 0]))
+
+
+def _line_variances(series: Sequence[NoisePower], group: Sequence[int]) -> tuple[float, float, float]:
+    """Variance of rows' and of columns' offsets (DN^2), of the darks where there are any, and its standard deviation."""
+    darks = [item for item, number in zip(series, group, strict=True) if number < 0] or list(series)
+    found, sds = [], []
+    for kind in ("row", "column"):
+        weight = np.array([1.0 / max(getattr(item, f"{kind}_sd_DN2"), 1e-12) ** 2 for item in darks])
+        values = np.array([getattr(item, f"{kind}_variance_DN2") for item in darks])
+        found.append(float(np.sum(weight * values) / weight.sum()))
+        sds.append(float(1.0 / math.sqrt(weight.sum())))
+    return found[0], found[1], math.hypot(*sds)

@@ -23,7 +23,15 @@ def series_line():
     from raytwin.acquisition.setting import filters_from_text
     from raytwin.generator.psf import blur_variance_share
     from raytwin.generator.spectral_signal import SpectralModel
-    from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, SpectralPosterior, Twin, estimate_from_sd
+    from raytwin.generator.twin import (
+        DetectorMaps,
+        Level,
+        NoiseModel,
+        SpectralPosterior,
+        Twin,
+        estimate_from_sd,
+        gaussian_spread,
+    )
 
     shape, sigma_px, white = (40, 40), 0.5, 0.01
     copper = filters_from_text("Cu:0.05")
@@ -69,8 +77,7 @@ def series_line():
             bad_pixels=np.zeros(shape, dtype=np.uint8),
         ),
         noise=NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(sigma_px, 0.003),
+            spread=gaussian_spread("aperture", estimate_from_sd(sigma_px, 0.003)),
             white_fraction=white,
             read_noise_DN=estimate_from_sd(12.0, 0.05),
             quantised=True,
@@ -118,7 +125,15 @@ def make_model_twin():
     from raytwin.generator.predict import predict_flatfield
     from raytwin.generator.psf import blur_variance_share
     from raytwin.generator.spectral_signal import SpectralModel
-    from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, SpectralPosterior, Twin, estimate_from_sd
+    from raytwin.generator.twin import (
+        DetectorMaps,
+        Level,
+        NoiseModel,
+        SpectralPosterior,
+        Twin,
+        estimate_from_sd,
+        gaussian_spread,
+    )
 
     copper, scintillator = filters_from_text("Cu:0.05"), filters_from_text("CsI:0.5")
     sigma_px, white, read_DN = 0.5, 0.01, 12.0
@@ -160,8 +175,7 @@ def make_model_twin():
                 bad_pixels=np.zeros(shape, dtype=np.uint8),
             ),
             noise=NoiseModel(
-                psf_model="aperture",
-                psf_sigma_px=estimate_from_sd(sigma_px, 0.003),
+                spread=gaussian_spread("aperture", estimate_from_sd(sigma_px, 0.003)),
                 white_fraction=white,
                 read_noise_DN=estimate_from_sd(read_DN, 0.05),
                 quantised=True,

@@ -4,19 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.calibration.flat_levels import median_variance
-from raytwin.calibration.noise_covariance import compute_noise_covariance, fit_spread, sampling_covariance
 from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
 from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.twin import Estimate, Level, NoiseModel, estimate_from_sd
+from raytwin.generator.twin import Estimate, Level, NoiseModel, estimate_from_sd, gaussian_spread
 from raytwin.generator.twin_spectrum import slope_over_gain
-
-SMALL = (24, 24)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 4.0])
@@ -32,42 +29,6 @@ def test_noise_of_a_median_over_pixels_grows_with_the_spread_of_the_map(spread):
     # the maps are the independent ones
     error = np.std(squares) / math.sqrt(maps)
     assert np.mean(squares) == pytest.approx(stated, rel=0.15, abs=3.5 * error)
-
-
-def test_shares_of_lags_rows_and_columns_beyond_the_frame_are_missing():
-    rng = np.random.default_rng(1)
-    found = compute_noise_covariance(
-        [rng.standard_normal((8, *SMALL))], signal_DN=np.zeros(SMALL), good=np.ones(SMALL, dtype=bool), radius=4
-    )
-    expected = np.outer(1.0 - np.abs(np.arange(-4, 5)) / SMALL[0], 1.0 - np.abs(np.arange(-4, 5)) / SMALL[1])
-    assert found.pair_share == pytest.approx(expected)
-
-
-def test_sampling_covariance_of_white_noise_is_that_of_the_pairs_there_are():
-    covariance = np.zeros((9, 9))
-    covariance[4, 4] = 3.0
-    share = np.full((9, 9), 0.5)
-    share[4, 4] = 1.0
-    matrix = sampling_covariance(covariance, 1000.0, 2, share)
-    assert matrix[0, 0] == pytest.approx(2 * 9.0 / 1000.0)
-    assert np.diag(matrix)[1:] == pytest.approx(9.0 / 500.0)
-
-
-def test_chi_square_of_a_small_frame_is_that_of_its_degrees_of_freedom():
-    rng = np.random.default_rng(2)
-    good = np.ones(SMALL, dtype=bool)
-    total, degrees = 0.0, 0
-    for _ in range(12):
-        flat = compute_noise_covariance(
-            [20.0 * rng.standard_normal((40, *SMALL))], signal_DN=np.full(SMALL, 400.0), good=good, radius=5
-        )
-        dark = compute_noise_covariance(
-            [5.0 * rng.standard_normal((40, *SMALL))], signal_DN=np.zeros(SMALL), good=good, radius=5
-        )
-        found = fit_spread([flat, dark], group=[0, -1], models=["aperture"])
-        total, degrees = total + found.chi_square, degrees + found.degrees
-    # 5 % beside chance: differences of neighbouring frames make covariances a little less than Gaussian
-    assert total < 1.05 * chi2.ppf(0.999, degrees)
 
 
 def test_sd_of_a_mixture_has_its_interval():
@@ -120,8 +81,7 @@ def levels_with(slope_of_gain, gains):
 
 def noise_of(sigma_px):
     return NoiseModel(
-        psf_model="aperture",
-        psf_sigma_px=Estimate(value=sigma_px, low=sigma_px, high=sigma_px),
+        spread=gaussian_spread("aperture", Estimate(value=sigma_px, low=sigma_px, high=sigma_px)),
         white_fraction=0.01,
         read_noise_DN=estimate_from_sd(1.0, 0.01),
         quantised=True,

@@ -11,7 +11,7 @@ from raytwin.calibration.calibrate import bad_pixel_counts, calibrate_twin, cali
 from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.errors import InputError
 from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import blur_variance_share
+from raytwin.generator.psf import Spread, blur_variance_share
 from raytwin.generator.twin import BAD_PIXEL_CODES
 
 SHAPE = (40, 40)
@@ -31,8 +31,7 @@ def flat_frames(level, *, count=24, rng, gain=GAIN, read_DN=READ_DN, dark=DARK_D
             gain_DN=gain,
             white_fraction=WHITE,
             read_variance_DN2=read_DN**2,
-            psf_model="aperture",
-            psf_sigma_px=SIGMA,
+            spread=Spread(sigma_px=SIGMA),
             rng=rng,
         )
         for _ in range(count)
@@ -90,7 +89,7 @@ def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
     slope = GAIN * (blur_variance_share("aperture", SIGMA) + WHITE) / (1 + WHITE)
     assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.03)
-    assert clean.noise.psf_sigma_px.value == pytest.approx(SIGMA, rel=0.03)
+    assert clean.noise.spread.value.sigma_px == pytest.approx(SIGMA, rel=0.03)
     assert clean.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.02)
     assert clean.noise.quantised
     assert clean.dark_DN.value == pytest.approx(DARK_DN, abs=0.3)

@@ -16,7 +16,7 @@ from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
 from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd
+from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 
 SHAPE = (8, 8)
 INSTRUMENT = Instrument(
@@ -94,8 +94,7 @@ def twin_of(model, truth, beams, *, instrument=INSTRUMENT):
             bad_pixels=np.zeros(SHAPE, dtype=np.uint8),
         ),
         noise=NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(0.5, 0.01),
+            spread=gaussian_spread("aperture", estimate_from_sd(0.5, 0.01)),
             white_fraction=0.0,
             read_noise_DN=estimate_from_sd(1.0, 0.01),
             quantised=True,

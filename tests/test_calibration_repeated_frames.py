@@ -13,7 +13,7 @@ from raytwin.diagnosis.preparation import calibrated_twin
 from raytwin.diagnosis.session import only_own_noise, read_session
 from raytwin.errors import InputError
 from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import blur_variance_share
+from raytwin.generator.psf import Spread, blur_variance_share
 
 SHAPE = (64, 64)
 GAIN, SIGMA, READ_DN, DARK_DN, AVERAGED = 9.0, 0.55, 11.0, 1200.0, 16
@@ -31,8 +31,7 @@ def exposures(mean, count, rng, gain=GAIN):
             gain_DN=gain,
             white_fraction=0.003,
             read_variance_DN2=READ_DN**2,
-            psf_model="aperture",
-            psf_sigma_px=SIGMA,
+            spread=Spread(sigma_px=SIGMA),
             rng=rng,
         )
         for _ in range(count)
@@ -108,7 +107,7 @@ def test_the_noise_of_the_field_beside_objects_is_that_of_the_beam(found):
     assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
     slope = GAIN * (blur_variance_share("aperture", SIGMA) + 0.003) / 1.003
     assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.02)
-    assert found.noise.psf_sigma_px.value == pytest.approx(SIGMA, rel=0.04)
+    assert found.noise.spread.value.sigma_px == pytest.approx(SIGMA, rel=0.04)
     (row,) = found.evidence["repeated_frames"]
     assert row["where"] == "beside objects"
     assert len(row["series"]) == 12
@@ -180,7 +179,7 @@ def test_without_any_repeated_frame_one_line_says_what_is_missing(tmp_path, word
 def test_a_wide_spread_is_fitted_as_far_as_the_open_field_reaches(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "SIGMA", 2.2)
     wide = transfer_of(write_session(tmp_path / "wide.h5", share=0.75, objects=8))
-    assert wide.noise.psf_sigma_px.value == pytest.approx(2.2, rel=0.1)
+    assert wide.noise.spread.value.sigma_px == pytest.approx(2.2, rel=0.1)
 
 
 def test_objects_in_another_beam_say_nothing_of_this_one(tmp_path):

@@ -10,7 +10,7 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.sessions import merge_sessions, one_layer, select_layer
 from raytwin.calibration.bad_pixels import cluster_evidence
 from raytwin.calibration.calibrate import bad_pixel_counts
-from raytwin.calibration.noise_covariance import compute_noise_covariance
+from raytwin.calibration.noise_power import compute_noise_power
 from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.cli import main
 from raytwin.errors import InputError
@@ -147,17 +147,18 @@ def test_clusters_are_counted_as_groups_that_touch():
     assert cluster_evidence(np.zeros((4, 4), np.uint8)) == {"groups": 0, "largest": 0, "kernel_pixels": 0}
 
 
-def test_stack_and_pair_covariances_agree_on_white_frames():
+def test_stack_and_pair_noise_power_agree_on_white_frames():
     rng = np.random.default_rng(4)
     frames = 3.0 * rng.standard_normal((40, 48, 48))
     good = np.ones((48, 48), bool)
     signal = np.zeros((48, 48))
     about = (frames.mean(axis=0), len(frames))
-    stack = compute_noise_covariance([frames], signal_DN=signal, good=good, radius=2, about=about)
-    pairs = compute_noise_covariance([frames], signal_DN=signal, good=good, radius=2)
+    stack = compute_noise_power([frames], signal_DN=signal, good=good, about=about)
+    pairs = compute_noise_power([frames], signal_DN=signal, good=good)
     for found in (stack, pairs):
-        assert found.covariance_DN2[2, 2] == pytest.approx(9.0, abs=5 * 9.0 * np.sqrt(2 / found.samples))
-    assert stack.samples == pytest.approx(39 * 48 * 48)
+        flat = np.full(found.power_DN2.shape, 9.0)
+        assert found.variance_DN2(flat) == pytest.approx(9.0, abs=5 * 9.0 * np.sqrt(2 / found.samples))
+    assert pairs.samples < stack.samples < 39 * 48 * 48
     assert stack.samples > 1.4 * pairs.samples
 
 

@@ -15,7 +15,6 @@ from raytwin.cli import main
 from raytwin.diagnosis import coarse
 from raytwin.diagnosis.coarse_twin import twin_in_squares
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.psf import blur_variance_share
 from raytwin.generator.series import SeriesRequest, expected_series
 from raytwin.generator.twin_io import read_twin
 
@@ -61,9 +60,10 @@ def test_maps_and_levels_are_those_of_averaged_frames(both):
 
 def test_light_spreads_over_as_much_less_of_a_square(both):
     _, squares, averaged = both
-    left = [blur_variance_share(twin.noise.psf_model, twin.noise.psf_sigma_px.value) for twin in (squares, averaged)]
+    left = [twin.noise.spread.value.variance_share for twin in (squares, averaged)]
     assert left[0] == pytest.approx(left[1], rel=0.03)
-    assert squares.noise.psf_sigma_px.low <= squares.noise.psf_sigma_px.value <= squares.noise.psf_sigma_px.high
+    width = squares.noise.spread.intervals["sigma_px"]
+    assert width.low <= width.value <= width.high
 
 
 def test_spectra_give_squares_the_level_of_pixels_and_fewer_dn_a_photon(both, session):

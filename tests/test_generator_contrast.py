@@ -25,6 +25,7 @@ from raytwin.generator.contrast import (
     published_delta_r,
 )
 from raytwin.generator.noise import sample_frame_noise
+from raytwin.generator.psf import Spread
 from raytwin.materials import material_from_name, mu_per_mm
 
 LOW = setting_from_text("kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05")
@@ -140,8 +141,7 @@ def test_noise_is_that_of_quotients_of_drawn_frames(sigma_px, pixels):
                 gain_DN=gain,
                 white_fraction=0.0,
                 read_variance_DN2=80.0**2,
-                psf_model="aperture",
-                psf_sigma_px=sigma_px,
+                spread=Spread(sigma_px=sigma_px),
                 rng=rng,
             )
             logs.append(-np.log((signal + noise) / open_signal))

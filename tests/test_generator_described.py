@@ -22,7 +22,7 @@ from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
 from raytwin.generator.render import Geometry, geometry_of, render_expected
 from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.twin import estimate_from_sd
+from raytwin.generator.twin import estimate_from_sd, gaussian_spread
 from raytwin.generator.twin_io import write_twin
 
 SHAPE = (64, 80)
@@ -86,7 +86,7 @@ def channels_of(twin):
 
 
 def test_a_render_without_blur_is_the_sum_over_energies_within_1e_4(twin):
-    sharp = replace(twin, noise=replace(twin.noise, psf_sigma_px=estimate_from_sd(0.0, 0.0)))
+    sharp = replace(twin, noise=replace(twin.noise, spread=gaussian_spread("aperture", estimate_from_sd(0.0, 0.0))))
     geometry = geometry_of(sharp, settings=(LOW, HIGH))
     rng = np.random.default_rng(1)
     lengths = {"chicken_breast": rng.uniform(0, 30, SHAPE), "rib_bone": rng.uniform(0, 3, SHAPE)}
@@ -98,7 +98,7 @@ def test_a_render_without_blur_is_the_sum_over_energies_within_1e_4(twin):
 
 def test_signals_not_path_lengths_are_averaged_over_a_pixel(twin):
     """The planted fault would be the mean thickness: behind a step in a pixel more comes through than behind its mean."""
-    sharp = replace(twin, noise=replace(twin.noise, psf_sigma_px=estimate_from_sd(0.0, 0.0)))
+    sharp = replace(twin, noise=replace(twin.noise, spread=gaussian_spread("aperture", estimate_from_sd(0.0, 0.0))))
     geometry = geometry_of(sharp, settings=(LOW, HIGH))
     fine = np.zeros((3 * SHAPE[0], 3 * SHAPE[1]))
     fine[:, 1::3] = 30.0

@@ -1037,7 +1037,7 @@ def light_pairs(name, parameters, line, rng, count):
     covariance of two pixels that one lands in each. No transfer function is used.
     """
     place = rng.random((2, count))
-    sigma = line.noise.psf_sigma_px.value
+    sigma = line.noise.spread.value.sigma_px
 
     def disc(reach):
         distance, angle = rng.exponential(reach, count), rng.uniform(0, 2 * math.pi, count)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition import Filter, Instrument, Setting, filters_from_text, setting_from_text
 from raytwin.errors import InputError
-from raytwin.generator.binning import binned_pixel, binned_variance_share
+from raytwin.generator.binning import binned_pixel
 from raytwin.generator.contrast import predict_contrast
 from raytwin.generator.dual_layer import predict_back_layer
 from raytwin.generator.line_limits import (
@@ -24,7 +24,7 @@ from raytwin.generator.line_limits import (
     shortest_interval_ms,
 )
 from raytwin.generator.predict import binned_over_single, predict_flatfield, spectral_model_of
-from raytwin.generator.psf import blur_variance_share, sampled_gaussian_1d
+from raytwin.generator.psf import Spread, blur_variance_share, sampled_gaussian_1d
 from raytwin.generator.spectral_signal import OpenBeam
 from raytwin.generator.twin_io import read_twin, write_twin
 from raytwin.materials import transmission
@@ -179,16 +179,18 @@ def test_binned_noise_is_that_of_blurred_quanta_drawn_and_binned(binning):
             quanta = spread
         blocks = quanta.reshape(size // binning, binning, size // binning, binning).mean(axis=(1, 3))
         variances.append(np.mean(blocks**2))
-    expected = binned_variance_share("sampled", sigma, binning) / binning**2
+    expected = Spread(model="sampled", sigma_px=sigma).binned_variance_share(binning) / binning**2
     assert np.mean(variances) == pytest.approx(expected, abs=5 * np.std(variances) / math.sqrt(frames))
 
 
 @given(st.sampled_from(["aperture", "sampled"]), st.floats(0.0, 2.0), st.integers(1, 30))
 def test_binning_shares_rise_from_one_pixel_s_to_that_of_the_quanta(model, sigma, binning):
-    share = binned_variance_share(model, sigma, binning)
-    assert binned_variance_share(model, sigma, 1) == pytest.approx(blur_variance_share(model, sigma), rel=1e-6)
-    assert share <= binned_variance_share(model, sigma, binning + 1) + 1e-12 <= 1.0 + 1e-9
-    assert binned_variance_share(model, sigma, 4000) == pytest.approx(1.0, abs=0.01)
+    share = Spread(model=model, sigma_px=sigma).binned_variance_share(binning)
+    assert Spread(model=model, sigma_px=sigma).binned_variance_share(1) == pytest.approx(
+        blur_variance_share(model, sigma), rel=1e-6
+    )
+    assert share <= Spread(model=model, sigma_px=sigma).binned_variance_share(binning + 1) + 1e-12 <= 1.0 + 1e-9
+    assert Spread(model=model, sigma_px=sigma).binned_variance_share(400) == pytest.approx(1.0, abs=0.01)
 
 
 def test_binned_flatfields_add_signal_noise_and_photons_as_the_readout_does(twin):

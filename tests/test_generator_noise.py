@@ -8,7 +8,7 @@ from scipy.stats import skew
 
 from raytwin.errors import InputError
 from raytwin.generator.noise import digitise, frame_sd_DN, sample_correlated_quanta, sample_frame_noise
-from raytwin.generator.psf import noise_autocovariance
+from raytwin.generator.psf import Spread, noise_autocovariance
 
 SIGMA = 0.6
 WHITE = 0.01
@@ -20,8 +20,7 @@ def noise_frames(count, *, signal=400.0, shape=(48, 48), seed=0, **changes):
         "gain_DN": 7.0,
         "white_fraction": WHITE,
         "read_variance_DN2": 150.0,
-        "psf_model": "aperture",
-        "psf_sigma_px": SIGMA,
+        "spread": Spread(sigma_px=SIGMA),
         **changes,
     }
     level = np.full(shape, signal)
@@ -101,9 +100,9 @@ def test_same_generator_state_gives_the_same_noise():
 def test_impossible_variances_and_steps_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match=r"quantum variance: got -1.0; expected 0 DN\^2 or more"):
-        sample_correlated_quanta(np.array([[1.0, -1.0]]), 1.0, psf_model="aperture", psf_sigma_px=0.5, rng=rng)
+        sample_correlated_quanta(np.array([[1.0, -1.0]]), 1.0, spread=Spread(sigma_px=0.5), rng=rng)
     with pytest.raises(InputError, match="DN a quantum"):
-        sample_correlated_quanta(np.ones((2, 2)), 0.0, psf_model="aperture", psf_sigma_px=0.5, rng=rng)
+        sample_correlated_quanta(np.ones((2, 2)), 0.0, spread=Spread(sigma_px=0.5), rng=rng)
 
 
 def test_sd_of_averaged_frames_falls_with_the_root_of_their_number():

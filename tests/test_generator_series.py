@@ -16,9 +16,10 @@ from raytwin.generator._spread import noise_pattern
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.line_state import LineState
 from raytwin.generator.predict import predict_flatfield, spectral_model_of
-from raytwin.generator.psf import noise_autocovariance_1d
+from raytwin.generator.psf import Spread, noise_autocovariance_1d
 from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
 from raytwin.generator.spectral_signal import OpenBeam
+from raytwin.generator.twin import gaussian_spread
 from raytwin.generator.twin_io import read_twin, write_twin
 from raytwin.generator.twin_spectrum import slope_over_gain, white_gain_DN
 
@@ -250,7 +251,12 @@ def test_a_displaced_scene_is_the_scene_drawn_elsewhere(series_line, displacemen
 
 @pytest.mark.parametrize("displacement", [(0.04, -0.16), (0.5, 1.3)])
 def test_a_scene_of_points_is_moved_without_ringing_beside_its_steps(series_line, displacement):
-    points = replace(series_line, noise=replace(series_line.noise, psf_model="sampled"))
+    points = replace(
+        series_line,
+        noise=replace(
+            series_line.noise, spread=gaussian_spread("sampled", series_line.noise.spread.intervals["sigma_px"])
+        ),
+    )
     row, column = np.indices(SHAPE)
     step = {"Al": np.where((row > 12) & (column > 14), 6.0, 0.0)}
     flat = expected_series(points, request()).signal_DN
@@ -325,7 +331,7 @@ def test_the_general_noise_pattern_of_an_unchanged_spread_is_the_calibrated_one(
     )
     for model in ("aperture", "sampled"):
         for sigma in (0.3, 0.5, 0.9):
-            found = noise_pattern(model, sigma, state)
+            found = noise_pattern(Spread(model=model, sigma_px=sigma), state)
             half = noise_autocovariance_1d(model, sigma, 3)
             assert found.share == pytest.approx(half[0] ** 2, rel=1e-6)
             np.testing.assert_allclose(found.autocovariance, np.outer(half, half) / half[0] ** 2, atol=1e-6)

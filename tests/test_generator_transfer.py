@@ -17,7 +17,7 @@ from raytwin.errors import InputError
 from raytwin.generator.generate import ChannelModel, PairTransfer, generate_dataset
 from raytwin.generator.noise import sample_frame_noise
 from raytwin.generator.predict import predict_flatfield, spectral_model_of
-from raytwin.generator.psf import blur_variance_share, noise_autocovariance
+from raytwin.generator.psf import Spread, blur_variance_share, noise_autocovariance
 from raytwin.generator.spectral_signal import OpenBeam
 from raytwin.generator.transfer import nearest_covariance
 
@@ -43,7 +43,7 @@ TARGETS = {
         Setting(kV=120.0, power_W=45.0, exposure_ms=5.0, filters=COPPER, averaged=4),
     ),
 }
-OPTICS = {"psf_model": "aperture", "psf_sigma_px": SIGMA, "white_fraction": WHITE}
+OPTICS = {"spread": Spread(sigma_px=SIGMA), "white_fraction": WHITE}
 MEAT_MM, BONE_MM = 15.0, 1.0
 
 

@@ -16,7 +16,7 @@ from raytwin.generator.as_published import published_parameters, sample_as_publi
 from raytwin.generator.generate import ChannelModel, generate_dataset
 from raytwin.generator.noise import sample_frame_noise
 from raytwin.generator.predict import predict_flatfield, predict_flatfields, slope_share, spectral_model_of
-from raytwin.generator.psf import blur_variance_share, sampled_gaussian_1d
+from raytwin.generator.psf import Spread, blur_variance_share, sampled_gaussian_1d
 from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.twin import (
     DetectorMaps,
@@ -26,6 +26,7 @@ from raytwin.generator.twin import (
     SpectralPosterior,
     Twin,
     estimate_from_sd,
+    gaussian_spread,
 )
 from raytwin.generator.twin_io import read_twin, write_twin
 
@@ -106,8 +107,7 @@ def make_twin(**changes):
             bad_pixels=bad,
         ),
         "noise": NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(SIGMA, 0.003),
+            spread=gaussian_spread("aperture", estimate_from_sd(SIGMA, 0.003)),
             white_fraction=WHITE,
             read_noise_DN=estimate_from_sd(READ, 0.05),
             quantised=True,
@@ -512,8 +512,7 @@ def test_noise_from_scratch_and_prediction_agree(twin):
         gain_DN=prediction.gain_DN.value,
         white_fraction=WHITE,
         read_variance_DN2=twin.noise.read_variance_DN2,
-        psf_model="aperture",
-        psf_sigma_px=SIGMA,
+        spread=Spread(sigma_px=SIGMA),
         rng=rng,
     )
     assert noise.std() == pytest.approx(prediction.sd_DN.value, rel=5 * math.sqrt(2.5 / 2 / noise.size))

@@ -188,7 +188,7 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
         parameters = np.array(twin.spectral.best)  # type: ignore[union-attr]
         for (nuisance, sd), value in zip(NUISANCES.items(), rest, strict=False):
             parameters[names.index(nuisance)] += sd * value
-        sigma = twin.noise.psf_sigma_px.value * (1.0 + SPREAD_SD * float(rest[-1]))
+        sigma = twin.noise.spread.value.sigma_px * (1.0 + SPREAD_SD * float(rest[-1]))
         changed = replace(twin, noise=replace(twin.noise, psf_sigma_px=Estimate(value=sigma, low=0.0, high=9.0)))
         effects = (applied(own),) if present else ()
         parts = [

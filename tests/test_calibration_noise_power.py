@@ -1,0 +1,149 @@
+"""Noise power of frame differences: known noise is found whatever changes smoothly beside it."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from raytwin.calibration.noise_power import (
+    compute_difference_power,
+    compute_noise_power,
+    correlation_of_quanta,
+    smeared,
+    spread_of_bins,
+    usable,
+)
+from raytwin.errors import InputError
+from raytwin.generator.noise import sample_frame_noise
+from raytwin.generator.psf import Spread
+
+SHAPE = (96, 120)
+SPREAD = Spread(sigma_px=0.5)
+SIGNAL, GAIN, READ_DN2 = 1000.0, 8.0, 120.0
+LEVEL = np.full(SHAPE, SIGNAL)
+
+
+def frames_of(count, *, seed=0, spread=SPREAD, level=LEVEL):
+    rng = np.random.default_rng(seed)
+    noise = {"gain_DN": GAIN, "white_fraction": 0.0, "read_variance_DN2": READ_DN2, "spread": spread, "rng": rng}
+    return np.stack([level + sample_frame_noise(level, **noise) for _ in range(count)])
+
+
+def expected_power(side, spread=SPREAD):
+    return smeared(GAIN * SIGNAL * spread.noise_power(side) + READ_DN2)
+
+
+def misfit(found, expected):
+    """Mean of measured over expected less 1, in its own standard deviations."""
+    ratio = np.where(found.used, found.power_DN2 / expected - 1.0, 0.0)
+    return float(np.sum(found.modes * ratio) / found.modes.sum()) * math.sqrt(found.modes.sum())
+
+
+def smooth_change(seed):
+    """A smooth map of zero mean and rms 1, over half of the field."""
+    field = gaussian_filter(np.random.default_rng(seed).standard_normal(SHAPE), 40, mode="wrap")
+    return (field - field.mean()) / field.std()
+
+
+@pytest.mark.parametrize("spread", [SPREAD, Spread(sigma_px=0.4, aspect=1.3, tail_share=0.2, tail_px=1.0)])
+def test_power_is_that_of_the_noise_within_sampling_error(spread):
+    found = compute_noise_power([frames_of(12, spread=spread)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
+    expected = expected_power(found.square_px, spread)
+    assert abs(misfit(found, expected)) < 4.0
+    assert found.common_mode == 0.0
+    assert abs(found.row_variance_DN2) < 4.0 * found.row_sd_DN2
+
+
+def test_drift_of_level_and_shape_and_offsets_of_lines_leave_the_power_alone():
+    """Level 1 %, shape 0.3 % rms and lines of half a read noise from frame to frame: summed up, forty times the noise."""
+    rng = np.random.default_rng(3)
+    clean = frames_of(12)
+    factors = 0.01 * rng.standard_normal(12)
+    change = np.stack([0.003 * smooth_change(seed) + factor for seed, factor in enumerate(factors)])
+    lines = 5.5 * rng.standard_normal((12, SHAPE[0], 1))
+    good = np.ones(SHAPE, bool)
+    found = compute_noise_power([clean + change * SIGNAL + lines], signal_DN=LEVEL, good=good)
+    undisturbed = compute_noise_power([clean], signal_DN=LEVEL, good=good)
+    above = np.where(found.used, np.abs(found.power_DN2 / undisturbed.power_DN2 - 1.0), 0.0)
+    lowest = np.minimum.outer(*(np.arange(above.shape[0]),) * 2)
+    assert above[lowest >= 2].max() < 0.02
+    assert math.sqrt(found.row_variance_DN2) == pytest.approx(5.5, rel=0.25)
+    assert math.sqrt(found.common_mode) == pytest.approx(math.sqrt(np.mean(np.diff(factors) ** 2) / 2), rel=0.05)
+
+
+def test_what_the_projection_takes_is_given_back():
+    """White noise has the same power at every frequency in use, also where a constant and a slope are projected out."""
+    rng = np.random.default_rng(1)
+    found = compute_noise_power(
+        [rng.standard_normal((200, 48, 48))], signal_DN=np.zeros((48, 48)), good=np.ones((48, 48), bool)
+    )
+    sd = np.where(found.used, 1.0 / np.sqrt(np.where(found.used, found.modes * spread_of_bins(32), 1.0)), np.inf)
+    assert np.all(np.abs(np.where(found.used, found.power_DN2, 1.0) - 1.0) < 6.0 * sd)
+    assert usable(32)[1, 2] and not usable(32)[1, 1] and not usable(32)[0, 5]
+
+
+def test_bad_pixels_leave_no_trace():
+    frames = frames_of(12)
+    good = np.random.default_rng(0).random(SHAPE) > 0.01
+    good[:, 50] = False
+    frames[:, ~good] = 65535.0 * np.random.default_rng(1).random((len(frames), int((~good).sum())))
+    found = compute_noise_power([frames], signal_DN=LEVEL, good=good)
+    assert abs(misfit(found, expected_power(found.square_px))) < 4.0
+
+
+def test_pieces_do_not_matter():
+    frames = frames_of(8)
+    good = np.ones(SHAPE, bool)
+    one = compute_noise_power([frames], signal_DN=LEVEL, good=good)
+    many = compute_noise_power([frames[:1], frames[1:6], frames[6:]], signal_DN=LEVEL, good=good)
+    assert many.power_DN2 == pytest.approx(one.power_DN2, nan_ok=True)
+
+
+def test_single_averaged_flats_at_two_levels_hold_the_noise_of_one_exposure():
+    """Pattern of the pixels and shape of the beam cancel; two levels weigh quanta and electronics by their own law."""
+    rng = np.random.default_rng(5)
+    gain = 1.0 + 0.02 * rng.standard_normal(SHAPE)
+    count, ratio, levels, powers = 30, 0.4, [], []
+    for seed in range(6):
+        flats = []
+        for factor, part in ((1.0, 0), (ratio, 1)):
+            level = factor * LEVEL
+            mean = frames_of(count, seed=100 + 2 * seed + part, level=level).mean(axis=0)
+            flats.append(gain * (mean + factor * SIGNAL * 0.001 * smooth_change(seed)))
+        powers.append(
+            compute_difference_power(
+                *flats,
+                exposures=(count, count),
+                dark_exposures=(0, 0),
+                same_dark=True,
+                good=np.ones(SHAPE, bool),
+            )
+        )
+        levels.append(powers[-1].signal_DN)
+    signal = (1 / SIGNAL + 1 / (ratio * SIGNAL)) / (1 / SIGNAL**2 + 1 / (ratio * SIGNAL) ** 2)
+    assert levels == pytest.approx([signal] * 6, rel=0.02)
+    side = powers[0].square_px
+    expected = smeared(GAIN * signal * SPREAD.noise_power(side) + READ_DN2)
+    mean = np.mean([item.power_DN2 for item in powers], axis=0)
+    weight = powers[0].modes
+    found = float(np.sum(weight * np.where(powers[0].used, mean / expected - 1.0, 0.0)) / weight.sum())
+    # the pattern's own square (0.02^2) and sampling
+    assert abs(found) < 4.0 / math.sqrt(6 * weight.sum()) + 0.003
+
+
+def test_correlation_of_neighbours_is_that_of_the_spread_and_its_interval_holds_it():
+    found = compute_noise_power([frames_of(20)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
+    fitted = GAIN * SIGNAL * SPREAD.noise_power(found.square_px) + READ_DN2
+    rho = SPREAD.noise_autocovariance(2) / SPREAD.variance_share
+    for row in correlation_of_quanta([found], [fitted], white_DN2=READ_DN2):
+        true = rho[2 + row["lag_row"], 2 + row["lag_column"]]
+        assert abs(row["value"] - true) < 2.0 * (row["high"] - row["low"])
+        assert row["high"] - row["low"] < 0.03
+
+
+def test_too_few_frames_or_good_pixels_are_refused():
+    with pytest.raises(InputError, match="at least two frames"):
+        compute_noise_power([frames_of(1)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
+    with pytest.raises(InputError, match="good pixels: got 0; expected squares of 64 x 64 px"):
+        compute_noise_power([frames_of(2)], signal_DN=LEVEL, good=np.zeros(SHAPE, bool))

@@ -8,7 +8,7 @@ import pytest
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.calibration.photon_transfer import compute_photon_transfer
-from raytwin.calibration.repeated_frames import bounded_read_variance, most_read_variance
+from raytwin.calibration.repeated_frames import most_read_variance
 from raytwin.diagnosis.preparation import calibrated_twin
 from raytwin.diagnosis.session import only_own_noise, read_session
 from raytwin.errors import InputError
@@ -220,27 +220,6 @@ def test_a_diagnosis_calibrates_such_a_session_and_knows_whose_noise_it_has(sess
     assert not any(item.own_noise for item in elsewhere)
     assert only_own_noise(list(parts.values()))
     assert not only_own_noise(elsewhere)
-
-
-@pytest.mark.parametrize(
-    ("variance", "expected"), [(-500.0, (0.0, 30.0)), (50.0, (45.0, 55.0)), (500.0, (70.0, 100.0))]
-)
-def test_a_bounded_read_variance_stays_within_its_bounds(variance, expected):
-    value, sd = bounded_read_variance(variance, 100.0 if abs(variance) > 100 else 1.0, 100.0)
-    assert expected[0] < value < expected[1]
-    assert 0 < sd < 100.0
-
-
-def test_a_bounded_read_variance_that_nothing_is_known_of_is_even():
-    value, sd = bounded_read_variance(0.0, 1e6, 120.0)
-    assert value == pytest.approx(60.0, rel=1e-3)
-    assert sd == pytest.approx(120.0 / np.sqrt(12.0), rel=0.02)
-
-
-def test_a_read_variance_at_its_bound_is_not_known_better_than_the_bound():
-    value, sd = bounded_read_variance(1000.0, 20.0, 100.0)
-    assert 90.0 < value <= 100.0
-    assert sd > 9.0
 
 
 def test_two_averaged_darks_bound_the_read_variance_whatever_their_pattern():

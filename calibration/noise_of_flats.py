@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
-from ..errors import InputError
+from ..errors import FitError, InputError
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
 from .frame_sums import effective_frames
@@ -116,6 +116,7 @@ def fit_flat_noise(
 
     Raises:
         InputError: no flat has signal above dark.
+        FitError: the noise tells no gain.
     """
     tell("noise power")
     beams = sorted({beam_of(item) for item, _ in flats}, key=lambda key: (key[0] is None, key[0] or 0.0, str(key[1])))
@@ -163,6 +164,13 @@ def fit_flat_noise(
         in_fit[worst] = False
         bent.append(stacks[worst][0].name)
         fit = _fit(powers, groups, in_fit, most_read)
+    half = 1.959964 * fit.gain_sd_DN
+    if np.all(fit.gain_DN < half):
+        best = int(np.argmax(fit.gain_DN / half))
+        raise FitError(
+            f"the noise tells no gain: {fit.gain_DN[best]:.3g} +- {half[best]:.2g} DN at best; the spread is too wide for frames"
+            " of this size, or what changes between the frames hides the quanta: take larger frames, in a row"
+        )
     warnings += [
         f"left out of the fit: {name} (its variance bends away from the photon-transfer line)" for name in bent
     ]

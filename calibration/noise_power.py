@@ -24,7 +24,7 @@ from .frame_sums import effective_frames
 
 LARGEST_SQUARE_PX = 64  # a spread of 3 px leaves half of the power at the lowest frequency in use
 SMALLEST_SQUARE_PX = 8
-_LOW_BINS = 8  # sum of the two orders, up to which power stands for that of whole frames and lines
+_LOW_BAND = 0.25  # cycles a pixel, from which the power at 0 is extrapolated
 _LEAST_GOOD_SHARE = 0.7  # of a square's pixels, for the projection to be as in a whole one
 _LEAST_LEFT = 0.15  # of white noise, after the projection, for a frequency to be used
 _SLOPES_FROM_PX = (
@@ -411,8 +411,7 @@ class _PowerSum:
         modes = np.where(used, 0.5 * mode_share(side) * self.squares.pixels * degrees, 0.0)
         # a plateau's height, for what the pixels' own noise adds to whole frames and lines
         lowest = int(np.argmax(used.any(axis=1))) + 1
-        low = used & (np.add.outer(np.arange(side // 2 + 1), np.arange(side // 2 + 1)) <= _LOW_BINS)
-        plateau = float(np.sum(modes[low] * power[low]) / modes[low].sum())
+        plateau = _at_zero(power, modes)
         signal = float(np.mean(self.squares.level)) if self.has_signal else 0.0
         common = 0.0
         if self.has_signal:
@@ -441,6 +440,20 @@ class _PowerSum:
             column_variance_DN2=found[1][0],
             column_sd_DN2=found[1][1],
         )
+
+
+def _at_zero(power: FloatArray, modes: FloatArray) -> float:
+    """Power at frequency 0 from that at low ones, whose logarithm falls as the square of the frequency (DN^2)."""
+    order = np.arange(power.shape[0]) / (2.0 * (power.shape[0] - 1))
+    square = order[:, None] ** 2 + order[None, :] ** 2
+    low = (modes > 0) & (square < _LOW_BAND**2) & (np.nan_to_num(power) > 0)
+    if np.count_nonzero(low) < 3:
+        low = (modes > 0) & (np.nan_to_num(power) > 0)
+    if not low.any():
+        return 0.0
+    design = np.stack([np.ones(int(low.sum())), square[low]], axis=1) * np.sqrt(modes[low])[:, None]
+    found = np.linalg.lstsq(design, np.log(power[low]) * np.sqrt(modes[low]), rcond=None)[0]
+    return float(np.exp(found[0]))
 
 
 def _line_variance(difference: FloatArray, good: NDArray[np.bool_], axis: int) -> float:

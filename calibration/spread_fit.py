@@ -10,7 +10,7 @@ choice leaves open is part of the standard deviations. A second route to the gai
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -18,22 +18,33 @@ from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..generator.psf import Spread
-from .noise_power import NoisePower, mode_share, smeared, spread_of_bins, usable
+from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, smeared, spread_of_bins, usable
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
 # quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
 WHITE_FRACTION_PRIOR = (0.003, 0.03)
 _LOW_BAND = 0.2  # cycles a pixel, up to which the second route extrapolates to 0
-_ROUNDING_DN2 = 1.0 / 12.0  # of an ADC in whole numbers
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
-_BOUNDS = {"sigma_px2": (0.0, 144.0), "log_aspect": (-1.6, 1.6), "tail_share": (0.0, 1.0), "log_tail_px": (-1.6, 1.6)}
+_BOUNDS = {
+    "sigma_px2": (0.0, (0.1 * LARGEST_SQUARE_PX) ** 2),
+    "log_aspect": (-1.6, 1.6),
+    "tail_share": (0.0, 1.0),
+    "log_tail_px": (-1.6, 1.6),
+}
 # A tail that squares of M px cannot show passes for a smaller gain: it is glare, not spread. The longest reach L is that whose
 # transfer function is still 0.8 at 2 / M, the lowest frequency in full use: 2 pi L (2 / M) = 1/2.
 _LONGEST_TAIL = 1.0 / (8.0 * math.pi)
-_STARTS = {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0}
+# Of a core wider than this share of the square less than a fifth of the power is left there: it cannot be told from drift.
+_WIDEST_CORE = 0.1
+# narrow, wide, and nearly all light in the tail
+_STARTS = (
+    {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
+    {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
+    {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},
+)
 _WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
 _TAIL = ("tail_share", "log_tail_px")
 _LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
@@ -139,12 +150,20 @@ class _Normal:
     right: FloatArray
     square: float  # of the whitened data
 
-    def solved(self) -> tuple[FloatArray, float]:
-        """Coefficients and chi-square; what no datum tells stays 0."""
-        scale = np.sqrt(np.clip(np.diag(self.matrix), 1e-300, None))
-        scaled = self.matrix / np.outer(scale, scale) + 1e-11 * np.eye(len(scale))
-        found = np.linalg.solve(scaled, self.right / scale) / scale
-        return np.asarray(found), self.square - float(self.right @ found)
+    def solved(self, least_0: Sequence[int] = ()) -> tuple[FloatArray, float]:
+        """Coefficients and chi-square; those of `least_0` are 0 where they would be negative, and what no datum tells stays 0."""
+        free = np.ones(len(self.right), dtype=bool)
+        while True:
+            matrix, right = self.matrix[np.ix_(free, free)], self.right[free]
+            scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+            scaled = matrix / np.outer(scale, scale) + 1e-11 * np.eye(len(scale))
+            found = np.zeros(len(free))
+            found[free] = np.linalg.solve(scaled, right / scale) / scale
+            negative = [place for place in least_0 if free[place] and found[place] < 0]
+            if not negative:
+                return found, self.square - float(right @ found[free])
+            # the one that would be most negative in its own standard deviations goes first
+            free[min(negative, key=lambda place: found[place] * math.sqrt(self.matrix[place, place]))] = False
 
     def covariance(self) -> FloatArray:
         """Inverse of the matrix."""
@@ -212,6 +231,8 @@ class _Problem:
     ) -> _Normal:
         """Normal equations of A_0.., W_0.., r^2, E and F of each drifting series, and of the spread's parameters.
 
+        Without repeated darks the electronic noise has the prior of a standard deviation that is uniform up to its bound.
+
         Args:
             shapes: power of unit quanta (cell,) by side.
             gains: (group,) that the white part's prior is relative to; None: no prior.
@@ -261,14 +282,26 @@ class _Problem:
                 row = np.array([-centre, 1.0]) / (max(abs(float(gain)), 1e-12) * width)
                 both = [group, groups + group]
                 matrix[np.ix_(both, both)] += np.outer(row, row)
-        return _Normal(matrix, right, self.square)
+        square = self.square
+        if math.isfinite(self.most_read_DN2) and self.most_read_DN2 > 0:
+            # mean and variance of r^2 for r anywhere between 0 and its largest value
+            mean, precision = self.most_read_DN2 / 3.0, 1.0 / (self.most_read_DN2**2 * (1.0 / 5.0 - 1.0 / 9.0))
+            matrix[read, read] += precision
+            right[read] += precision * mean
+            square += precision * mean**2
+        return _Normal(matrix, right, square)
 
     def solve(self, spread: Spread) -> tuple[FloatArray, float]:
         """Coefficients and chi-square at this spread, with the white part's prior about the gain that the data have."""
         shapes = self.in_cells(spread)
-        first = self.normal(shapes, None).solved()[0]
+        first = self.normal(shapes, None).solved(self.not_negative)[0]
         # the sum is the gain, known even where the two cannot be told apart
-        return self.normal(shapes, self.gains(first)).solved()
+        return self.normal(shapes, self.gains(first)).solved(self.not_negative)
+
+    @property
+    def not_negative(self) -> range:
+        """Coefficients that add power: white noise that follows the signal, electronic noise, slow changes."""
+        return range(self.groups, 2 * self.groups + 1 + 2 * len(self.drifting))
 
     def gains(self, coefficients: FloatArray) -> FloatArray:
         """A + W (group,), DN."""
@@ -319,16 +352,15 @@ def _fitted(problem: _Problem, family: str, *, start: FloatArray | None = None) 
     """A family at its best."""
     names = _FAMILIES[family][2]
     bounds = np.array([_BOUNDS[name] for name in names]).T
+    bounds[1, names.index("sigma_px2")] = (_WIDEST_CORE * max(problem.sides)) ** 2
     if "log_tail_px" in names:
         bounds[1, names.index("log_tail_px")] = math.log(_LONGEST_TAIL * max(problem.sides))
 
-    first = np.array([_STARTS[name] for name in names]) if start is None else start
-    first = np.clip(first, bounds[0] + 1e-3, bounds[1] - 1e-3)
-    tried = [_descended(problem, family, first, bounds)]
-    if "tail_share" in names and start is None:
-        wide = first.copy()
-        wide[names.index("tail_share")] = 0.8
-        tried.append(_descended(problem, family, wide, bounds))
+    starts = [start] if start is not None else [np.array([one[name] for name in names]) for one in _STARTS]
+    tried = [
+        _descended(problem, family, np.clip(one, bounds[0] + 1e-3, bounds[1] - 1e-3), bounds)
+        for one in {tuple(one): one for one in starts}.values()
+    ]
     theta, chi_square = min(tried, key=lambda one: one[1])
     spread = _spread_of(family, theta)
     coefficients, _ = problem.solve(spread)
@@ -336,8 +368,7 @@ def _fitted(problem: _Problem, family: str, *, start: FloatArray | None = None) 
     normal = problem.normal(
         problem.in_cells(spread), problem.gains(coefficients), coefficients[: problem.groups], slopes
     )
-    candidate = _Candidate(family, theta, spread, coefficients, normal.covariance(), chi_square)
-    return _within_bounds(problem, candidate)
+    return _Candidate(family, theta, spread, coefficients, normal.covariance(), chi_square)
 
 
 def _slopes(problem: _Problem, family: str, theta: FloatArray) -> list[dict[int, FloatArray]]:
@@ -365,7 +396,7 @@ def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatA
             coefficients[: problem.groups],
             _slopes(problem, family, theta),
         )
-        step = normal.solved()[0][-len(theta) :]
+        step = normal.solved(problem.not_negative)[0][-len(theta) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
             moved = np.clip(theta + share * step, bounds[0], bounds[1])
             there, value = problem.solve(_spread_of(family, moved))
@@ -380,64 +411,6 @@ def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatA
     return theta, chi_square
 
 
-def _within_bounds(problem: _Problem, item: _Candidate) -> _Candidate:
-    """The candidate with electronic noise and slow changes kept where they can be.
-
-    Electronic noise is white: not negative, and at no frequency more than the power that was measured. Without repeated darks
-    it is an intercept that flats hardly tell. White noise that follows the signal and slow changes add power. The Gaussian of
-    each is cut at its bounds, and everything else follows by its covariance with it.
-    """
-    read = 2 * problem.groups
-    every, covariance = np.concatenate([item.coefficients, item.theta]), item.covariance
-    limits = {read: max(problem.most_read_DN2, 0.0)} | dict.fromkeys(range(problem.groups, read), math.inf)
-    limits |= dict.fromkeys(range(read + 1, len(item.coefficients)), math.inf)
-    for place, most in limits.items():
-        variance = max(float(covariance[place, place]), 1e-300)
-        value, own = float(every[place]), math.sqrt(variance)
-        mean, sd = _electronic(value, own, most) if place == read else truncated_gaussian(value, own, 0.0, most)
-        along = covariance[:, place] / variance
-        every = every + along * (mean - every[place])
-        covariance = covariance - np.outer(along, along) * (variance - sd**2)
-    coefficients, theta = every[: len(item.coefficients)], every[len(item.coefficients) :]
-    bounds = np.array([_BOUNDS[name] for name in item.names]).T
-    theta = np.clip(theta, bounds[0], bounds[1])
-    spread = _spread_of(item.family, theta)
-    return replace(item, coefficients=coefficients, theta=theta, spread=spread, covariance=covariance)
-
-
-def truncated_gaussian(mean: float, sd: float, low: float, high: float) -> tuple[float, float]:
-    """Mean and standard deviation of a Gaussian that is cut at `low` and `high`, in their unit."""
-    if sd <= 0 or high <= low:
-        return min(max(mean, low), max(high, low)), 0.0
-    # within eight standard deviations of the nearest value allowed nothing underflows
-    nearest = min(max(mean, low), high)
-    at = np.linspace(max(low, nearest - 8.0 * sd), min(high, nearest + 8.0 * sd), 4001)
-    off = (at - mean) / sd
-    weight = np.exp(-0.5 * (off**2 - float(np.min(off**2))))
-    weight /= weight.sum()
-    centre = float(np.sum(weight * at))
-    return centre, float(np.sqrt(np.sum(weight * (at - centre) ** 2)))
-
-
-def _electronic(value: float, sd: float, most: float) -> tuple[float, float]:
-    """Mean and sd (DN^2) of an electronic variance known as a Gaussian, of which nothing else is known but its upper bound.
-
-    The prior of a scale is uniform in its logarithm (Jeffreys), from the rounding of whole numbers up.
-    """
-    most = min(most, max(value, 0.0) + 8.0 * sd)
-    least = min(_ROUNDING_DN2, 1e-4 * most)
-    if not most > least > 0:
-        return max(value, 0.0), sd
-    top = min(most, max(value, least) + 8.0 * sd)
-    bottom = max(least, min(value, top) - 8.0 * sd)
-    at = np.geomspace(bottom, top, 4001)
-    off = (at - value) / sd
-    weight = np.exp(-0.5 * (off**2 - float(np.min(off**2))))
-    weight /= weight.sum()
-    centre = float(np.sum(weight * at))
-    return centre, float(np.sqrt(np.sum(weight * (at - centre) ** 2)))
-
-
 def _best(problem: _Problem, families: Sequence[str]) -> tuple[dict[str, _Candidate], str]:
     """All families at their best, and the one of the highest evidence; the weights are its own."""
     # the simplest and the most general family set the weights, which hardly depend on the rest
@@ -447,6 +420,8 @@ def _best(problem: _Problem, families: Sequence[str]) -> tuple[dict[str, _Candid
         problem.reweight(found[best].spread, found[best].coefficients)
         found = {best: _fitted(problem, best, start=found[best].theta)}
     found = {family: _fitted(problem, family) for family in families}
+    lit = {family: item for family, item in found.items() if np.all(item.coefficients[: problem.groups] > 0)}
+    found = lit or found
     return found, min(found, key=lambda family: _criterion(problem, found[family]))
 
 
@@ -489,8 +464,8 @@ def fit_spread(
         found, best = _best(problem, families)
     chosen = found[best]
     groups = problem.groups
-    if not np.all(np.isfinite(chosen.coefficients)):
-        raise FitError("the noise power has no finite fit; look for saturated or constant frames")
+    if not (np.all(np.isfinite(chosen.coefficients)) and np.any(chosen.coefficients[:groups] > 0)):
+        raise FitError("the noise power has no fit with quanta in it; look for saturated, constant or processed frames")
     inflation = max(1.0, chosen.chi_square / problem.independent)
     criteria = {family: _criterion(problem, item) for family, item in found.items()}
     lowest = min(criteria.values())
@@ -509,8 +484,9 @@ def fit_spread(
             continue
         share = weights[family] / total
         other_gain, other_slope = gains_of(item)
-        gain_variance = gain_variance + share * (other_gain - gain) ** 2
-        slope_variance = slope_variance + share * (other_slope - slope) ** 2
+        # scales are averaged by their logarithms
+        gain_variance = gain_variance + share * (gain * _log_ratio(other_gain, gain)) ** 2
+        slope_variance = slope_variance + share * (slope * _log_ratio(other_slope, slope)) ** 2
         for name in spread_variance:
             moved = getattr(item.spread, name) - getattr(chosen.spread, name)
             if name != "tail_px" or min(item.spread.tail_share, chosen.spread.tail_share) > 0:
@@ -546,6 +522,12 @@ def fit_spread(
         criteria={family: value - lowest for family, value in criteria.items()},
         expected_DN2=expected,
     )
+
+
+def _log_ratio(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Logarithm of the ratio of two positive scales; 0 where one of them is none."""
+    both = (first > 0) & (second > 0)
+    return np.asarray(np.log(np.where(both, first, 1.0) / np.where(both, second, 1.0)))
 
 
 def _drifting(problem: _Problem, candidate: _Candidate) -> tuple[int, ...]:
@@ -660,8 +642,10 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
 
 
 def _line_variances(series: Sequence[NoisePower], group: Sequence[int]) -> tuple[float, float, float]:
-    """Variance of rows' and of columns' offsets (DN^2), of the darks where there are any, and its standard deviation."""
-    darks = [item for item, number in zip(series, group, strict=True) if number < 0] or list(series)
+    """Variance of rows' and of columns' offsets in the darks (DN^2), and its standard deviation; 0 without repeated darks."""
+    darks = [item for item, number in zip(series, group, strict=True) if number < 0]
+    if not darks:
+        return 0.0, 0.0, 0.0
     found, sds = [], []
     for kind in ("row", "column"):
         weight = np.array([1.0 / max(getattr(item, f"{kind}_sd_DN2"), 1e-12) ** 2 for item in darks])

@@ -105,7 +105,7 @@ def test_evidence_of_a_clean_session_shows_nothing(clean):
     assert evidence["output_rms_percent"] < 0.1
     assert evidence["linearity"]["largest_departure_percent"] < 0.3
     assert max(abs(value) for value in evidence["drift_percent_per_series"].values()) < 0.5
-    assert abs(evidence["dark_neighbour_correlation"]["row_direction"]) < 0.03
+    assert max(evidence["line_noise_DN"].values()) < 0.1 * READ_DN
 
 
 def planted(tmp_path, change, **options):
@@ -148,7 +148,9 @@ def test_output_noise_from_frame_to_frame_is_named_with_its_size(tmp_path):
     found = planted(tmp_path, flicker)
     assert 0.6 < found.evidence["output_rms_percent"] < 1.7
     assert any("tube output varies by" in line for line in found.warnings)
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    level = found.levels[0]
+    assert level.gain_DN.low < GAIN < level.gain_DN.high
+    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.06)
 
 
 def test_a_nonlinear_detector_departs_from_the_line_in_load(tmp_path):
@@ -267,7 +269,7 @@ REFUSED = {
     "no darks": ({"with_darks": False}, "flats without a dark series"),
     "kinds swapped": ({"swap": True}, "kinds are not swapped"),
     "all saturated": ({"powers": (400.0, 450.0), "bits": 12}, "no usable flat .flat_400W: saturated at 4095 DN"),
-    "single frames": ({"count": 1}, "a single frame has no noise"),
+    "a single frame": ({"count": 1, "powers": (5.0,)}, "a single frame has no noise"),
     "no flats": ({"powers": ()}, "no flat series that may calibrate"),
 }
 

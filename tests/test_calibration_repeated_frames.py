@@ -11,7 +11,7 @@ from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.calibration.repeated_frames import most_read_variance
 from raytwin.diagnosis.preparation import calibrated_twin
 from raytwin.diagnosis.session import only_own_noise, read_session
-from raytwin.errors import InputError
+from raytwin.errors import FitError, InputError
 from raytwin.generator.noise import sample_frame_noise
 from raytwin.generator.psf import Spread, blur_variance_share
 
@@ -51,14 +51,25 @@ def shadow(share):
 
 
 def write_session(
-    path, *, share=0.4, frames=3, objects=6, role="evaluation", flat_frames=0, with_maps=True, seed=0, filters=()
+    path,
+    *,
+    share=0.4,
+    frames=3,
+    objects=6,
+    role="evaluation",
+    flat_frames=0,
+    with_maps=True,
+    seed=0,
+    filters=(),
+    exposures_ms=tuple(LEVELS),
 ):
     """Averaged darks and flats at two exposures, and repeated frames of objects, or `flat_frames` of flats, after them."""
     rng = np.random.default_rng(seed)
     pattern = 1.0 + 0.03 * rng.standard_normal(SHAPE)
     instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0)
     with write_acquisition(path, instrument) as writer:
-        for exposure_ms, level in LEVELS.items():
+        for exposure_ms in exposures_ms:
+            level = LEVELS[exposure_ms]
             words = {"exposure_ms": exposure_ms, "averaged": AVERAGED, "role": "calibration"}
             writer.add_series(f"dark_{exposure_ms:g}", kind="dark", frames=averaged(np.zeros(SHAPE), rng), **words)
             words |= {"kV": 40.0, "power_W": 20.0}
@@ -69,7 +80,8 @@ def write_session(
             writer.add_scene(
                 scene, kind="product", thickness_mm={"chicken_breast": thickness} if with_maps else None, product=scene
             )
-            for exposure_ms, level in LEVELS.items():
+            for exposure_ms in exposures_ms:
+                level = LEVELS[exposure_ms]
                 covered = thickness > 0
                 mean = level * pattern * np.where(covered, 0.5, 1.0)
                 found = np.where(
@@ -104,9 +116,9 @@ def found(session):
 def test_the_noise_of_the_field_beside_objects_is_that_of_the_beam(found):
     (level,) = found.levels
     assert level.gain_DN.low < GAIN < level.gain_DN.high
-    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.06)
     slope = GAIN * (blur_variance_share("aperture", SIGMA) + 0.003) / 1.003
-    assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.02)
+    assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.03)
     assert found.noise.spread.value.sigma_px == pytest.approx(SIGMA, rel=0.04)
     (row,) = found.evidence["repeated_frames"]
     assert row["where"] == "beside objects"
@@ -140,16 +152,16 @@ def test_it_is_said_where_the_noise_comes_from_and_what_it_cannot_tell(found):
 
 
 def test_behind_objects_the_gain_is_harder_and_its_interval_says_so(tmp_path):
-    covered = transfer_of(write_session(tmp_path / "covered.h5", share=1.0))
+    covered = transfer_of(write_session(tmp_path / "covered.h5", share=1.0, exposures_ms=(20.0,)))
     (row,) = covered.evidence["repeated_frames"]
     assert row["where"] == "behind objects"
     (level,) = covered.levels
-    assert level.gain_DN.value == pytest.approx(HARDER * GAIN, rel=0.04)
+    assert level.gain_DN.value == pytest.approx(HARDER * GAIN, rel=0.08)
     assert level.gain_DN.high - level.gain_DN.low > 2.0 * 1.96 * 0.03 * level.gain_DN.value
 
 
 def test_objects_that_nobody_maps_are_read_away_from_steps(tmp_path):
-    blind = transfer_of(write_session(tmp_path / "blind.h5", with_maps=False))
+    blind = transfer_of(write_session(tmp_path / "blind.h5", with_maps=False, exposures_ms=(20.0,)))
     assert [row["where"] for row in blind.evidence["repeated_frames"]] == ["behind objects"]
     assert blind.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.08)
 
@@ -158,7 +170,7 @@ def test_repeated_flats_held_back_for_evaluation_give_the_whole_field(tmp_path):
     again = transfer_of(write_session(tmp_path / "again.h5", objects=0, flat_frames=12))
     (row,) = again.evidence["repeated_frames"]
     assert (row["series"], row["share_percent"]) == (["flat_again"], 100.0)
-    assert again.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+    assert again.levels[0].gain_DN.low < GAIN < again.levels[0].gain_DN.high
     assert again.levels[0].series == ("flat_20", "flat_80")
 
 
@@ -170,24 +182,85 @@ def test_series_held_back_for_evaluation_stay_so_where_others_repeat_the_beam(tm
 
 @pytest.mark.parametrize("words", [{"frames": 1}, {"objects": 0}], ids=["single frames", "no objects"])
 def test_without_any_repeated_frame_one_line_says_what_is_missing(tmp_path, words):
-    path = write_session(tmp_path / "single.h5", **words)
+    path = write_session(tmp_path / "single.h5", exposures_ms=(20.0,), **words)
     with pytest.raises(InputError, match="a single frame has no noise") as error:
         transfer_of(path)
     assert "\n" not in str(error.value)
 
 
-def test_a_wide_spread_is_fitted_as_far_as_the_open_field_reaches(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "SIGMA", 2.2)
-    wide = transfer_of(write_session(tmp_path / "wide.h5", share=0.75, objects=8))
-    assert wide.noise.spread.value.sigma_px == pytest.approx(2.2, rel=0.1)
+def test_a_wide_spread_is_found_or_no_gain_is_given(tmp_path, monkeypatch):
+    """Quanta spread over most of an open field are seen as slow changes: the interval holds the gain, or there is none."""
+    for sigma_px, share in ((1.2, 0.4), (2.2, 0.75)):
+        monkeypatch.setattr(sys.modules[__name__], "SIGMA", sigma_px)
+        try:
+            wide = transfer_of(write_session(tmp_path / f"{sigma_px}.h5", share=share, objects=8))
+        except FitError as error:
+            assert sigma_px > 2 and "the noise tells no gain" in str(error)
+        else:
+            assert wide.levels[0].gain_DN.low < GAIN < wide.levels[0].gain_DN.high
 
 
 def test_objects_in_another_beam_say_nothing_of_this_one(tmp_path):
     from raytwin.acquisition.setting import filters_from_text
 
-    path = write_session(tmp_path / "other.h5", filters=filters_from_text("Cu:0.2"))
+    path = write_session(tmp_path / "other.h5", filters=filters_from_text("Cu:0.2"), exposures_ms=(20.0,))
     with pytest.raises(InputError, match="a single frame has no noise"):
         transfer_of(path)
+
+
+def test_two_single_flats_of_a_beam_are_a_pair_whose_difference_holds_the_noise(tmp_path):
+    paired = transfer_of(write_session(tmp_path / "pair.h5", objects=0))
+    assert [row["series"] for row in paired.evidence["flat_pairs"]] == [["flat_20", "flat_80"]]
+    (level,) = paired.levels
+    assert level.gain_DN.low < GAIN < level.gain_DN.high
+    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.2)
+    slope = GAIN * (blur_variance_share("aperture", SIGMA) + 0.003) / 1.003
+    assert level.photon_transfer_slope_DN.low < slope < level.photon_transfer_slope_DN.high
+    assert any("noise comes from 1 pairs of single flats" in line for line in paired.warnings)
+
+
+def test_a_turning_object_is_no_repeat_and_changes_nothing_but_one_line(tmp_path):
+    """Frames of one series that show another scene each are left out of the noise, and one line says so."""
+    rng = np.random.default_rng(9)
+    paths = [tmp_path / "with.h5", tmp_path / "without.h5"]
+    for path in paths:
+        rng = np.random.default_rng(9)
+        instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0, source_object_mm=990.0)
+        with write_acquisition(path, instrument) as writer:
+            words = {"exposure_ms": 20.0, "averaged": AVERAGED}
+            writer.add_series("dark", kind="dark", frames=averaged(np.zeros(SHAPE), rng), **words)
+            for number in range(2):
+                flat = averaged(np.full(SHAPE, 8e3), rng)
+                writer.add_series(f"flat{number}", kind="flat", frames=flat, kV=40.0, power_W=20.0, **words)
+            if path == paths[0]:
+                rows = np.arange(SHAPE[0])[:, None]
+                turning = [
+                    exposures(8e3 * np.where(np.abs(rows - 20 - 5 * turn) < 12, 0.4, 1.0) * np.ones(SHAPE), 1, rng)
+                    for turn in range(6)
+                ]
+                setting = Setting(kV=40.0, power_W=20.0, exposure_ms=20.0)
+                writer.add_series("walnut", kind="object", frames=np.concatenate(turning), setting=setting)
+    first, second = (transfer_of(path) for path in paths)
+    assert first.levels[0].gain_DN == second.levels[0].gain_DN
+    (line,) = set(first.warnings) - set(second.warnings)
+    assert line.startswith("walnut is not used for noise: its frames do not show one scene")
+
+
+def test_copies_of_a_frame_are_counted_once(tmp_path):
+    """A grabber that hands the last frame out again halves the pair variances; each exposure is counted once."""
+    rng = np.random.default_rng(4)
+    instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0)
+    setting = Setting(kV=40.0, power_W=20.0, exposure_ms=20.0)
+    own = exposures(np.full(SHAPE, 8e3), 10, rng)
+    dark = exposures(np.zeros(SHAPE), 8, rng)
+    found = {}
+    for name, frames in (("clean", own), ("copied", np.repeat(own, 2, axis=0))):
+        with write_acquisition(tmp_path / f"{name}.h5", instrument) as writer:
+            writer.add_series("dark", kind="dark", frames=dark, exposure_ms=20.0)
+            writer.add_series("flat", kind="flat", frames=frames, setting=setting)
+        found[name] = transfer_of(tmp_path / f"{name}.h5")
+    assert found["copied"].levels[0].gain_DN == found["clean"].levels[0].gain_DN
+    assert any("10 of 20 frames are copies" in line for line in found["copied"].warnings)
 
 
 def test_a_beam_with_repeated_flats_takes_nothing_from_objects(tmp_path):

@@ -102,14 +102,14 @@ def test_one_session_has_no_evidence_of_sessions(tmp_path):
         assert "sessions" not in compute_photon_transfer(acquisition).evidence
 
 
-def test_more_frames_of_a_second_session_narrow_the_gain(tmp_path):
+def test_more_frames_of_a_second_session_narrow_the_slope(tmp_path):
     first = session(tmp_path / "a.h5", seed=1)
     second = session(tmp_path / "b.h5", seed=2)
     with open_acquisition(first) as acquisition:
-        alone = compute_photon_transfer(acquisition).levels[0].gain_DN
+        alone = compute_photon_transfer(acquisition).levels[0].photon_transfer_slope_DN
     stack, both = merged(first, second)
     with stack:
-        together = compute_photon_transfer(both).levels[0].gain_DN
+        together = compute_photon_transfer(both).levels[0].photon_transfer_slope_DN
     width = [value.high - value.low for value in (alone, together)]
     assert width[1] / width[0] == pytest.approx(np.sqrt(0.5), rel=0.25)
 
@@ -163,8 +163,8 @@ def test_stack_and_pair_noise_power_agree_on_white_frames():
 
 
 def test_drift_enters_the_gain_from_stacks_and_not_that_from_pairs(tmp_path):
-    """A pattern that comes up over the series, which no factor of the whole frame takes out: +-6 % from first to last."""
-    pattern = np.where(np.arange(SHAPE[1]) % 2 == 0, 0.06, -0.06)
+    """A chessboard that comes up over the series, which no factor of a frame, row or column takes out: +-6 % from first to last."""
+    pattern = np.where(np.add.outer(np.arange(SHAPE[0]), np.arange(SHAPE[1])) % 2 == 0, 0.06, -0.06)
 
     def drift(frames, level):
         ramp = np.linspace(-0.5, 0.5, len(frames))[:, None, None]

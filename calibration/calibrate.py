@@ -23,7 +23,7 @@ from ..spectra import (
     energy_grid_keV,
     tube_fluence_interpolated,
 )
-from .next_measurement import rank_measurements, voltages_within_reach
+from .next_measurement import advice, voltages_within_reach
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
 from .spectral_fit import SpectralFit, fit_spectrum, model_for
@@ -152,8 +152,7 @@ def calibrate_twin(
     )
     if advise and spectral is not None:
         tell("next measurement")
-        ranked = rank_measurements(twin)
-        twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
+        twin = replace(twin, evidence=evidence | {"next_measurement": advice(twin)})
     return twin
 
 
@@ -180,7 +179,7 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
             for_sums=name == DEFAULT_MODEL,
         )
     materials = [layer.material for item in flats for layer in item.filters]
-    wanted = dict.fromkeys(measured, PRIORS["kV_error"].high)
+    wanted = dict.fromkeys(measured, -PRIORS["kV_error"].low)
     for kV in voltages_within_reach(measured, anode) if advise else ():
         wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
     for highest_kV in sorted({measured[-1], max(wanted)}):

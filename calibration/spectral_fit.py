@@ -1,9 +1,10 @@
 """The spectral part of a twin: tube, filtration, scintillator and gain from levels, gains and transmissions.
 
 Only ratios between levels say anything of the spectrum, and flats alone leave much open; so the answer is a posterior.
-Filtration, scintillator thickness, tube voltage and the size of departures from the model are drawn by importance sampling. All
-else (scales, tables, exponents) acts on the logarithm of a level nearly linearly: for each draw it is integrated out
-exactly about that draw's own derivatives, and drawn back from its conditional Gaussian.
+Filtration, scintillator thickness, tube voltage, K escape and the sizes of discrepancies are drawn by importance sampling. All
+else (scales, tables, exponents, light, covers) acts on the logarithm of a level nearly linearly: for each draw it is
+integrated out about that draw's own derivatives, taken where the data put these parameters, and drawn back so that the levels
+are met by the model itself and not by its derivatives.
 """
 
 import math
@@ -31,13 +32,10 @@ from ..spectra import BIN_WIDTH_KEV, Spectrum
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
-    DEPARTURE_FACTOR,
-    DEPARTURES,
     FREE_OUTPUT,
     GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
-    LOG_DEPARTURE_SD,
     LOG_DISCREPANCY_SD,
     MEASURED_SPECTRUM,
     PRIORS,
@@ -63,7 +61,16 @@ _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepanc
 _STUDENT_DEGREES = 5.0
 _MIXTURE = (0.75, 0.2, 0.05)
 _Z95 = 1.959964
-SHAPE_PARAMETERS = ("inherent_filtration_mm_Al", "log_scintillator_thickness", "kV_error", ALTERNATIVE_SCINTILLATOR)
+_LINEARISED_ABOUT = 64  # draws whose mean is the point at which the linear parameters' derivatives are taken
+_STEP_SHARES = (1.0, 0.3, 0.1, 0.0)  # of a Newton step, the next where the last one leads uphill
+_NEWTON_STEPS = 3  # of the linear parameters of each draw, towards the model itself
+SHAPE_PARAMETERS = (
+    "inherent_filtration_mm_Al",
+    "log_scintillator_thickness",
+    "kV_error",
+    "escape_scale",
+    ALTERNATIVE_SCINTILLATOR,
+)
 DEFAULT_SCINTILLATOR = (Filter(material="CsI", thickness_mm=0.5),)
 OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 
@@ -387,8 +394,9 @@ def _relative_sd(estimate: object) -> float:
 class _Posterior:
     """Log posterior of the shapes in units of the prior, u = (parameter - centre) / sd.
 
-    For each draw of the shapes: y ~ N(f, W + J J'), with W the noise and discrepancy of the data and J the derivatives
-    of the linear parameters times their prior sd.
+    For each draw of the shapes: y ~ N(f - J a, W + J J'), with W the noise and discrepancy of the data, f the model and J the
+    derivatives of the linear parameters times their prior sd, both at a, where the data put the linear parameters (in units
+    of their prior sd; the prior's centre until something is known).
     """
 
     def __init__(
@@ -417,8 +425,8 @@ class _Posterior:
         self.repeats = tuple(repeats)
         self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
         self.is_gain = np.array([item.kind == "gain" for item in data])
-        self.dimensions = len(self.shape) + len(self.learned) + 1  # the last is the factor of the departures
-        self.departs = np.array([name.startswith(DEPARTURES) for name in self.linear_names])
+        self.dimensions = len(self.shape) + len(self.learned)
+        self.about = np.zeros(len(self.linear))
         # one of the tables is right, so shares of two others exclude each other: what one takes is missing to the other
         self.mixing = np.eye(len(self.linear))
         for first, second in self._share_pairs():
@@ -439,8 +447,9 @@ class _Posterior:
         ]
 
     def parameters(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter), the linear ones at their prior centres, from shapes (draw, shape)."""
+        """Full parameter sets (draw, parameter), the linear ones where the data put them, from shapes (draw, shape)."""
         full = np.tile(self.centre, (len(u), 1))
+        full[:, self.linear] += self.linear_sd * (self.mixing @ self.about)
         full[:, self.shape] += self.sd[self.shape] * u[:, : len(self.shape)]
         if self.alternative is not None:
             # a Gaussian latent with the threshold that gives the prior's share
@@ -462,10 +471,10 @@ class _Posterior:
                 result[name] = centre * np.exp(LOG_DISCREPANCY_SD * u[:, column])
         return result
 
-    def linear_sd(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Prior standard deviations of the linear parameters (draw, linear), with each draw's factor of departures."""
-        factor = DEPARTURE_FACTOR * np.exp(LOG_DEPARTURE_SD * u[:, -1])
-        return np.asarray(self.sd[self.linear] * np.where(self.departs, factor[:, None], 1.0))
+    @property
+    def linear_sd(self) -> NDArray[np.float64]:
+        """Prior standard deviations of the linear parameters (linear,)."""
+        return np.asarray(self.sd[self.linear])
 
     def variances(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of each datum's logarithm (draw, datum)."""
@@ -496,25 +505,34 @@ class _Posterior:
         misfit = self.value - self.expectation(parameters[None, :])[0][0]
         return float(np.sum(misfit**2 / variance))
 
-    def _conditional(
-        self, u: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Log likelihood (draw,), parameters, and mean and lower root of the precision of the linear ones given u."""
-        full = self.parameters(u)
-        expected, slope = self.expectation(full)
-        slope = (slope * self.linear_sd(u)[:, None, :]) @ self.mixing
+    def _conditional(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Log likelihood (draw,) and mean (draw, linear) of the linear parameters given u, in units of their prior sd."""
+        expected, slope = self.expectation(self.parameters(u))
+        slope = (slope * self.linear_sd) @ self.mixing
         variance = self.variances(u)
-        misfit = self.value - expected
-        weighted = slope / variance[:, :, None]
-        precision = np.eye(len(self.linear)) + np.swapaxes(slope, 1, 2) @ weighted
-        lower = np.asarray(np.linalg.cholesky(precision), dtype=np.float64)
-        right = np.einsum("ndk,nd->nk", weighted, misfit)
+        misfit = self.value - expected + slope @ self.about
+        lower, right = self._normal_equations(slope, variance, misfit)
         half = np.linalg.solve(lower, right[:, :, None])[:, :, 0]
         mean = np.asarray(np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0], dtype=np.float64)
         logarithm: NDArray[np.float64] = -0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1))
         logarithm -= 0.5 * np.sum(np.log(variance), axis=1)
         logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
-        return logarithm, full, mean, lower
+        return logarithm, mean
+
+    @staticmethod
+    def _normal_equations(
+        slope: NDArray[np.float64], variance: NDArray[np.float64], misfit: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower root of the linear parameters' precision (draw, linear, linear) and the right side (draw, linear)."""
+        weighted = slope / variance[:, :, None]
+        precision = np.eye(slope.shape[2]) + np.swapaxes(slope, 1, 2) @ weighted
+        lower = np.asarray(np.linalg.cholesky(precision), dtype=np.float64)
+        return lower, np.einsum("ndk,nd->nk", weighted, misfit)
+
+    def relinearise(self, u: NDArray[np.float64], weight: NDArray[np.float64], rng: np.random.Generator) -> None:
+        """Take derivatives from now on where draws (draw, dimension) of these weights (draw,) put the linear parameters."""
+        chosen = u[_resampled(weight, _LINEARISED_ABOUT, rng)]
+        self.about = self._conditional(chosen)[1].mean(axis=0)
 
     def _log_likelihood_of_repeats(self, level_sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log likelihood (draw,) of the scatter between repeats of a setting, whatever its level: y ~ N(m, s^2 + sd^2)."""
@@ -538,17 +556,49 @@ class _Posterior:
         return result
 
     def with_linear(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter): the linear ones drawn given the shapes; without rng their mean."""
-        _, full, z, lower = self._conditional(u)
+        """Full parameter sets (draw, parameter): the linear ones drawn given the shapes; without rng the most probable.
+
+        Each draw solves the least-squares problem whose data and prior centres were moved by draws of their noise, which is
+        exact for a linear model and meets the data where it bends.
+
+        Source: Bardsley, Solonen, Haario and Laine (2014), SIAM J Sci Comput 36:A1895.
+        """
+        full, variance = self.parameters(u), self.variances(u)
+        z = np.tile(self.about, (len(u), 1))
+        moved, pulled = self.value, np.zeros(z.shape)
         if rng is not None:
-            normal = rng.standard_normal(z.shape)
-            z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
-        full[:, self.linear] += self.linear_sd(u) * (z @ self.mixing.T)
-        escape = list(self.model.names).index("escape_scale")
-        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
-        full[:, escape] = np.clip(full[:, escape], bounds[0][escape], bounds[1][escape])
-        # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
+            moved = self.value + np.sqrt(variance) * rng.standard_normal(variance.shape)
+            pulled = rng.standard_normal(z.shape)
+
+        def cost(rows: NDArray[np.intp], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+            data = np.sum((moved[rows] - expected) ** 2 / variance[rows], axis=1)
+            return np.asarray(data + np.sum((z[rows] - pulled[rows]) ** 2, axis=1))
+
+        every = np.arange(len(u))
+        moved = np.broadcast_to(moved, variance.shape)
+        expected, slope = self.expectation(full)
+        least = cost(every, expected)
+        for _ in range(_NEWTON_STEPS):
+            slope = (slope * self.linear_sd) @ self.mixing
+            misfit = moved - expected + np.einsum("ndk,nk->nd", slope, z)
+            lower, right = self._normal_equations(slope, variance, misfit)
+            half = np.linalg.solve(lower, (right + pulled)[:, :, None])
+            step = np.linalg.solve(np.swapaxes(lower, 1, 2), half)[:, :, 0] - z
+            expected, slope = np.empty_like(expected), np.empty_like(slope)
+            rows, before = every, z.copy()
+            for share in _STEP_SHARES:
+                z[rows] = before[rows] + share * step[rows]
+                full[np.ix_(rows, self.linear)] = self.centre[self.linear] + self.linear_sd * (z[rows] @ self.mixing.T)
+                expected[rows], slope[rows] = self.expectation(full[rows])
+                found = cost(rows, expected[rows])
+                better = found <= least[rows]
+                least[rows[better]] = found[better]
+                rows = rows[~better]
+                if not rows.size:
+                    break
         names = list(self.model.names)
+        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
+        # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
         swank, gain, output = (names.index(name) for name in ("log_swank", "log_DN_per_keV", "log_output"))
         beyond = full[:, swank] - np.clip(full[:, swank], bounds[0][swank], bounds[1][swank])
         full[:, swank] -= beyond
@@ -575,6 +625,7 @@ class _Posterior:
             weight, effective = _weights(temper * likelihood + log_ratio)
             if temper >= 1.0 and effective > _ENOUGH:
                 break
+            self.relinearise(u, weight, rng)
             mean = weight @ u
             spread = u - mean
             covariance = (spread * weight[:, None]).T @ spread
@@ -802,10 +853,7 @@ def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: di
     for name in own:
         if name == "log_DN_per_keV":
             continue
-        width = priors[name].sd
-        if name.startswith(DEPARTURES):
-            width *= DEPARTURE_FACTOR * math.exp(LOG_DEPARTURE_SD**2)  # root mean square over the factor's prior
-        share = float(np.std(samples[:, names.index(name)])) / width
+        share = float(np.std(samples[:, names.index(name)])) / priors[name].spread
         if share > 0.7:
             result.append(f"{name}: {100 * min(share, 1.0):.0f} % of the prior's width is left")
     columns = samples[:, [names.index(name) for name in own]]

@@ -98,7 +98,7 @@ def _carries(first: NextMeasurement, twin: Twin) -> str | None:
     if first.other_kV_percent is None:
         return None
     measured = sorted({level.kV for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None})
-    names = " and ".join(f"{kV:g}" for kV in measured)
+    names = " and ".join(filter(None, (", ".join(f"{kV:g}" for kV in measured[:-1]), f"{measured[-1]:g}")))
     text = f"From {names} kV, levels at other voltages are known to +-{first.other_kV_percent:.1f} %"
     if first.measured_kV_percent is not None:
         text += f", behind other filters at the same voltages to +-{first.measured_kV_percent:.1f} %"

@@ -159,7 +159,7 @@ def test_advice_says_how_far_voltages_carry_and_what_each_kind_of_measurement_br
     beams = [(kV, layers) for kV in (40.0, 90.0) for layers in ("", "Al:2")]
     answer = advice(twin_of(model, truth, beams))
     # two voltages do not carry to a third as other filters do
-    assert answer["width_percent_other_kV"] > 1.5 * answer["width_percent_measured_kV"]
+    assert answer["width_percent_other_kV"] > 1.2 * answer["width_percent_measured_kV"]
     assert answer["carries"] in answer["text"]
     assert f"{answer['width_percent_other_kV']:.1f} %" in answer["carries"]
     by_kind = {}
@@ -232,19 +232,32 @@ def test_the_slope_of_the_levels_carries_over_to_settings_not_measured(model, tr
     assert found.sd_DN.value == pytest.approx(exact, rel=0.01)
 
 
-def load_validation():
-    """validation/prediction_limit.py as a module."""
-    path = Path(__file__).parents[1] / "validation" / "prediction_limit.py"
-    spec = importlib.util.spec_from_file_location("prediction_limit", path)
+def load_validation(name):
+    """A script of validation/ as a module."""
+    path = Path(__file__).parents[1] / "validation" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["prediction_limit"] = module  # its processes look it up by name
+    sys.modules[name] = module  # its processes look it up by name
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.mark.slow
+def test_intervals_hold_on_lines_whose_physics_is_not_the_twins(tmp_path):
+    """Three families left out of all priors, one line each: no value off by three half-widths, most inside."""
+    validation = load_validation("foreign_lines")
+    jobs = [(family, 31, ("A", "C")) for family in ("no_escape", "light", "kqp")]
+    results = validation.run(jobs, folder=tmp_path)
+    assert validation.run(jobs, folder=tmp_path) == results
+    for row in validation.summarise(results, draws=50):
+        if row["family"] == "all":
+            assert row["worst_half_widths"] < 3.0, row
+            assert row["coverage_percent"] > 80, row
+
+
+@pytest.mark.slow
 def test_predictions_in_the_lab_stay_near_the_information_limit(tmp_path):
-    validation = load_validation()
+    validation = load_validation("prediction_limit")
     results = validation.run(range(500, 503), kind="nominal", folder=tmp_path)
     again = validation.run(range(500, 503), kind="nominal", folder=tmp_path)
     assert [item["seed"] for item in again] == [500, 501, 502]

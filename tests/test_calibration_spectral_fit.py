@@ -172,6 +172,20 @@ def test_intervals_hold_for_lines_drawn_from_the_priors(model):
     assert inside / 2 >= binom.ppf(1e-3, lines, 0.95)
 
 
+@pytest.mark.parametrize("escape", [-1.0, 0.1])
+def test_draws_meet_the_levels_where_the_model_bends(model, escape):
+    """Not to first order in light, covers and anode: to the levels' own noise, whatever escapes."""
+    truth = typical(model, escape_scale=escape, light_nonproportionality=2.0, anode_roughness_um=3.0, cover_mm_C=1.5)
+    posterior = fit_spectrum(
+        levels_of(model, truth, BEAMS), INSTRUMENT, rng=np.random.default_rng(7), level_discrepancy=1e-4
+    ).posterior
+    for beam in BEAMS:
+        draws = np.log(model.signal(posterior.samples, beam).rate_DN_per_mAs)
+        exact = float(np.log(model.signal(truth[None, :], beam).rate_DN_per_mAs[0]))
+        assert abs(float(np.mean(draws)) - exact) < 3e-4
+        assert np.std(draws) == pytest.approx(0.001, rel=0.15)  # the sampling noise that the levels state
+
+
 def test_more_levels_narrow_the_prediction(model):
     truth = typical(model, inherent_filtration_mm_Al=0.8, kV_error=0.004)
     new = OpenBeam(kV=60.0, filters=filters_from_text("Al:2"))

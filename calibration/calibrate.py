@@ -29,7 +29,8 @@ from .priors import PRIORS
 from .spectral_fit import SpectralFit, fit_spectrum, model_for
 from .wedges import measure_transmissions, wedge_evidence
 
-_POSTERIOR_KV_ERROR = 0.045  # relative, either way: draws of the posterior hardly go further
+# relative, either way: draws of the posterior hardly go further than 0.05, and a varying voltage asks a step of 0.02 beyond
+_POSTERIOR_KV_ERROR = 0.07
 
 
 def calibrate_twin(

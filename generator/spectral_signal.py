@@ -291,23 +291,26 @@ class SpectralModel:
         behind = self._behind_the_anode(samples, beam)
         kV_error = self._kV_error(samples, beam.kV)
         variance = self._column(samples, "kV_variance")
-        photons = behind * self._fluence_at(beam.kV, kV_error, behind.shape[1])
+        shares = _node_shares(_KV_ERRORS, kV_error)
         if np.any(variance):
-            varied = self._second_difference(beam.kV, kV_error, behind.shape[1])
-            photons = np.maximum(photons + behind * variance[:, None] * varied, 0.0)
-        return np.asarray(photons)
+            # spectra at the voltage and a step to both sides are shares of the same nodes
+            shares += variance[:, None] * _second_difference_shares(kV_error)
+        behind *= self._fluence_of_nodes(beam.kV, shares, behind.shape[1])
+        return np.maximum(behind, 0.0, out=behind)
+
+    def _fluence_of_nodes(self, kV: float, shares: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy) as shares (draw, node) of the nodes of the voltage error, on the first `top` energies."""
+        used = np.flatnonzero(np.any(shares != 0.0, axis=0))
+        span = slice(int(used[0]), int(used[-1]) + 1)
+        return np.asarray(shares[:, span] @ self.fluence(kV, span)[span, :top])
 
     def _fluence_at(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
         """Unfiltered fluence (draw, energy) at errors (draw,) of the tube voltage, on the first `top` energies."""
-        below, _ = _brackets(_KV_ERRORS, kV_error)
-        nodes = self.fluence(kV, slice(int(below.min()), int(below.max()) + 2))
-        return _interpolate(_KV_ERRORS, nodes[:, :top], kV_error)
+        return self._fluence_of_nodes(kV, _node_shares(_KV_ERRORS, kV_error), top)
 
     def _second_difference(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
         """Half of kV^2 d2 Phi / d kV2 (draw, energy), over a step on both sides."""
-        inside = np.clip(kV_error, _KV_ERRORS[0] + _KV_STEP, _KV_ERRORS[-1] - _KV_STEP)
-        below, middle, above = (self._fluence_at(kV, inside + step, top) for step in (-_KV_STEP, 0.0, _KV_STEP))
-        return np.asarray((above + below - 2.0 * middle) / (2.0 * _KV_STEP**2))
+        return self._fluence_of_nodes(kV, _second_difference_shares(kV_error), top)
 
     def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
@@ -450,16 +453,23 @@ class SpectralModel:
         if not names:
             return None
         other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
-        first, second, share = (np.zeros((len(samples), top)) for _ in range(3))
-        for name in names:
-            column = self._column(samples, name)[:, None]
-            row = self._response_rows[0][name][:top]
-            if len(self._response_rows) > 1:
-                row = np.where(other[:, None], self._response_rows[1][name][:top], row)
-            for logarithm, power in zip((first, second, share), RESPONSE_PARAMETERS[name], strict=True):
-                if power:
-                    np.add(logarithm, (power * column) * row, out=logarithm)
-        return np.exp(first), np.exp(second), np.exp(share)
+        factors = []  # of each kind of parameter, as its powers have it
+        for kind in ((1.0, 1.0, 1.0), (1.0, 2.0, 0.0), (0.0, -1.0, 0.0)):
+            own = [name for name in names if RESPONSE_PARAMETERS[name] == kind]
+            if not own:
+                factors.append(None)
+                continue
+            columns = np.stack([self._column(samples, name) for name in own], axis=1)
+            logarithm = columns @ np.stack([self._response_rows[0][name][:top] for name in own])
+            if np.any(other):
+                rows = np.stack([self._response_rows[1][name][:top] for name in own])
+                logarithm[other] = columns[other] @ rows
+            factors.append(np.exp(logarithm, out=logarithm))
+        passed, light, swank = factors
+        share = np.ones((len(samples), top)) if passed is None else passed
+        first = share if light is None else share * light
+        second = first if light is None else first * light
+        return first, second if swank is None else second / swank, share
 
     def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
@@ -698,6 +708,23 @@ def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDAr
     below = np.clip(np.searchsorted(nodes, clipped, side="right") - 1, 0, len(nodes) - 2)
     share = (clipped - nodes[below]) / (nodes[below + 1] - nodes[below])
     return below, share
+
+
+def _node_shares(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the nodes in a linear interpolation at positions `at` (draw,)."""
+    below, share = _brackets(nodes, at)
+    shares = np.zeros((len(at), len(nodes)))
+    rows = np.arange(len(at))
+    shares[rows, below] = 1.0 - share
+    shares[rows, below + 1] = share
+    return shares
+
+
+def _second_difference_shares(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the fluence's nodes in half of its second derivative by the logarithm of the voltage."""
+    inside = np.clip(kV_error, _KV_ERRORS[0] + _KV_STEP, _KV_ERRORS[-1] - _KV_STEP)
+    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-_KV_STEP, 0.0, _KV_STEP))
+    return np.asarray((above + below - 2.0 * middle) / (2.0 * _KV_STEP**2))
 
 
 def _interpolate(

@@ -237,7 +237,7 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
     )
 
 
-def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | None, intervals: bool) -> _Beam:
+def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | None, intervals: bool = False) -> _Beam:
     load = setting.tube_load_mAs
     if load is None:
         raise InputError(

@@ -28,9 +28,9 @@ DOSIMETER_LIMIT = 0.05
 _RECTANGULAR = math.sqrt(3.0)
 DOSIMETER_CALIBRATION_SD = DOSIMETER_LIMIT / _RECTANGULAR
 # What a reading scatters where nobody repeated any, and how many repeats that assumption is worth against those made: it
-# stands for the generator too, and gives way to five repeats.
+# stands for the generator too, and gives way to ten repeats.
 REPEATABILITY = 0.01
-REPEATABILITY_WORTH = 2.0
+REPEATABILITY_WORTH = 4.0
 # RQR 2 to RQR 10 (IEC 61267) lie up to so far in ln(mean energy) from the calibration's RQR 5
 _RATED_LOG_ENERGY = 0.35
 

@@ -27,6 +27,8 @@ from .transmission_table import TransmissionTable
 _STRAYS = 0.001
 _EFFICIENCY = 0.37
 _LEAST_TO_JUDGE = 4
+_MOST_STRAYS = 5  # one in so many: beyond, the table is not mostly right
+_RARE = 0.05
 _OF_TUBE = ("inherent_filtration_mm_Al", "kV_error", "log_output", "log_mu_")
 
 
@@ -128,9 +130,29 @@ def fit_without_strays(
     Raises:
         FitError: see `fit_spectrum`.
     """
-    found = fit(data)
-    kept, warnings = _without_strays(found.posterior, data)
-    return (found if kept == data else fit(kept)), kept, warnings
+    found, kept = fit(data), data
+    warnings: list[str] = []
+    for _ in range(len(data.kermas) // _MOST_STRAYS + len(data.ratios) // _MOST_STRAYS):
+        suspect = _suspect(found.posterior, kept)
+        if suspect is None:
+            break
+        # what is wrong pulls the fit towards itself, and is judged by a fit that has not seen it
+        others = DoseData(
+            kermas=tuple(item for item in kept.kermas if item is not suspect),
+            ratios=tuple(item for item in kept.ratios if item is not suspect),
+        )
+        refit = fit(others)
+        departure = _stray(refit.posterior, others, suspect)
+        if departure is None:
+            break
+        lines = ", ".join(str(line) for line in suspect.rows)
+        beam = " ".join([f"{suspect.kV:g} kV", text_from_filters(suspect.filters)]).strip()
+        warnings.append(
+            f"line{'' if len(suspect.rows) == 1 else 's'} {lines} ({beam}): {100.0 * math.expm1(departure):+.0f} % from what all"
+            " the others say, left out"
+        )
+        found, kept = refit, others
+    return found, kept, warnings
 
 
 def table_evidence(
@@ -212,40 +234,42 @@ def departures(
     return np.array(read), np.array(behind)
 
 
-def _without_strays(posterior: SpectralPosterior, data: DoseData) -> tuple[DoseData, list[str]]:
-    warnings = []
-    kermas, ratios = departures(posterior, data.kermas, data.ratios)
-    stray = _strays(kermas, data.kermas)
-    stray_ratio = _strays(ratios, data.ratios)
-    items: list[KermaReading | KermaRatio] = [*data.kermas, *data.ratios]
-    for item, departure, left_out in zip(items, (*kermas, *ratios), (*stray, *stray_ratio), strict=True):
-        if left_out:
-            lines = ", ".join(str(line) for line in item.rows)
-            beam = " ".join([f"{item.kV:g} kV", text_from_filters(item.filters)]).strip()
-            warnings.append(
-                f"line{'' if len(item.rows) == 1 else 's'} {lines} ({beam}):"
-                f" {100.0 * math.expm1(departure):+.0f} % from what all the others say, left out"
-            )
-    kept = DoseData(
-        kermas=tuple(item for item, left_out in zip(data.kermas, stray, strict=True) if not left_out),
-        ratios=tuple(item for item, left_out in zip(data.ratios, stray_ratio, strict=True) if not left_out),
-    )
-    return kept, warnings
+def _suspect(posterior: SpectralPosterior, data: DoseData) -> KermaReading | KermaRatio | None:
+    """The datum that departs most from a fit of all, if so much is rare among so many Gaussian ones, or None."""
+    from scipy.special import ndtri
+
+    worst: tuple[float, KermaReading | KermaRatio | None] = (0.0, None)
+    kinds: tuple[Sequence[KermaReading | KermaRatio], ...] = (data.kermas, data.ratios)
+    for items, departure in zip(kinds, departures(posterior, data.kermas, data.ratios), strict=True):
+        if len(items) <= _LEAST_TO_JUDGE:
+            continue
+        own = np.array([item.relative_sd for item in items])
+        size = np.abs(departure) / np.hypot(_scatter(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
+        place = int(np.argmax(size))
+        if size[place] > max(1.0, worst[0]):
+            worst = (float(size[place]), items[place])
+    return worst[1]
 
 
-def _strays(departure: NDArray[np.float64], items: Sequence[KermaReading | KermaRatio]) -> NDArray[np.bool_]:
-    """Which departures (n,) of these data one table in a thousand would show."""
+def _stray(posterior: SpectralPosterior, others: DoseData, suspect: KermaReading | KermaRatio) -> float | None:
+    """How far a datum lies from a fit of the others (logarithm), if one table in a thousand would show so much, or None."""
     from scipy.special import stdtrit
 
-    if departure.size < _LEAST_TO_JUDGE:
-        return np.zeros(departure.size, dtype=np.bool_)
-    about = departure - np.median(departure)
-    common = (1.4826 * float(np.median(np.abs(about)))) ** 2
-    own = np.array([item.relative_sd**2 for item in items])
-    freedom = np.array([item.freedom if isinstance(item, KermaReading) else math.inf for item in items])
-    together = (common + own) ** 2 / (common**2 / (_EFFICIENCY * (departure.size - 1)) + own**2 / freedom)
-    limit = -stdtrit(together, 0.5 * _STRAYS / departure.size)
-    return np.asarray(np.abs(about) > limit * np.sqrt(common + own))
+    if isinstance(suspect, KermaReading):
+        around = departures(posterior, others.kermas, ())[0]
+        departure, freedom = float(departures(posterior, [suspect], ())[0][0]), suspect.freedom
+    else:
+        around = departures(posterior, (), others.ratios)[1]
+        departure, freedom = float(departures(posterior, (), [suspect])[1][0]), math.inf
+    common, own = _scatter(around) ** 2, suspect.relative_sd**2
+    together = (common + own) ** 2 / (common**2 / (_EFFICIENCY * (around.size - 1)) + own**2 / freedom)
+    limit = -float(stdtrit(together, 0.5 * _STRAYS / (around.size + 1)))
+    return departure if abs(departure) > limit * math.sqrt(common + own) else None
+
+
+def _scatter(departure: NDArray[np.float64]) -> float:
+    """Standard deviation of departures (n,) by their median absolute deviation."""
+    return 1.4826 * float(np.median(np.abs(departure - np.median(departure))))
 
 
 def _rows(items: Sequence[KermaReading | KermaRatio], departure: NDArray[np.float64]) -> list[dict[str, Any]]:

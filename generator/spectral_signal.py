@@ -470,8 +470,9 @@ class SpectralModel:
         weight = np.zeros((6, self.energies_keV.size))
         weight[:2] = 100.0 * self._kerma
         deposits = np.broadcast_to(weight[:, None, :], (6, len(samples), self.energies_keV.size))
-        logs, slope, _ = self.log_derivatives(samples, beam, [*names, "hardness_exponent"], deposits=deposits)
-        hardness, slope = slope[:, -1].copy(), slope[:, :-1].copy()
+        asked = list(dict.fromkeys([*names, "hardness_exponent"]))
+        logs, found, _ = self.log_derivatives(samples, beam, asked, deposits=deposits)
+        hardness, slope = found[:, asked.index("hardness_exponent")].copy(), found[:, : len(names)].copy()
         for column, name in enumerate(names):
             if name in _OF_DETECTOR:
                 slope[:, column] = 0.0

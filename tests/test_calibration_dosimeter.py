@@ -89,11 +89,13 @@ def test_kerma_and_its_derivatives_are_those_of_the_spectrum():
     layers = (Filter(material="Cu", thickness_mm=0.1),)
     beam_ = OpenBeam(kV=70.0, filters=layers)
     inherent = Filter(material="Al", thickness_mm=1.5)
-    expected = air_kerma_uGy_per_mAs(tube_spectrum(kV=70.0, filters=(inherent, *layers)))
     names = [name for name in model.names if name not in ("inherent_filtration_mm_Al", "log_scintillator_thickness")]
     names.remove("kV_error")
-    value, slope, _ = model.log_kerma_derivatives(sample, beam_, names)
-    assert value[0] == pytest.approx(math.log(expected), abs=2e-3)
+    value, slope, by_response = model.log_kerma_derivatives(sample, beam_, names)
+    spectrum = tube_spectrum(kV=70.0, filters=(inherent, *layers))
+    kerma = spectrum.fluence * model.kerma_weights[: spectrum.fluence.size]
+    assert by_response[0] == pytest.approx(kerma @ np.log(spectrum.energies_keV / 50.0) / kerma.sum(), abs=2e-3)
+    assert value[0] == pytest.approx(math.log(air_kerma_uGy_per_mAs(spectrum)), abs=2e-3)
     for column, name in enumerate(names):
         step = np.zeros(len(model.names))
         step[model.names.index(name)] = 1e-3

@@ -1,6 +1,6 @@
 """Tubes calibrated with a dosimeter, against the truth of drawn systems: errors, and how often 95 % intervals hold it.
 
-    python validation/dosimeter.py [--systems 40] [--first 0] [--family NAME]... [--json FILE]
+    python validation/dosimeter.py [--systems 40] [--first 0] [--family NAME]... [--protocol NAME]... [--json FILE]
     python validation/dosimeter.py --real ../shared/realdata
 
 Each system is a tube of the virtual lab (SpekPy's `kqp` at the voltage itself, the lab's own attenuation: no physics of the
@@ -9,8 +9,8 @@ response over energy are wrong within IEC 61674's limits. Every setting strays o
 stated, readings scatter and are rounded. Families add what no label says: a worn anode, a rippling voltage.
 
 Protocols: `kermas` (4 kV, with and without 2 mm Al, one repeated), `half_values` (kermas at 3 kV and half-value layers there),
-`ratios` (half-value layers alone). Rows compare inherent filtration, output over the plain spectrum of the stated tube, and
-air kerma and half-value layer at settings that were not measured. --real fits the published dose reports and transmissions.
+`ratios` (half-value layers alone). Rows compare inherent filtration, output (air kerma at 80 kV behind 3 mm Al), and air kerma
+and half-value layer at settings that were not measured. --real fits the published dose reports and transmissions.
 """
 
 import argparse
@@ -164,11 +164,10 @@ def measured_table(truth: Truth, protocol: str, seed: int, path: Path) -> None:
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
-def measure_system(seed: int, family: str) -> Iterator[dict[str, Any]]:
+def measure_system(seed: int, family: str, protocols: Sequence[str] = PROTOCOLS) -> Iterator[dict[str, Any]]:
     """Rows `{quantity, protocol, family, seed, truth, value, low, high}` of one system."""
     truth = Truth(draw_system(seed, family), seed)
-    tubes = {"filtration": truth.system.filtration_mm_Al, "output": math.exp(truth.system.log_output)}
-    for protocol in PROTOCOLS:
+    for protocol in protocols:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "doses.csv"
             measured_table(truth, protocol, seed, path)
@@ -182,7 +181,11 @@ def measure_system(seed: int, family: str) -> Iterator[dict[str, Any]]:
             common = {"quantity": quantity, "protocol": protocol, "family": family, "seed": seed, "truth": value}
             return common | estimate.as_dict()
 
-        yield row("inherent_filtration_mm_Al", tubes["filtration"], twin.spectral.interval("inherent_filtration_mm_Al"))
+        yield row(
+            "inherent_filtration_mm_Al",
+            truth.system.filtration_mm_Al,
+            twin.spectral.interval("inherent_filtration_mm_Al"),
+        )
         for kV, filters in UNMEASURED:
             layers = filters_from_text(filters)
             spectrum = predict_spectrum(twin, kV=kV, filters=layers)
@@ -313,6 +316,7 @@ def main() -> int:
     parser.add_argument("--systems", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--family", action="append", choices=FAMILIES)
+    parser.add_argument("--protocol", action="append", choices=PROTOCOLS)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--real", type=Path)
     arguments = parser.parse_args()
@@ -327,7 +331,7 @@ def main() -> int:
         for family in arguments.family or FAMILIES
     ]
     for seed, family in tqdm(cases, desc="systems", unit="system", disable=None):
-        rows += measure_system(seed, family)
+        rows += measure_system(seed, family, arguments.protocol or PROTOCOLS)
         if arguments.json is not None:
             arguments.json.write_text(json.dumps(rows), encoding="utf-8")
     print("\n".join(summary(rows)))

@@ -34,7 +34,7 @@ class OutputTable:
 
     Fields: kermas: one entry a kV and filter, its readings brought to 1 mAs and 1 m and averaged; half_values: one entry a
     row; scatter: relative sd of one reading about its setting's mean, from the repeats and what is assumed without any;
-    repeats: how many degrees of freedom told it; rows: of the file.
+    repeats: how many degrees of freedom told it; rows: of the file; notes: what its owner should know.
     """
 
     kermas: tuple[KermaReading, ...]
@@ -42,6 +42,7 @@ class OutputTable:
     scatter: float
     repeats: int
     rows: int
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for the twin's evidence."""
@@ -118,7 +119,7 @@ def read_output_table(path: str | os.PathLike[str], *, anode: str = "W") -> Outp
             finest = min(finest, half_value.resolution / half_value.value)
             half_values.append(_half_value(row, kV, filters, half_value))
         resolutions.append(finest)
-    refuse_copies(rows, COLUMNS, resolutions)
+    notes = refuse_copies(rows, COLUMNS, resolutions)
     scatter, repeats = _scatter_of([readings for _, readings in kermas.values()])
     return OutputTable(
         kermas=tuple(
@@ -129,6 +130,7 @@ def read_output_table(path: str | os.PathLike[str], *, anode: str = "W") -> Outp
         scatter=scatter,
         repeats=repeats,
         rows=len(rows),
+        notes=notes,
     )
 
 

@@ -20,10 +20,13 @@ _COVERAGE_FACTOR = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransmissionTable:
-    """A transmission table as data of the fit: ratios, one entry a row; absorbers: names of those of unknown composition."""
+    """A transmission table as data of the fit: ratios, one entry a row; absorbers: names of those of unknown composition;
+    notes: what its owner should know.
+    """
 
     ratios: tuple[KermaRatio, ...]
     absorbers: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for the twin's evidence."""
@@ -86,10 +89,10 @@ def read_transmission_table(
             )
         )
         resolutions.append(reading.resolution / reading.value)
-    refuse_copies(rows, COLUMNS, resolutions)
+    notes = refuse_copies(rows, COLUMNS, resolutions)
     absorbers = tuple(dict.fromkeys(item.absorber for item in ratios if item.absorber))
     _check_unknown(ratios, absorbers, option=rows[0].place.rpartition(",")[0])
-    return TransmissionTable(ratios=tuple(ratios), absorbers=absorbers)
+    return TransmissionTable(ratios=tuple(ratios), absorbers=absorbers, notes=notes)
 
 
 def _layers(row: TableRow) -> tuple[Filter, ...]:

@@ -34,10 +34,11 @@ _OF_TUBE = ("inherent_filtration_mm_Al", "kV_error", "log_output", "log_mu_")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoseData:
-    """What tables say, as data of the spectral fit."""
+    """What tables say, as data of the spectral fit; notes: what their owner should know."""
 
     kermas: tuple[KermaReading, ...]
     ratios: tuple[KermaRatio, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def any(self) -> bool:
@@ -53,6 +54,7 @@ def dose_data(output: OutputTable | None, transmission: TransmissionTable | None
             *(() if output is None else output.half_values),
             *(() if transmission is None else transmission.ratios),
         ),
+        notes=tuple(note for table in (output, transmission) if table is not None for note in table.notes),
     )
 
 
@@ -131,7 +133,7 @@ def fit_without_strays(
         FitError: see `fit_spectrum`.
     """
     found, kept = fit(data), data
-    warnings: list[str] = []
+    warnings = list(data.notes)
     for _ in range(len(data.kermas) // _MOST_STRAYS + len(data.ratios) // _MOST_STRAYS):
         suspect = _suspect(found.posterior, kept)
         if suspect is None:

@@ -272,7 +272,7 @@ BAD_OUTPUT = {
     "no load": ("kV,filter,distance_mm,air_kerma_uGy\n60,,1000,5\n", "no tube load"),
     "no distance": ("kV,filter,mAs,air_kerma_uGy\n60,,1,5\n", "distance_mm"),
     "kV": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n600,,1,1000,5\n", "line 2: kV: got 600 kV"),
-    "copy": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,51.234\n60,,1,1000,51.234\n", "as in line 2"),
+    "copy": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,51.2347\n60,,1,1000,51.2347\n", "as in line 2"),
     "cells": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,51,2\n", "6 cells"),
 }
 BAD_TRANSMISSION = {

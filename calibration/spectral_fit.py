@@ -20,15 +20,30 @@ from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError, InputError
 from ..generator.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
+    KERMA_OUTPUT,
     OTHER_TABLES,
     OpenBeam,
     SpectralModel,
     SpectrumCorrection,
+    absorber_of_parameter,
     attenuation_scale_name,
 )
 from ..generator.twin import Level, NoiseModel, SpectralPosterior
 from ..generator.twin_spectrum import slope_over_gain
 from ..spectra import BIN_WIDTH_KEV, Spectrum
+from .dose_data import (
+    DOSE_FILTRATION,
+    DOSE_PRIORS,
+    DOSIMETER_CALIBRATION,
+    DOSIMETER_HARDNESS,
+    FREE_KERMA_OUTPUT,
+    KERMA_DISCREPANCY,
+    RATIO_DISCREPANCY,
+    KermaRatio,
+    KermaReading,
+    absorber_priors,
+    dose_parameters,
+)
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
@@ -89,6 +104,23 @@ class SpectralFit:
     discrepancy: Mapping[str, tuple[float, float, float]]
 
 
+def contradicts(fit: SpectralFit) -> bool:
+    """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
+    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
+
+
+def fit_evidence(fit: SpectralFit) -> dict[str, Any]:
+    """What a twin keeps of its fit, in plain numbers."""
+    return {
+        "chi_square": fit.chi_square,
+        "data": fit.data,
+        "effective_draws": fit.effective_draws,
+        "undetermined": list(fit.posterior.undetermined),
+        "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
+        "prior": dict(fit.posterior.prior),
+    }
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transmission:
     """Signal behind known layers over the open signal at one kV and filter, with its relative standard deviation."""
@@ -103,11 +135,30 @@ class Transmission:
 
 @dataclass(frozen=True, slots=True)
 class _Datum:
-    kind: str  # rate, gain or transmission
+    kind: str  # of `_DISCREPANCY_OF`
     beam: int
-    over: int  # beam of the denominator of a transmission
+    over: int  # beam of the denominator of a ratio
     value: float  # logarithm
     sd: float
+    calibration: float = 0.0  # of a kerma: the uncertainty of its dosimeter's calibration over the table's mean
+
+
+# kind of a datum -> whose learned size is its own departure from the model; the sizes' medians
+_DISCREPANCY_OF = {
+    "rate": "level",
+    "gain": "gain",
+    "transmission": "level",
+    "kerma": "kerma",
+    "kerma_ratio": "ratio",
+    "signal_ratio": "ratio",
+}
+_DISCREPANCIES = {
+    "level": LEVEL_DISCREPANCY,
+    "gain": GAIN_DISCREPANCY,
+    "kerma": KERMA_DISCREPANCY,
+    "ratio": RATIO_DISCREPANCY,
+}
+_OF_DETECTOR = ("rate", "gain", "transmission", "signal_ratio")
 
 
 def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None) -> float:
@@ -140,6 +191,10 @@ def priors_for(
             )
         elif name in PRIORS:
             result[name] = PRIORS[name]
+        elif name == KERMA_OUTPUT and not geometry_declared:
+            result[name] = FREE_KERMA_OUTPUT
+        elif name in DOSE_PRIORS:
+            result[name] = DOSE_PRIORS[name]
         elif any(name.startswith(f"{table}_") for table in OTHER_TABLES):
             result[name] = TABLE_SHARE
         else:
@@ -154,13 +209,14 @@ def model_for(
     highest_kV: float,
     model_name: str = "casim",
     correction: SpectrumCorrection | None = None,
+    more_names: Sequence[str] = (),
 ) -> SpectralModel:
     """The spectral model of a declared instrument; what it leaves open takes the defaults (W, 12 degrees).
 
     Without a declared scintillator CsI and Gd2O2S are both weighed (for a counting detector only CsI, as a stand-in).
     """
     undeclared = instrument.scintillator is None and not instrument.counting
-    return SpectralModel(
+    result = SpectralModel(
         anode=instrument.anode or "W",
         anode_angle_deg=instrument.anode_angle_deg or 12.0,
         model=model_name,
@@ -174,6 +230,7 @@ def model_for(
         highest_kV=max(160.0, highest_kV),
         correction=correction,
     )
+    return result.with_parameters(more_names) if more_names else result
 
 
 def correction_from_spectra(
@@ -241,8 +298,10 @@ def fit_spectrum(
     model_name: str = "casim",
     noise: NoiseModel | None = None,
     repeats: Sequence[Mapping[str, Any]] = (),
+    kermas: Sequence[KermaReading] = (),
+    ratios: Sequence[KermaRatio] = (),
 ) -> SpectralFit:
-    """Posterior of the spectral parameters from measured levels, gains and transmissions.
+    """Posterior of the spectral parameters from measured levels, gains, transmissions and dosimeter readings.
 
     Args:
         levels: measured levels; those without kV are left out.
@@ -259,36 +318,51 @@ def fit_spectrum(
             taken as the same in all beams.
         repeats: settings measured more than once (`repeated_settings` of the evidence): how far their levels scatter
             beyond sampling tells how well the line repeats itself.
+        kermas, ratios: what dosimeters say; they calibrate the tube without any level, too.
 
     Raises:
-        FitError: no level with a kV, or the posterior cannot be sampled.
+        FitError: no level with a kV and no dosimeter reading, or the posterior cannot be sampled.
     """
     known = [level for level in levels if level.kV is not None]
-    if not known:
+    if not known and not kermas and not ratios:
         raise FitError("no flat series states its kV, so nothing can be said of the spectrum")
     if spectra:
         correction = correction_from_spectra(spectra, instrument, model_name=model_name)
     layers = [layer for level in known for layer in level.filters]
     layers += [layer for item in transmissions for layer in (*item.filters, *item.layers)]
+    layers += [layer for ratio in ratios for layer in (*ratio.filters, *ratio.layers)]
+    layers += [layer for reading in kermas for layer in reading.filters]
+    read = [(item.kV, item.filters) for item in kermas] + [(item.kV, item.filters) for item in ratios]
     model = model_for(
         instrument,
         materials=[layer.material for layer in layers],
-        highest_kV=max([level.kV or 0.0 for level in known] + [item.kV for item in transmissions]),
+        highest_kV=max(
+            [level.kV or 0.0 for level in known] + [item.kV for item in transmissions] + [kV for kV, _ in read]
+        ),
         model_name=model_name,
         correction=correction,
+        more_names=dose_parameters(kermas, ratios, with_flats=bool(known)),
     )
     priors = priors_for(
         model,
         scintillator_declared=instrument.scintillator is not None,
-        geometry_declared=instrument.pixel_mm is not None and all(level.source_detector_mm for level in known),
+        geometry_declared=not known
+        or (instrument.pixel_mm is not None and all(level.source_detector_mm for level in known)),
     )
+    if (kermas or ratios) and correction is None:
+        priors["inherent_filtration_mm_Al"] = DOSE_FILTRATION
+    absorbers = absorber_priors(model, np.array([priors[name].centre for name in model.names]), ratios)
+    if absorbers:
+        model, priors = model.with_parameters(tuple(absorbers)), priors | absorbers
     beams: dict[OpenBeam, int] = {}
-    data = _data(known, transmissions, instrument, noise, beams)
+    data = [*_data(known, transmissions, instrument, noise, beams), *_dose_data(kermas, ratios, beams)]
     fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
     posterior = _Posterior(model, priors, tuple(beams), data, fixed, _repeated_levels(repeats))
     best, samples, discrepancies, effective = posterior.sample(rng)
     names = model.names
-    voltages = [level.kV or 0.0 for level in known]
+    voltages = [level.kV or 0.0 for level in known] or [kV for kV, _ in read]
+    measured = [level.filters for level in known] or [filters for _, filters in read]
+    own = {name: _sd_of_mixture(draws) for name, draws in discrepancies.items()}
     return SpectralFit(
         posterior=SpectralPosterior(
             names=names,
@@ -305,10 +379,11 @@ def fit_spectrum(
             correction=correction,
             cover=model.cover,
             counting=model.counting,
-            level_discrepancy=_sd_of_mixture(discrepancies["level"]),
-            gain_discrepancy=_sd_of_mixture(discrepancies["gain"]),
+            level_discrepancy=own.get("level", LEVEL_DISCREPANCY),
+            gain_discrepancy=own.get("gain", GAIN_DISCREPANCY),
+            kerma_discrepancy=own.get("kerma"),
             calibrated_kV=(min(voltages), max(voltages)),
-            calibrated_filters=tuple(sorted({text_from_filters(level.filters) for level in known})),
+            calibrated_filters=tuple(sorted({text_from_filters(filters) for filters in measured})),
         ),
         effective_draws=effective,
         chi_square=posterior.chi_square(best),
@@ -375,6 +450,23 @@ def _data(
     return data
 
 
+def _dose_data(
+    kermas: Sequence[KermaReading], ratios: Sequence[KermaRatio], beams: dict[OpenBeam, int]
+) -> list[_Datum]:
+    def number(kV: float, filters: tuple[Filter, ...], absorber: str = "") -> int:
+        return beams.setdefault(OpenBeam(kV=kV, filters=filters, absorber=absorber), len(beams))
+
+    data = []
+    for item in kermas:
+        value = math.log(item.value)
+        data.append(_Datum("kerma", number(item.kV, item.filters), -1, value, item.relative_sd, item.calibration_sd))
+    for ratio in ratios:
+        behind = number(ratio.kV, (*ratio.filters, *ratio.layers), ratio.absorber)
+        kind = "signal_ratio" if ratio.of_signal else "kerma_ratio"
+        data.append(_Datum(kind, behind, number(ratio.kV, ratio.filters), math.log(ratio.value), ratio.relative_sd))
+    return data
+
+
 def _repeated_levels(repeats: Sequence[Mapping[str, Any]]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Logarithms of the levels of each repeated setting, and their sampling's relative sd (series,) each."""
     found = []
@@ -412,8 +504,9 @@ class _Posterior:
         self.beams = beams
         self.data = data
         names = model.names
-        self.shape = np.array([i for i, name in enumerate(names) if name in SHAPE_PARAMETERS])
-        self.linear = np.array([i for i, name in enumerate(names) if name not in SHAPE_PARAMETERS])
+        shapes = {name for name in names if name in SHAPE_PARAMETERS or absorber_of_parameter(name)}
+        self.shape = np.array([i for i, name in enumerate(names) if name in shapes])
+        self.linear = np.array([i for i, name in enumerate(names) if name not in shapes])
         self.linear_names = [names[i] for i in self.linear]
         self.centre = np.array([priors[name].centre for name in names])
         self.sd = np.array([priors[name].sd for name in names])
@@ -423,8 +516,11 @@ class _Posterior:
         self.noise = np.array([item.sd for item in data])
         self.fixed = dict(discrepancies)
         self.repeats = tuple(repeats)
-        self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
-        self.is_gain = np.array([item.kind == "gain" for item in data])
+        self.departing = [_DISCREPANCY_OF[item.kind] for item in data]
+        # levels and gains count where there are any flats: even a kind without data then strays as its prior says
+        of_flats = not data or any(item.kind in ("rate", "gain") for item in data)
+        kinds = {*self.departing, *(("level", "gain") if of_flats else ())}
+        self.learned = [name for name in _DISCREPANCIES if name in kinds and self.fixed.get(name) is None]
         self.dimensions = len(self.shape) + len(self.learned)
         self.about = np.zeros(len(self.linear))
         # one of the tables is right, so shares of two others exclude each other: what one takes is missing to the other
@@ -460,13 +556,13 @@ class _Posterior:
         return full
 
     def discrepancies(self, u: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Relative sd of levels and of gains beyond the model (draw,) each."""
+        """Relative sd of each kind of data beyond the model (draw,) each."""
         result = {}
-        for name, centre in (("level", LEVEL_DISCREPANCY), ("gain", GAIN_DISCREPANCY)):
-            fixed = self.fixed[name]
+        for name, centre in _DISCREPANCIES.items():
+            fixed = self.fixed.get(name)
             if fixed is not None:
                 result[name] = np.full(len(u), fixed)
-            else:
+            elif name in self.learned:
                 column = len(self.shape) + self.learned.index(name)
                 result[name] = centre * np.exp(LOG_DISCREPANCY_SD * u[:, column])
         return result
@@ -479,25 +575,54 @@ class _Posterior:
     def variances(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of each datum's logarithm (draw, datum)."""
         found = self.discrepancies(u)
-        extra = np.where(self.is_gain, found["gain"][:, None], found["level"][:, None])
+        extra = np.stack([found[name] for name in self.departing], axis=1)
         return np.asarray(self.noise**2 + extra**2 + 1e-12)
 
     def expectation(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Logarithms that the model expects (draw, datum) and their derivatives (draw, datum, linear)."""
-        deposits = self.model.deposit_tables(parameters)
-        found = [
-            self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits) for beam in self.beams
-        ]
         value = np.empty((len(parameters), len(self.data)))
         slope = np.empty((len(parameters), len(self.data), len(self.linear)))
+        self._expected_kermas(parameters, value, slope)
+        seen = {place for item in self.data if item.kind in _OF_DETECTOR for place in (item.beam, item.over)}
+        if not seen:
+            return value, slope
+        deposits = self.model.deposit_tables(parameters)
+        found = {
+            place: self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits)
+            for place, beam in enumerate(self.beams)
+            if place in seen
+        }
         for column, item in enumerate(self.data):
+            if item.kind not in _OF_DETECTOR:
+                continue
             logs, rate, gain = found[item.beam]
             value[:, column] = logs[1] if item.kind == "gain" else logs[0]
             slope[:, column] = gain if item.kind == "gain" else rate
-            if item.kind == "transmission":
+            if item.over >= 0:
                 value[:, column] -= found[item.over][0][0]
                 slope[:, column] -= found[item.over][1]
         return value, slope
+
+    def _expected_kermas(
+        self, parameters: NDArray[np.float64], value: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> None:
+        """Fill in what the model expects of the kermas and their ratios: see `expectation`."""
+        kinds = [(column, item) for column, item in enumerate(self.data) if item.kind not in _OF_DETECTOR]
+        found = {
+            place: self.model.log_kerma_derivatives(parameters, self.beams[place], self.linear_names)
+            for place in {place for _, item in kinds for place in (item.beam, item.over) if place >= 0}
+        }
+        for column, item in kinds:
+            value[:, column], slope[:, column], hardness = found[item.beam]
+            if item.over >= 0:
+                value[:, column] -= found[item.over][0]
+                slope[:, column] -= found[item.over][1]
+                hardness = hardness - found[item.over][2]
+            for name, by in ((DOSIMETER_HARDNESS, hardness), (DOSIMETER_CALIBRATION, item.calibration)):
+                if name in self.linear_names:
+                    slope[:, column, self.linear_names.index(name)] = by
+                    # the derivatives may stand where the data put this parameter
+                    value[:, column] += parameters[:, self.model.names.index(name)] * by
 
     def chi_square(self, parameters: NDArray[np.float64]) -> float:
         """Squared misfit over noise and the largest plausible discrepancy, at one parameter set (parameter,)."""
@@ -552,7 +677,8 @@ class _Posterior:
         result = np.full(len(u), -np.inf)
         if inside.any():
             result[inside] = self._conditional(u[inside])[0]
-            result[inside] += self._log_likelihood_of_repeats(self.discrepancies(u[inside])["level"])
+            if self.repeats:
+                result[inside] += self._log_likelihood_of_repeats(self.discrepancies(u[inside])["level"])
         return result
 
     def with_linear(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:

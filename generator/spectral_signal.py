@@ -20,6 +20,7 @@ scintillator's own (`spectra.light_per_keV`), a power of energy, and the depth a
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -72,7 +73,12 @@ RESPONSE_PARAMETERS: dict[str, tuple[float, float, float]] = {
 }
 _RESPONSE_OF_COUNTERS = ("cover_mm_C", "dead_layer_um")
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
+# of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
+KERMA_OUTPUT = "log_kerma_over_flats"
 OTHER_TABLES = ("chantler", "penelope")
+# parameters that say nothing of the tube: a dosimeter does not notice them
+_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
+_ABSORBER = "absorber_mm:"
 _KV_ERRORS = np.linspace(-0.09, 0.06, 31)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
 _ALL_NODES = slice(None)
 _LOWEST_KEV = (
@@ -95,12 +101,29 @@ def table_share_name(table: str, material: str) -> str:
     return f"{table}_{material}"
 
 
+def absorber_thickness_name(absorber: str, material: str) -> str:
+    """Name of the parameter that holds how much (mm) of a material an absorber of unknown composition amounts to."""
+    return f"{_ABSORBER}{absorber}:{material}"
+
+
+def absorber_of_parameter(name: str) -> tuple[str, str] | None:
+    """The absorber and the material whose thickness a parameter is (`absorber_thickness_name`), or None."""
+    if not name.startswith(_ABSORBER):
+        return None
+    absorber, _, material = name.removeprefix(_ABSORBER).rpartition(":")
+    return absorber, material
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenBeam:
-    """One open-beam setting as the spectrum sees it: kV and filters; rates are per mAs at 1 m and 1 mm2 of pixel."""
+    """One open-beam setting as the spectrum sees it: kV and filters; rates are per mAs at 1 m and 1 mm2 of pixel.
+
+    absorber: name of an absorber of unknown composition behind the filters, whose thicknesses are parameters; empty: none.
+    """
 
     kV: float
     filters: tuple[Filter, ...]
+    absorber: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,8 +202,7 @@ class SpectralModel:
         for material in self.filter_materials:
             every.append(attenuation_scale_name(material))
             every += [table_share_name(table, material) for table in OTHER_TABLES]
-        self.names = tuple(every) if names is None else tuple(names)
-        self._index = {name: position for position, name in enumerate(self.names)}
+        self._named(every if names is None else names)
         self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
         self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
@@ -213,6 +235,26 @@ class SpectralModel:
         if key not in self._departures:
             self._departures[key] = _table_departure(material, table, self.energies_keV)
         return self._departures[key]
+
+    def with_parameters(self, names: Sequence[str]) -> "SpectralModel":
+        """The same model with more parameters, behind its own; the tables are shared."""
+        result = copy(self)
+        result._named((*self.names, *(name for name in names if name not in self._index)))
+        return result
+
+    def _named(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self._index = {name: position for position, name in enumerate(self.names)}
+        self._absorbers: dict[str, dict[str, str]] = {}
+        for name in self.names:
+            found = absorber_of_parameter(name)
+            if found is not None:
+                self._absorbers.setdefault(found[0], {})[name] = found[1]
+
+    @property
+    def kerma_weights(self) -> NDArray[np.float64]:
+        """Air kerma of a photon per cm2 (energy,), uGy cm2."""
+        return self._kerma
 
     def mu(self, material: str) -> NDArray[np.float64]:
         """Linear attenuation (energy,), 1/mm."""
@@ -339,6 +381,9 @@ class SpectralModel:
             if row is not None:
                 factors.append(self._column(samples, name))
                 rows.append(row)
+        for name, material in self._absorbers.get(beam.absorber, {}).items():
+            factors.append(self._column(samples, name))
+            rows.append(-self.mu(material)[:top])
         width = energies[1] - energies[0]
         factors.append(
             self._column(samples, "log_output")
@@ -509,8 +554,30 @@ class SpectralModel:
             gain_DN=excess * second / first,
             absorbed_per_mAs=absorbed,
             # photons are per mm2, kerma counts per cm2
-            kerma_uGy_per_mAs=100.0 * photons @ self._kerma[:top],
+            kerma_uGy_per_mAs=100.0 * (photons @ self._kerma[:top]) * np.exp(self._column(samples, KERMA_OUTPUT)),
         )
+
+    def log_kerma_derivatives(
+        self, samples: NDArray[np.float64], beam: OpenBeam, names: Sequence[str]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithm of the air kerma of a beam (draw,), uGy per mAs at 1 m, and how each of `names` moves it (draw, name).
+
+        The third is the mean of ln(E / 50 keV) over the kerma (draw,): the derivative by the exponent of a dosimeter whose
+        response goes as a power of the energy. Arguments as in `log_derivatives`.
+        """
+        weight = np.zeros((6, self.energies_keV.size))
+        weight[:2] = 100.0 * self._kerma
+        deposits = np.broadcast_to(weight[:, None, :], (6, len(samples), self.energies_keV.size))
+        asked = list(dict.fromkeys([*names, "hardness_exponent"]))
+        logs, found, _ = self.log_derivatives(samples, beam, asked, deposits=deposits)
+        hardness, slope = found[:, asked.index("hardness_exponent")].copy(), found[:, : len(names)].copy()
+        for column, name in enumerate(names):
+            if name in _OF_DETECTOR:
+                slope[:, column] = 0.0
+            elif name == KERMA_OUTPUT:
+                slope[:, column] = 1.0
+        value = logs[0] - self._column(samples, "log_DN_per_keV") + self._column(samples, KERMA_OUTPUT)
+        return value, slope, hardness
 
     def log_derivatives(
         self,

@@ -498,7 +498,7 @@ class SpectralModel:
         if not names:
             return None
         other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
-        factors = []  # of each kind of parameter, as its powers have it
+        factors: list[NDArray[np.float64] | None] = []  # of each kind of parameter, as its powers have it
         for kind in ((1.0, 1.0, 1.0), (1.0, 2.0, 0.0), (0.0, -1.0, 0.0)):
             own = [name for name in names if RESPONSE_PARAMETERS[name] == kind]
             if not own:

@@ -48,7 +48,7 @@ from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, SHAR
 from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for, priors_for
 from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
-from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd
+from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.spectra import air_kerma_uGy_per_mAs, energy_grid_keV, tube_fluence_interpolated
 from raytwin.spectra.spectrum import Spectrum
@@ -372,8 +372,7 @@ def measured_twin(line: ForeignLine, beams: tuple[tuple[float, str], ...], rng: 
             bad_pixels=np.zeros((8, 8), dtype=np.uint8),
         ),
         noise=NoiseModel(
-            psf_model="aperture",
-            psf_sigma_px=estimate_from_sd(0.5, 0.005),
+            spread=gaussian_spread("aperture", estimate_from_sd(0.5, 0.005)),
             white_fraction=0.0,
             read_noise_DN=estimate_from_sd(0.01, 0.001),
             quantised=False,

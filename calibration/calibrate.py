@@ -294,7 +294,7 @@ def _tube_answer(twin: TubeTwin) -> dict[str, Any]:
     missing = ("psf_sigma_px", "read_noise_DN", "dark_DN", *(() if flux is not None else ("flux_scale",)))
     return {
         "psf_sigma_px": None,
-        "psf_model": None,
+        "spread": None,
         "read_noise_DN": None,
         "dark_DN": None,
         "inherent_filtration_mm_Al": twin.spectral.interval("inherent_filtration_mm_Al").as_dict(),

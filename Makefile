@@ -42,6 +42,7 @@ validation-generator: $(READY)
 validation-prediction: $(READY)
 	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
 	for kind in nominal departing; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --repeats 3 --first 2000 --systems 40 --processes 2 --json build/prediction_limit/$${kind}_repeated.json || exit 1; done
+	OMP_NUM_THREADS=1 $(BIN)/python validation/foreign_lines.py --processes 2 --json build/foreign_lines/coverage.json
 
 # the diagnosis on sessions of other programs, a quarter of an hour a line (gvxr and gecatsim are installed apart; without one its lines are left out)
 validation-simulators: $(READY)

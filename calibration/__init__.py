@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from .next_measurement import (
         NextMeasurement,
+        advice,
         rank_measurements,
     )
     from .noise_power import (
@@ -64,6 +65,7 @@ _LAZY = {
     "SpreadFit": "spread_fit",
     "Validation": "validate",
     "ValidationRow": "validate",
+    "advice": "next_measurement",
     "calibrate_twin": "calibrate",
     "calibration_answer": "calibrate",
     "compute_difference_power": "noise_power",
@@ -91,6 +93,7 @@ __all__ = [
     "SpreadFit",
     "Validation",
     "ValidationRow",
+    "advice",
     "calibrate_twin",
     "calibration_answer",
     "compute_difference_power",

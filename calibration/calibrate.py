@@ -1,6 +1,5 @@
 """Measured flats and darks -> a calibrated twin."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
+from ..generator.tube_twin import TubeTwin
 from ..generator.twin import BAD_PIXEL_CODES, Estimate, SpreadEstimate, Twin
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
@@ -23,13 +23,17 @@ from ..spectra import (
     energy_grid_keV,
     tube_fluence_interpolated,
 )
-from .next_measurement import rank_measurements, voltages_within_reach
+from .next_measurement import advice, voltages_within_reach
+from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
-from .spectral_fit import SpectralFit, fit_spectrum, model_for
+from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for
+from .transmission_table import TransmissionTable
+from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
 
-_POSTERIOR_KV_ERROR = 0.045  # relative, either way: draws of the posterior hardly go further
+# relative, either way: draws of the posterior hardly go further than 0.05, and a varying voltage asks a step of 0.02 beyond
+_POSTERIOR_KV_ERROR = 0.07
 
 
 def calibrate_twin(
@@ -42,6 +46,8 @@ def calibrate_twin(
     spectra: Sequence[Spectrum] = (),
     estimator: str = "pairs",
     repeated: Sequence[Series] | None = None,
+    output_table: OutputTable | None = None,
+    transmission_table: TransmissionTable | None = None,
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
@@ -54,6 +60,7 @@ def calibrate_twin(
         spectra: measured ones, in place of the tube model at their voltages.
         estimator: variances from `pairs` of successive frames, or from the `stack` about its mean.
         repeated: flats and objects that the noise of single-frame flats may be read from, in place of the acquisition's.
+        output_table, transmission_table: what a dosimeter read on this line; `calibrate_tube` does without an acquisition.
         advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
@@ -66,7 +73,8 @@ def calibrate_twin(
     warnings = [*cut_off, *transfer.warnings]
     evidence = dict(transfer.evidence)
     spectral = None
-    if any(level.kV is not None for level in transfer.levels):
+    doses = dose_data(output_table, transmission_table)
+    if any(level.kV is not None for level in transfer.levels) or doses.any:
         tell("spectrum")
         if not any(level.rate_DN_per_mAs for level in transfer.levels if level.kV is not None):
             warnings.append("no tube current or power in the flats: levels cannot be predicted, only gains")
@@ -76,37 +84,37 @@ def calibrate_twin(
             )
         voltages = {level.kV for level in transfer.levels if level.kV is not None}
         beams = {(level.kV, level.filters) for level in transfer.levels if level.kV is not None}
-        if len(beams) == 1:
+        if len(beams) == 1 and not doses.any:
             warnings.append(
                 "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or"
                 " the same kV with a known filter"
             )
-        elif len(voltages) == 1:
+        elif len(voltages) == 1 and not doses.any:
             warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
         wedges = measure_transmissions(acquisition, transfer.maps)
         evidence["wedges"] = wedge_evidence(wedges)
         warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
         transmissions = [value for item in wedges for value in item.transmissions]
-        try:
-            fit = fit_spectrum(
+
+        def fit_of(chosen: DoseData, behind: Sequence[Transmission] = transmissions) -> SpectralFit:
+            return fit_spectrum(
                 transfer.levels,
                 acquisition.instrument,
                 rng=rng,
                 spectra=spectra,
-                transmissions=transmissions,
+                transmissions=behind,
                 noise=transfer.noise,
                 repeats=transfer.evidence["repeated_settings"],
+                kermas=chosen.kermas,
+                ratios=chosen.ratios,
             )
-            if transmissions and _contradicts(fit):
-                without = fit_spectrum(
-                    transfer.levels,
-                    acquisition.instrument,
-                    rng=rng,
-                    spectra=spectra,
-                    noise=transfer.noise,
-                    repeats=transfer.evidence["repeated_settings"],
-                )
-                if not _contradicts(without):
+
+        try:
+            fit, doses, told = fit_without_strays(doses, fit_of)
+            warnings += told
+            if transmissions and contradicts(fit):
+                without = fit_of(doses, ())
+                if not contradicts(without):
                     fit = without
                     evidence["wedges"] = [{**row, "used": False} for row in evidence["wedges"]]
                     warnings.append(
@@ -123,15 +131,9 @@ def calibrate_twin(
                     f"spectra were measured at {voltages_kV} kV; at other voltages the tube model is corrected as between or"
                     " nearest to these"
                 )
-            evidence["spectrum"] = {
-                "chi_square": fit.chi_square,
-                "data": fit.data,
-                "effective_draws": fit.effective_draws,
-                "undetermined": list(spectral.undetermined),
-                "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
-                "prior": dict(spectral.prior),
-            }
-            if _contradicts(fit):
+            evidence["spectrum"] = fit_evidence(fit)
+            evidence |= table_evidence(spectral, doses, output=output_table, transmission=transmission_table)
+            if contradicts(fit):
                 warnings.append(
                     f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
                     " data): check kV, filter and power of the series"
@@ -152,8 +154,7 @@ def calibrate_twin(
     )
     if advise and spectral is not None:
         tell("next measurement")
-        ranked = rank_measurements(twin)
-        twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
+        twin = replace(twin, evidence=evidence | {"next_measurement": advice(twin)})
     return twin
 
 
@@ -180,7 +181,7 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
             for_sums=name == DEFAULT_MODEL,
         )
     materials = [layer.material for item in flats for layer in item.filters]
-    wanted = dict.fromkeys(measured, PRIORS["kV_error"].high)
+    wanted = dict.fromkeys(measured, -PRIORS["kV_error"].low)
     for kV in voltages_within_reach(measured, anode) if advise else ():
         wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
     for highest_kV in sorted({measured[-1], max(wanted)}):
@@ -197,11 +198,6 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
 
 def _shares(names: Sequence[str]) -> list[str]:
     return [name for name in names if name.startswith(OTHER_TABLES)]
-
-
-def _contradicts(fit: SpectralFit) -> bool:
-    """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
-    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
 
 
 def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
@@ -227,8 +223,10 @@ def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
     }
 
 
-def calibration_answer(twin: Twin) -> dict[str, Any]:
-    """The answer of `raytwin calibrate --json`."""
+def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
+    """The answer of `raytwin calibrate --json`; of a tube alone, what needs a detector is null."""
+    if isinstance(twin, TubeTwin):
+        return _tube_answer(twin)
 
     def plain(estimate: Estimate | None) -> dict[str, float] | None:
         return None if estimate is None else estimate.as_dict()
@@ -239,9 +237,7 @@ def calibration_answer(twin: Twin) -> dict[str, Any]:
     if spectral is not None:
         filtration = spectral.interval("inherent_filtration_mm_Al")
         if any(level.rate_DN_per_mAs for level in twin.levels):
-            draws = np.exp(spectral.column("log_output"))
-            low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
-            flux = Estimate(value=float(middle), low=float(low), high=float(high))
+            flux = _output_scale(twin)
     if twin.noise.spread.gaussian_px is None:
         warnings.append(
             "psf_sigma_px is null: most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`"
@@ -282,4 +278,31 @@ def calibration_answer(twin: Twin) -> dict[str, Any]:
         "next_measurement": twin.evidence.get("next_measurement"),
         "evidence": dict(twin.evidence),
         "warnings": warnings,
+    }
+
+
+def _output_scale(twin: Twin | TubeTwin) -> Estimate | None:
+    """Output of the tube over the spectrum model's."""
+    if twin.spectral is None:
+        return None
+    low, middle, high = np.quantile(np.exp(twin.spectral.column("log_output")), [0.025, 0.5, 0.975])
+    return Estimate(value=float(middle), low=float(low), high=float(high))
+
+
+def _tube_answer(twin: TubeTwin) -> dict[str, Any]:
+    flux = _output_scale(twin) if twin.output_known else None
+    missing = ("psf_sigma_px", "read_noise_DN", "dark_DN", *(() if flux is not None else ("flux_scale",)))
+    return {
+        "psf_sigma_px": None,
+        "spread": None,
+        "read_noise_DN": None,
+        "dark_DN": None,
+        "inherent_filtration_mm_Al": twin.spectral.interval("inherent_filtration_mm_Al").as_dict(),
+        "flux_scale": None if flux is None else flux.as_dict(),
+        "levels": [],
+        "bad_pixels": None,
+        "undetermined": list(twin.spectral.undetermined),
+        "next_measurement": None,
+        "evidence": dict(twin.evidence),
+        "warnings": [*twin.warnings, f"null: {', '.join(missing)}, bad_pixels"],
     }

@@ -113,7 +113,7 @@ THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
 ATTENUATION_SD = 0.015  # of a material's attenuation: tables differ by 1-4 %
 ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube voltage
 LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
-OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over what departures are found to be beyond the usual
+OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over each further prior sd of the largest departure
 LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
 GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
 GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
@@ -312,35 +312,33 @@ def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
     """Standard deviations (parameter,) that spectral parameters are taken to have before a session is seen.
 
     They are those that calibration started from, not its posterior's: the calibrating series are among the probes and say again
-    what they know. Departures from tables and models are as large as calibration has found them to be (`departures_found`).
+    what they know.
     """
-    grown = departures_found(posterior)
     result = []
     for name in posterior.names:
-        sd = PRIORS.get(name, ATTENUATION_SCALE).sd
+        sd = PRIORS.get(name, ATTENUATION_SCALE).spread
         if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
             sd = UNDECLARED_SCINTILLATOR.sd
         if name in ("log_output", "log_DN_per_keV"):
             # fixed by the level within percents; a wide prior would only leave the linear range
             sd = 0.03
-        result.append(grown * sd if name.startswith(DEPARTURES) else sd)
+        result.append(sd)
     return np.array(result)
 
 
 def departures_found(posterior: SpectralPosterior | None) -> float:
-    """How many times larger than usual a line's departures from tables and models are by its calibration; 1 at the least.
+    """How many prior standard deviations a line's largest departure from tables and models is by its calibration; 1 at the least.
 
-    Calibration learns one factor for all of them; the one of which flats tell least keeps nearly all of it. In 38 sessions of the
-    lab it was 0.4 to 1, in twelve of fourteen with other programs' spectra, responses and cross sections 1.2 to 4.2.
+    What lies that far out by one parameter is likely to have more beside it that no parameter describes.
     """
     if posterior is None:
         return 1.0
-    spread = posterior.samples.std(axis=0)
-    found = [
-        float(sd) / PRIORS.get(name, ATTENUATION_SCALE).sd
-        for name, sd in zip(posterior.names, spread, strict=True)
-        if name.startswith(DEPARTURES)
-    ]
+    means = posterior.samples.mean(axis=0)
+    found = []
+    for name, mean in zip(posterior.names, means, strict=True):
+        if name.startswith(DEPARTURES):
+            prior = PRIORS.get(name, ATTENUATION_SCALE)
+            found.append(abs(float(mean) - prior.centre) / prior.sd)
     return max([1.0, *found])
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting, filters_from_text, text_from_filters
+from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
 from ..errors import InputError
 from ..spectra import checked_kV
 from .binning import binned_pixel
@@ -99,14 +99,9 @@ def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) 
 
 def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
     """In how many ways a setting lies outside what was calibrated, in words: kV, filters, level."""
-    posterior = twin.spectral
-    found = []
-    if posterior is not None:
-        lowest, highest = posterior.calibrated_kV
-        if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
-            found.append(f"kV ({lowest:g} to {highest:g} calibrated)")
-        if _filters_outside(posterior, setting):
-            found.append("filters")
+    found: list[str] = []
+    if twin.spectral is not None:
+        found += spectrum_outside(twin.spectral, kV=setting.kV, filters=setting.filters)
     points = [
         float(point["signal_DN"])
         for point in twin.evidence.get("photon_transfer", ())
@@ -117,7 +112,18 @@ def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
+def spectrum_outside(posterior: SpectralPosterior, *, kV: float, filters: Sequence[Filter]) -> tuple[str, ...]:
+    """In how many ways a beam lies outside what was calibrated, in words: kV, filters."""
+    found = []
+    lowest, highest = posterior.calibrated_kV
+    if not 0.98 * lowest <= kV <= 1.02 * highest:
+        found.append(f"kV ({lowest:g} to {highest:g} calibrated)")
+    if _filters_outside(posterior, filters):
+        found.append("filters")
+    return tuple(found)
+
+
+def _filters_outside(posterior: SpectralPosterior, filters: Sequence[Filter]) -> bool:
     stacks: list[dict[str, float]] = []
     for text in posterior.calibrated_filters:
         stack: dict[str, float] = {}
@@ -125,7 +131,7 @@ def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
             stack[layer.material] = stack.get(layer.material, 0.0) + layer.thickness_mm
         stacks.append(stack)
     wanted: dict[str, float] = {}
-    for layer in setting.filters:
+    for layer in filters:
         wanted[layer.material] = wanted.get(layer.material, 0.0) + layer.thickness_mm
     for material in {*wanted, *(name for stack in stacks for name in stack)}:
         thicknesses = [stack.get(material, 0.0) for stack in stacks]
@@ -285,7 +291,10 @@ def _by_model(
         quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
         quantum_sd=math.hypot(level_sd, gain_sd),
         photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, level_sd),
-        kerma_uGy=_estimate_from_draws(signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2, level_sd),
+        kerma_uGy=_estimate_from_draws(
+            signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2,
+            level_sd if posterior.kerma_discrepancy is None else widen * posterior.kerma_discrepancy,
+        ),
         outside=outside,
     )
 

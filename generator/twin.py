@@ -169,7 +169,8 @@ class SpectralPosterior:
     prior: name -> text; undetermined: directions that the data leave as wide as the prior, in words; anode,
     anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model; alternative:
     the scintillator of draws that have another one (where nobody declared it); level_discrepancy, gain_discrepancy: relative
-    sd of a single level and gain beyond the parameters; correction: of the tube model by measured spectra, if there were any.
+    sd of a single level and gain beyond the parameters; kerma_discrepancy: of a single setting's air kerma (None: no dosimeter
+    was read); correction: of the tube model by measured spectra, if there were any.
     """
 
     names: tuple[str, ...]
@@ -190,6 +191,7 @@ class SpectralPosterior:
     calibrated_filters: tuple[str, ...]
     alternative: tuple[Filter, ...] = ()
     correction: SpectrumCorrection | None = None
+    kerma_discrepancy: float | None = None
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Draws of one parameter (draw,)."""

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Sequence
 
 from ..acquisition.setting import Filter, filter_from_text
+from ..errors import InputError
 from ..materials import TABLES, Library, library_from_files, material_from_name, nist_identifier
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
@@ -22,6 +23,8 @@ from ..spectra import (
     tube_spectrum,
 )
 from ._answer import say
+from ._twin_file import HELP as TWIN_HELP
+from ._twin_file import twin_file
 
 SOFT_KEV = 12.0
 SOFT_SHARE = 0.1
@@ -73,6 +76,26 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
         "--cover", action="append", default=[], metavar="MATERIAL:MM", help="layer in front of it, repeatable"
     )
     parser.add_argument("--counting", action="store_true", help="photon-counting instead of energy-integrating")
+
+
+def add_twin_argument(parser: argparse.ArgumentParser) -> None:
+    """--twin, in place of the options that describe a tube."""
+    parser.add_argument("--twin", metavar="TWIN", type=twin_file, help=f"a calibrated tube: {TWIN_HELP}")
+
+
+def check_twin_alone(arguments: argparse.Namespace) -> None:
+    """Refuse what a calibrated tube states itself.
+
+    Raises:
+        InputError: no tube voltage, or an option that describes another tube.
+    """
+    if arguments.kv is None:
+        raise InputError("--kv", received="nothing", expected="the tube voltage in kV")
+    stated = {"anode": DEFAULT_ANODE, "angle": DEFAULT_ANGLE_DEG, "model": DEFAULT_MODEL, "table": "xraylib"}
+    given = [f"--{name}" for name, default in stated.items() if getattr(arguments, name) != default]
+    given += [f"--{name.replace('_', '-')}" for name in ("spectrum_file", "library") if getattr(arguments, name)]
+    if given:
+        raise InputError("--twin", received=f"also {', '.join(given)}", expected="a twin or a stated tube, not both")
 
 
 def kv_help() -> str:

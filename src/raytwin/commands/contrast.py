@@ -41,6 +41,7 @@ _LINE_OPTIONS = {
     "spread_px": ("psf_sigma_px", "PX", "sigma of the optical spread"),
     "read_noise_kev": ("read_noise_keV", "KEV", "electronic noise of a frame as energy absorbed"),
 }
+_OF_TUBE = ("anode", "anode_angle_deg", "inherent", "output_scale")
 _LAYER_OPTIONS = {"inherent": "layers of the tube", "scintillator": "sensitive layers", "cover": "layers before them"}
 
 
@@ -126,7 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _line_of(arguments: argparse.Namespace) -> "Twin | UncalibratedLine":
     from ..generator.contrast import UncalibratedLine
-    from ..generator.twin_io import read_twin
+    from ..generator.tube_twin import TubeTwin
+    from ..generator.twin_io import read_any_twin
     from ..materials import material_from_name
 
     given: dict[str, Any] = {}
@@ -143,9 +145,17 @@ def _line_of(arguments: argparse.Namespace) -> "Twin | UncalibratedLine":
             given[option] = getattr(arguments, option)
     if arguments.twin is None:
         return UncalibratedLine(**given)
+    twin = read_any_twin(arguments.twin)
+    if isinstance(twin, TubeTwin):
+        stated = [name for name in _OF_TUBE if name in given]
+        if stated:
+            raise InputError(
+                "--twin", received=f"also {', '.join(stated)}", expected="a calibrated tube or a stated one, not both"
+            )
+        return UncalibratedLine(**given, tube=twin)
     if given:
         raise InputError("--twin", received=f"also {', '.join(given)}", expected="a twin or a stated line, not both")
-    return read_twin(arguments.twin)
+    return twin
 
 
 def _axes_of(arguments: argparse.Namespace) -> dict[str, list[Any]]:

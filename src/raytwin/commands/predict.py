@@ -39,7 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     from ..generator.dual_layer import predict_back_layer
     from ..generator.line_limits import frames_per_s
     from ..generator.predict import predict_flatfield
-    from ..generator.twin_io import read_twin
+    from ..generator.tube_twin import TubeTwin, predict_tube
+    from ..generator.twin_io import read_any_twin
     from ..materials import material_from_name
 
     setting = Setting(
@@ -56,7 +57,13 @@ def run(arguments: argparse.Namespace) -> int:
     )
     for layer in setting.filters:
         material_from_name(layer.material)
-    twin = read_twin(arguments.twin)
+    twin = read_any_twin(arguments.twin)
+    if isinstance(twin, TubeTwin):
+        result = predict_tube(twin, setting).as_dict()
+        for warning in result["warnings"]:
+            say(f"warning: {warning}")
+        answer(result, as_json=arguments.json, text=_text(result))
+        return 0
     result = predict_flatfield(twin, setting).as_dict()
     result["frames_per_s"] = frames_per_s(twin.instrument, setting)
     if twin.instrument.dual_layer and twin.spectral is not None:

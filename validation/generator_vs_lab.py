@@ -183,7 +183,7 @@ def fine_lengths(system: LabSystem, scene: RenderedScene | None) -> dict[str, ND
 
 def without_margins(system: LabSystem, fine: NDArray[Any]) -> NDArray[Any]:
     """The lab's fine grid without what lies beside the detector."""
-    margin = 3 * margin_px(system.psf_sigma_px)
+    margin = 3 * margin_px(max(system.core_px))
     inner = slice(margin, -margin) if margin else slice(None)
     return fine[inner, inner]
 

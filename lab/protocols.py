@@ -283,10 +283,10 @@ def _product_plan(
 
 PROTOCOLS: dict[str, str] = {
     "calibration": "darks and flats at several powers and exposures, 40 and 90 kV, some settings held back",
-    "averaged": "as calibration, each flat and dark stored once as the mean of its frames",
-    "averaged_pairs": "as averaged, every flat stored in two series",
     "set1": "fillets with and without rib bones of 1.5-11 mm, at 1 s",
     "set2": "two fillets with bones of 2 and 3 mm in many places, at 1 s, 100, 50 and 20 ms",
+    "averaged": "as calibration, each flat and dark stored once as the mean of its frames",
+    "averaged_pairs": "as averaged, every flat stored in two series",
 }
 DEFAULT_FRAMES = {"calibration": 20, "averaged": 50, "averaged_pairs": 50, "set1": 1, "set2": 1}
 # of random numbers: what a seed gives does not hang on the order of a table
@@ -599,7 +599,7 @@ def _measure(
     expected: dict[str, Any] = {"kind": take.kind}
     if take.kind == "flat":
         if bench.course is not None:
-            expected["output"] = bench.course.level(bench.series)
+            expected["level"] = bench.course.level(bench.series)
         expected |= flat_truth(system, bench.base_maps, setting)
     return expected
 

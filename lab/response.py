@@ -122,6 +122,10 @@ def compute_deposits(
         bright = 1.0 + depth_light * (0.5 * (begin_mm + end_mm) / scintillator_mm - 0.5)
         absorbed = np.exp(-mu * begin_mm) * -np.expm1(-mu * (end_mm - begin_mm))
         full = absorbed.copy()
+        # what leaves it all first, the array filled below
+        index.append(everywhere)
+        deposit.append(bright * light_keV(energy_keV, of_photon=True))
+        probability.append(full)
         for element, fraction in fractions.items():
             edge = xraydb.xray_edge(element, "K")
             above = np.flatnonzero(energy_keV > edge.energy / 1000.0)
@@ -140,9 +144,6 @@ def compute_deposits(
                 index.append(above)
                 deposit.append(bright * light_keV(np.maximum(left_keV, 0.0), of_photon=False))
                 probability.append(leaves)
-        index.append(everywhere)
-        deposit.append(bright * light_keV(energy_keV, of_photon=True))
-        probability.append(full)
     return Deposits(
         energy_index=np.concatenate(index),
         deposit_keV=np.concatenate(deposit),

@@ -686,7 +686,9 @@ def _measure(
         advance()
     expected: dict[str, Any] = {"kind": take.kind}
     if take.kind in ("flat", "object"):
-        expected["output"] = take.output * (1.0 if line.course is None else line.course.level(line.series))
+        expected["output"] = take.output
+        if line.course is not None:
+            expected["level"] = line.course.level(line.series)
     if take.kind == "flat":
         # Of the line as it was calibrated; effects are told apart from it.
         expected |= flat_truth(line.base, line.base_maps, setting)

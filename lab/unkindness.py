@@ -201,8 +201,10 @@ class SessionCourse:
             # each cosine has a mean square of a half
             light = 1.0 + self.sizes.shape_percent / 100.0 * math.sqrt(2.0 / _SHAPE_PARTS) * departure
             dust = self.change.dust_after if series >= self.change.dust_series else self.change.dust_before
+            taken = np.zeros(self.shape)
             for row, column, size_px, share in dust:
-                light *= 1.0 - share * _speck(self.shape, row, column, size_px)
+                taken = np.maximum(taken, share * _speck(self.shape, row, column, size_px))
+            light *= 1.0 - taken
             self._kept = {series: light.astype(np.float32)}
         return self._kept[series]
 

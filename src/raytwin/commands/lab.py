@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " repeatable (default: all)",
     )
     parser.add_argument(
-        "--kind",
+        "--no-unkindness",
         action="store_true",
         help="without the little that every real line does all the time (drift, changes of shape, line noise, dust)",
     )
@@ -161,7 +161,7 @@ def run(arguments: argparse.Namespace) -> int:
             session=arguments.session,
             geometry=arguments.geometry,
             families=_families(arguments.family),
-            unkindness=NONE if arguments.kind else None,
+            unkindness=NONE if arguments.no_unkindness else None,
             effects=effects,
             leave_out=arguments.leave_out,
             only=arguments.only,

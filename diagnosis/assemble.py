@@ -16,7 +16,7 @@ from ..generator.series import ExpectedSeries, beam_conditions, expected_series,
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, spectral_sds, twin_changes, with_pauses
+from .changes import Variant, smooth_twin, spectral_sds, tails_always_there, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
@@ -190,6 +190,10 @@ def build_problem(
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
     steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
     changes += [Change.of_twin(step) for step in steps_taken]
+    changes += [
+        replace(model.change(variant, variant.strengths[0]), label=variant.name)
+        for variant in tails_always_there(side=side)
+    ]
     changes += without_each(model.base)
     unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
     compared = _Compared(

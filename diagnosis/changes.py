@@ -96,7 +96,6 @@ KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(
     (
         "veiling_glare",
-        "mtf_tail",
         "k_fluorescence",
         "image_lag",
         "nonlinearity",
@@ -129,6 +128,9 @@ EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
 EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again those at one distance
 ROUGH_FIELDS = 24
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
+# of a tail that was always there, which calibration takes for a part of the spread: screens have up to 20 % of their light there
+TAIL_SD_PERCENT = 10.0
+TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
 READ_NOISE_SD = 0.01  # rows and columns of a tenth each add 2 % to the variance, and calibration may leave them out
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
@@ -410,6 +412,15 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             step_sd=1.0,
         )
     )
+    return result
+
+
+def tails_always_there(*, side: int = 1) -> list[Variant]:
+    """Tails of the spread that are no effect, at one prior standard deviation: short and long ones, always there."""
+    result = []
+    for variant in variants_of(EFFECTS["mtf_tail"], side=side):
+        name = f"tail of the spread, {variant.name}"
+        result.append(replace(variant, name=name, since="always", strengths=(TAIL_SD_PERCENT,)))
     return result
 
 

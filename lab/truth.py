@@ -133,9 +133,10 @@ def compute_truth(system: LabSystem, *, settings: Iterable[Setting], exposures_m
         "light_swank": system.light_swank,
         "electrons_per_keV": system.electrons_per_keV,
         "DN_per_electron": float(np.median(maps.DN_per_electron[good])),
-        # The Gaussian that leaves the same share of the quanta's noise; the spread itself below.
-        "psf_sigma_px": equivalent_sigma_px(system),
+        # Of the core; the spread as a whole below, with the Gaussian that leaves the same share of the quanta's noise.
+        "psf_sigma_px": system.psf_sigma_px,
         "spread": {
+            "equivalent_sigma_px": equivalent_sigma_px(system),
             "core_row_px": system.core_px[0],
             "core_column_px": system.core_px[1],
             "tail_share": system.tail_share,

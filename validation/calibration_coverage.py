@@ -75,6 +75,12 @@ def measure_seed(
             settings = {item.name: item.setting for item in acquisition.series}
     answer = calibration_answer(twin)
     add("psf_sigma_px", truth["psf_sigma_px"], answer["psf_sigma_px"])
+    exact_at = {(one["lag_row"], one["lag_column"]): one["value"] for one in truth["noise_correlation"]}
+    for one in answer["evidence"].get("noise_correlation") or []:
+        lag = one["lag_row"], one["lag_column"]
+        if lag in exact_at:
+            estimate = {name: one[name] for name in ("value", "low", "high")}
+            add("noise_correlation", exact_at[lag], estimate, f"{lag[0]},{lag[1]}")
     add("read_noise_DN", truth["read_noise_DN"], answer["read_noise_DN"])
     dark = {entry["exposure_ms"]: entry["dark_DN"] for entry in truth["dark_DN_at"]}
     add("dark_DN", dark[twin.maps.dark_exposure_ms], answer["dark_DN"])

@@ -32,8 +32,8 @@ def usual_line_noise(
     darks = [item for item in darks if item.calibrates] or darks
     total = np.zeros(2)
     steps = 0
-    # mean number of pixels in a row, and in a column
-    pixels = clean.sum() / np.array(clean.shape, dtype=np.float64)
+    # in a row, and in a column
+    pixels = np.array(clean.shape[::-1], dtype=np.float64)
     for item in darks:
         found, model = summaries[item.name], expected[item.name]
         variance = float(np.mean(found.pair_variance_DN2[clean]))

@@ -269,8 +269,9 @@ def summarise_series(
                 product = np.einsum("nrc,nrc->rc", d[(slice(None), *first)], d[(slice(None), *second)])
                 for label, mask in enumerate(selected):
                     label_covariance[label, index] += float(product[mask].sum()) / 2.0
-            row_sum += float(np.mean((d.sum(axis=2) / row_count) ** 2)) / 2.0 * len(d)
-            column_sum += float(np.mean((d.sum(axis=1) / column_count) ** 2)) / 2.0 * len(d)
+            # each line counts as it has pixels: of a dead one few are left, whose mean is as noisy as a pixel
+            row_sum += float(np.mean(d.sum(axis=2) ** 2 / row_count)) / shape[1] / 2.0 * len(d)
+            column_sum += float(np.mean(d.sum(axis=1) ** 2 / column_count)) / shape[0] / 2.0 * len(d)
             block = _block_means(d, good, blocks)
             block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
         if len(x) > 3:

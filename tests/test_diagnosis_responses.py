@@ -287,10 +287,16 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         request=SimpleNamespace(beam_on=True, source_object_mm=None),
         own_noise=False,
         divided=False,
+        calibrates=True,
     )
     thinner = -0.01 * signal * np.log(1000.0 / signal)  # of one material 1 % thicker
     probes = SimpleNamespace(
-        series=SimpleNamespace(session=item, scalars={}, context=SimpleNamespace(label_names=(), label_gain=())),
+        series=SimpleNamespace(
+            session=item,
+            scalars={},
+            context=SimpleNamespace(label_names=(), label_gain=()),
+            expected=SimpleNamespace(noise_autocovariance=np.ones((1, 1))),
+        ),
         scalars=(),
         projection=SimpleNamespace(apply=lambda image: np.asarray(image, dtype=float).ravel()),
         of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),

@@ -63,6 +63,7 @@ from raytwin.lab.bench import Bench
 from raytwin.lab.response import Deposits, beam_of, compute_deposits
 from raytwin.lab.system import LabSystem, detector_maps, sample_system
 from raytwin.lab.truth import flat_truth
+from raytwin.lab.unkindness import NONE
 from raytwin.spectra import light_per_keV
 
 SIZE = 28
@@ -107,7 +108,8 @@ class Line:
 
     def __init__(self, seed: int, kind: str) -> None:
         rng = np.random.default_rng([seed, 77])
-        system = sample_system(rng).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
+        # the limit knows the plain line and the departures below alone
+        system = sample_system(rng, families=()).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
         aluminium = Filter(material="Al", thickness_mm=round(math.exp(rng.uniform(math.log(0.3), math.log(3.0))), 3))
         system = replace(
             system,
@@ -115,6 +117,7 @@ class Line:
             scintillator_mm=rng.uniform(0.36, 0.66),
             dead_pixels=0,
             hot_pixels=0,
+            unkindness=NONE,
         )
         # one DN is half to four times the read noise
         step = math.exp(rng.uniform(math.log(0.5), math.log(4.0)))

@@ -8,7 +8,7 @@ import enum
 import hashlib
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,22 +150,48 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
     Returns:
         The answer; `same` is None for a single frame and for fields of fewer than 16 pixels a side.
     """
-    first = next(iterator := iter(pieces), None)
-    if first is None:
-        return _cannot_tell(1, (0, 0))
-    block = _block_side(first.shape[1:])
-    if not block:
-        return _cannot_tell(1, (0, 0))
-    kept = _block_means(_chained(first, iterator), block)
-    indices, means, sigma_DN = kept
-    if len(means) < 2:
-        return _cannot_tell(block, means.shape[1:])
-    return _judged(indices, means - offset_DN, sigma_DN, block, lit=lit)
+    scan = SceneScan()
+    for piece in pieces:
+        scan.add(piece)
+    return scan.result(offset_DN=offset_DN, lit=lit)
 
 
-def _chained(first: NDArray[Any], rest: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-    yield first
-    yield from rest
+class SceneScan:
+    """`same_scene` for frames that are handed over one piece after the other."""
+
+    def __init__(self) -> None:
+        self._side = 1
+        self._kept: list[NDArray[np.float64]] = []
+        self._indices: list[int] = []
+        self._spreads: list[float] = []
+        self._last: NDArray[np.float64] | None = None
+        self._stride, self._number = 1, 0
+
+    def add(self, piece: NDArray[Any]) -> None:
+        """Take the next frames (m, row, column), DN."""
+        if self._number == 0:
+            self._side = _block_side(piece.shape[1:])
+        step = max(1, int(np.prod(piece.shape[1:])) // _KEPT_PIXELS)
+        for frame in piece if self._side else ():
+            sample = frame.reshape(-1)[::step].astype(np.float64)
+            if self._last is not None and len(self._spreads) < _MOST_FRAMES:
+                change = sample - self._last
+                self._spreads.append(float(np.median(np.abs(change - np.median(change)))))
+            self._last = sample
+            if self._number % self._stride == 0:
+                self._kept.append(block_means(frame[None], self._side)[0])
+                self._indices.append(self._number)
+            self._number += 1
+            if len(self._kept) > _MOST_FRAMES:
+                self._kept, self._indices, self._stride = self._kept[::2], self._indices[::2], 2 * self._stride
+
+    def result(self, *, offset_DN: float = 0.0, lit: bool = True) -> SceneCheck:
+        """The answer for the frames taken so far; see `same_scene`."""
+        if len(self._kept) < 2:
+            return _cannot_tell(self._side, (0, 0))
+        sigma_DN = 1.4826 * float(np.median(self._spreads)) / math.sqrt(2.0)
+        indices = np.array(self._indices, dtype=np.intp)
+        return _judged(indices, np.array(self._kept) - offset_DN, sigma_DN, self._side, lit=lit)
 
 
 def _cannot_tell(block: int, shape: tuple[int, ...]) -> SceneCheck:
@@ -194,31 +220,6 @@ def block_means(frames: NDArray[Any], side: int) -> NDArray[np.float64]:
     used = frames[:, : rows * side, : columns * side].reshape(count, rows, side, columns * side)
     lines = used.sum(axis=2, dtype=np.float64)
     return np.asarray(lines.reshape(count, rows, columns, side).sum(axis=3) / side**2)
-
-
-def _block_means(pieces: Iterable[NDArray[Any]], side: int) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
-    """Indices of the frames kept, their block means, and the temporal noise of one pixel (DN)."""
-    kept: list[NDArray[np.float64]] = []
-    indices: list[int] = []
-    spreads: list[float] = []
-    last: NDArray[np.float64] | None = None
-    stride, number = 1, 0
-    for piece in pieces:
-        step = max(1, int(np.prod(piece.shape[1:])) // _KEPT_PIXELS)
-        for frame in piece:
-            sample = frame.reshape(-1)[::step].astype(np.float64)
-            if last is not None and len(spreads) < _MOST_FRAMES:
-                change = sample - last
-                spreads.append(float(np.median(np.abs(change - np.median(change)))))
-            last = sample
-            if number % stride == 0:
-                kept.append(block_means(frame[None], side)[0])
-                indices.append(number)
-            number += 1
-            if len(kept) > _MOST_FRAMES:
-                kept, indices, stride = kept[::2], indices[::2], 2 * stride
-    sigma_DN = 1.4826 * float(np.median(spreads)) / math.sqrt(2.0) if spreads else 0.0
-    return np.array(indices, dtype=np.intp), np.array(kept), sigma_DN
 
 
 def _mixed(values: NDArray[np.float64]) -> NDArray[np.float64]:

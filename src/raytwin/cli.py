@@ -15,6 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the main job end to end on the virtual lab"),
     "spectrum": ("spectrum", "tube spectrum behind filters"),
     "mu": ("mu", "effective attenuation of a material"),
+    "check": ("check", "what measurements allow, what is suspicious, what to measure next"),
     "calibrate": ("calibrate", "measured flat and dark series -> calibrated twin"),
     "contrast": ("contrast", "contrast of a foreign object in a product, and maps of it"),
     "predict": ("predict", "flatfield at a setting, measured or not"),

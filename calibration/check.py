@@ -28,7 +28,7 @@ from .label_checks import beam_findings, clock_findings, kind_findings, load_fin
 from .series_scan import SeriesScan, scan_series
 
 _JUMP = 0.03  # of the signal from one frame to the next: the largest plausible rms of a tube's output
-_EVEN = 1e-3  # pixels of any panel respond less alike than this before correction
+_EVEN = 3e-3  # pixels of X-ray panels and cameras respond less alike than this (rms) before correction: 0.5 % and more
 _HOW = {
     SceneChange.STRUCTURE: "edges have moved in {share:.0f} % of the field",
     SceneChange.SHAPE: "the shape of the field changes by {shape:.0f} %",
@@ -36,6 +36,7 @@ _HOW = {
     SceneChange.LEVEL: "the level changes by {level:+.0f} %",
 }
 _LIT = ("flat", "object")
+_PATTERN_BYTES = 2**28
 
 Progress = Callable[[str], None]
 
@@ -166,22 +167,24 @@ def _is_twin(path: Path) -> bool:
         return False
 
 
-def _broken(path: str, what: str, error: InputError, draft: str = "") -> CheckResult:
+def _broken(path: str, what: str, error: InputError, *, draft: str = "", place: Path | None = None) -> CheckResult:
     """Of what cannot be read at all."""
     code = FindingCode.NO_SIDECAR if draft else FindingCode.DAMAGED
     return CheckResult(
         path=path,
         what=what,
         series=(),
-        findings=(Finding(code=code, values={"what": _one_line(error)}),),
+        findings=(Finding(code=code, values={"what": _one_line(error, place, path)}),),
         allows=(),
         next_measurements=(),
         draft=draft,
     )
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _one_line(error: Exception, place: Path | None = None, told: str = "") -> str:
+    """The error's line; the file's own name is left out where it only says which part of the file is meant."""
+    line = " ".join(str(error).split())
+    return line if place is None else line.replace(f"{place}, ", "").replace(str(place), told)
 
 
 def _checked_folder(place: Path, progress: Progress | None) -> CheckResult:
@@ -193,7 +196,7 @@ def _checked_folder(place: Path, progress: Progress | None) -> CheckResult:
             received="a folder that is in no layout known here",
             expected="images with a raytwin.toml, an EMVA 1288 set, a NeXus file, or the layout of the paper's data",
         )
-        return _broken(str(place), "folder", error, draft)
+        return _broken(str(place), "folder", error, draft=draft)
     return _checked_import(place, layout, progress)
 
 
@@ -269,10 +272,10 @@ def _checked_file(place: Path, told: str, what: str, progress: Progress | None) 
     try:
         acquisition = open_acquisition(place, damage=damage)
     except InputError as error:
-        return _broken(told, what, error)
+        return _broken(told, what, error, place=place)
     with acquisition:
         checked = check_series(acquisition, progress=progress)
-    damaged = [Finding(code=FindingCode.DAMAGED, values={"what": _one_line(error)}) for error in damage]
+    damaged = [Finding(code=FindingCode.DAMAGED, values={"what": _one_line(error, place, told)}) for error in damage]
     return CheckResult(
         path=told,
         what=what,
@@ -292,7 +295,7 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
     """Check the series of an open acquisition; see `check_acquisition`."""
     findings: list[Finding] = []
     scans: dict[str, _Kept] = {}
-    references: dict[str, tuple[str, NDArray[np.float32]]] = {}
+    patterns: dict[str, list[_Pattern]] = {}
     digests: dict[bytes, str] = {}
     dark_DN = _dark_level(acquisition)
     for item in acquisition.series:
@@ -301,12 +304,14 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
         try:
             scan = scan_series(item)
         except FileFormatError as error:
-            findings.append(Finding(code=FindingCode.DAMAGED, series=item.name, values={"what": _one_line(error)}))
+            # the series is named beside the sentence
+            what = _one_line(error, Path(acquisition.path), acquisition.path).removeprefix(f"series {item.name}/")
+            findings.append(Finding(code=FindingCode.DAMAGED, series=item.name, values={"what": what}))
             continue
         found = _series_findings(scan, acquisition, dark_DN)
         found += _copies_of_others(scan, digests)
         if not any(entry.code in _NO_PATTERN for entry in found):
-            found += _pattern_findings(scan, references)
+            _keep_pattern(scan, dark_DN, patterns)
         findings += found
         codes = {entry.code for entry in found}
         scans[item.name] = _Kept(
@@ -314,6 +319,10 @@ def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = No
             noise_DN=math.sqrt(scan.variance_DN2) if scan.variance_DN2 >= 0 else math.nan,
             codes=codes,
         )
+    for group in patterns.values():
+        for finding in _pattern_findings(group):
+            findings.append(finding)
+            scans[finding.series].codes.add(finding.code)
     read = [item for item in acquisition.series if item.name in scans]
     findings += _session_findings(acquisition, read, scans, dark_DN)
     rows = tuple(_row(item, scans.get(item.name), findings) for item in acquisition.series)
@@ -421,11 +430,11 @@ def _series_findings(scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: fl
         jump = _level_jump(scan, offset_DN)
         if jump is not None:
             add(FindingCode.LEVEL_JUMP, frame=jump[0], percent=100.0 * jump[1])
-    if item.kind == "flat" and not item.corrected & {"gain", "log"} and item.n_frames > 1:
+    raw = not item.corrected & {"gain", "log"} and not any(one.code is FindingCode.SATURATED for one in found)
+    if item.kind == "flat" and raw and item.n_frames > 1:
         pattern = frame_signs.fixed_pattern(scan.mean_DN - offset_DN, scan.differences, item.n_frames)
-        # what could have been seen must be less than what any panel has
-        if pattern.seen_from < _EVEN and max(pattern.relative, pattern.seen_from) < _EVEN:
-            add(FindingCode.FLAT_CORRECTED, percent=100.0 * max(pattern.relative, pattern.seen_from))
+        if pattern.at_most < _EVEN:
+            add(FindingCode.FLAT_CORRECTED, percent=100.0 * pattern.at_most)
     return found
 
 
@@ -465,39 +474,67 @@ def _copies_of_others(scan: SeriesScan, digests: dict[bytes, str]) -> list[Findi
     return [Finding(code=FindingCode.SAME_AS, series=name, values={"count": shared[other], "other": other})]
 
 
-def _pattern_findings(scan: SeriesScan, references: dict[str, tuple[str, NDArray[np.float32]]]) -> list[Finding]:
-    """Whether the pixels' pattern lies as in the first series of its kind: not turned, moved, nor with rows swapped."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Pattern:
+    """Fixed pattern of a series' mean frame (row, column), and its signal over its noise."""
+
+    name: str
+    values: NDArray[np.float16]
+    quality: float
+
+
+def _keep_pattern(scan: SeriesScan, dark_DN: float, patterns: dict[str, list[_Pattern]]) -> None:
+    """Remember the pattern of a flat or dark, while they fit into `_PATTERN_BYTES`."""
     item = scan.series
     if item.kind not in ("flat", "dark") or item.panel_rotation_deg or item.corrected & {"gain", "log"}:
-        return []
-    pattern = frame_signs.pattern_of(scan.mean_DN)
-    key = f"{item.kind} {item.layer or ''}"
-    if key not in references:
-        references[key] = (item.name, pattern)
-        return []
-    other, reference = references[key]
-    turned = frame_signs.turned_pattern(pattern, reference)
-    if turned is not None:
-        return [Finding(code=FindingCode.TURNED, series=item.name, values={"other": other, "how": turned})]
-    moved = frame_signs.shifted_pattern(pattern, reference)
-    if moved is not None:
-        return [
-            Finding(
-                code=FindingCode.SHIFTED,
-                series=item.name,
-                values={"other": other, "rows": moved[0], "columns": moved[1]},
-            )
-        ]
-    rows = frame_signs.swapped_rows(pattern, reference)
-    if rows is not None:
-        return [
-            Finding(
-                code=FindingCode.ROWS_SWAPPED,
-                series=item.name,
-                values={"first": rows[0], "second": rows[1], "other": other},
-            )
-        ]
+        return
+    if 2 * scan.mean_DN.size * (1 + sum(len(group) for group in patterns.values())) > _PATTERN_BYTES:
+        return
+    noise = math.sqrt(scan.variance_DN2 / item.n_frames) if scan.variance_DN2 > 0 else 1.0
+    signal = scan.level_DN - dark_DN if item.kind == "flat" and "offset" not in item.corrected else 1.0
+    patterns.setdefault(f"{item.kind} {item.layer or ''} {item.session}", []).append(
+        _Pattern(
+            name=item.name,
+            values=frame_signs.pattern_of(scan.mean_DN).astype(np.float16),
+            quality=signal / noise,
+        )
+    )
+
+
+def _pattern_findings(patterns: Sequence[_Pattern]) -> list[Finding]:
+    """Whether the pixels' pattern lies alike in series of one kind: not turned, moved, nor with rows swapped.
+
+    The clearest is the reference, unless most of the others contradict it: then it is the one at fault.
+    """
+    ranked = sorted(patterns, key=lambda one: -one.quality)
+    for number, reference in enumerate(ranked[:2]):
+        found = []
+        others = [one for one in ranked if one is not reference]
+        for one in others:
+            finding = _against(one, reference)
+            if finding is not None:
+                found.append(finding)
+        if number or len(found) <= 0.5 * len(others) or len(others) < 2:
+            return found
     return []
+
+
+def _against(one: _Pattern, reference: _Pattern) -> Finding | None:
+    """How a pattern lies otherwise than the reference; None: as far as can be seen, it does not."""
+    own, there = one.values.astype(np.float32), reference.values.astype(np.float32)
+    values: dict[str, Any] = {"other": reference.name}
+    turned = frame_signs.turned_pattern(own, there)
+    if turned is not None:
+        return Finding(code=FindingCode.TURNED, series=one.name, values=values | {"how": turned})
+    moved = frame_signs.shifted_pattern(own, there)
+    if moved is not None:
+        values |= {"rows": moved[0], "columns": moved[1]}
+        return Finding(code=FindingCode.SHIFTED, series=one.name, values=values)
+    rows = frame_signs.swapped_rows(own, there)
+    if rows is not None:
+        values |= {"first": rows[0], "second": rows[1]}
+        return Finding(code=FindingCode.ROWS_SWAPPED, series=one.name, values=values)
+    return None
 
 
 def _session_findings(
@@ -530,15 +567,18 @@ def _session_findings(
     noise = {name: kept.noise_DN for name, kept in scans.items()}
     found += kind_findings([item for item in read if not scans[item.name].codes & _NO_PATTERN], levels, noise)
     unfit = {entry.series for entry in found}
+    # without a dark nobody knows what is signal
+    known = any(item.kind == "dark" for item in read) or bool(acquisition.instrument.counting)
     flats = [
         item
         for item in read
         if item.kind == "flat"
+        and (known or "offset" in item.corrected)
         and not item.corrected & {"gain", "log"}
         and item.name not in unfit
         and not scans[item.name].codes & _UNFIT
     ]
-    signals = _signals(acquisition, flats, levels, dark_DN)
+    signals = _signals([item for item in read if item.name not in unfit], flats, levels, dark_DN)
     wrong = load_findings(flats, signals)
     found += wrong
     fitting = [item for item in flats if item.name not in {entry.series for entry in wrong}]
@@ -560,10 +600,10 @@ def _session_findings(
 
 
 def _signals(
-    acquisition: AcquisitionFile, flats: Sequence[Series], levels: dict[str, float], dark_DN: float
+    usable: Sequence[Series], flats: Sequence[Series], levels: dict[str, float], dark_DN: float
 ) -> dict[str, float]:
     """Level above the dark of the same exposure, or of the nearest, DN."""
-    darks = [item for item in acquisition.of_kind("dark") if item.name in levels and not item.corrected]
+    darks = [item for item in usable if item.kind == "dark" and not item.corrected]
 
     def dark_of(item: Series) -> float:
         if "offset" in item.corrected:
@@ -591,36 +631,27 @@ def _averaged_findings(
         if item.name in scans and math.isfinite(scans[item.name].noise_DN)
     ]
     read_DN2 = float(np.median(darks)) if darks else 0.0
-    groups: dict[Any, list[tuple[Series, float]]] = {}
+    groups: dict[Any, list[Series]] = {}
     for item in flats:
-        noise_DN2 = scans[item.name].noise_DN ** 2 * item.averaged
-        if signals[item.name] > 0 and math.isfinite(noise_DN2):
-            quantum = noise_DN2 - read_DN2
-            # below this the read noise decides
-            if quantum > 0.5 * read_DN2 or noise_DN2 < 0.5 * read_DN2:
-                groups.setdefault((item.kV, text_from_filters(item.filters), item.layer), []).append(
-                    (item, max(quantum, noise_DN2 / item.averaged / 100.0) / signals[item.name])
-                )
+        if signals[item.name] > 0 and scans[item.name].noise_DN > 0:
+            groups.setdefault((item.kV, text_from_filters(item.filters), item.layer), []).append(item)
     found = []
     for members in groups.values():
-        ratios = np.array([ratio for _, ratio in members])
         if len(members) < 2:
             continue
-        typical = float(np.median(ratios)) if len(members) > 2 else float(np.max(ratios))
-        for item, ratio in members:
-            if ratio < typical / math.sqrt(2.0):
-                count = max(2, round(typical / ratio)) * item.averaged
-                found.append(
-                    Finding(
-                        code=FindingCode.AVERAGED,
-                        series=item.name,
-                        values={
-                            "count": count,
-                            "how": f"its noise is {math.sqrt(typical / ratio):.2g} times less than that of the other flats",
-                            "declared": item.averaged,
-                        },
-                    )
-                )
+        variances = [scans[item.name].noise_DN ** 2 * item.averaged for item in members]
+        ratios = [max(v - read_DN2, 0.0) / signals[item.name] for v, item in zip(variances, members, strict=True)]
+        # of two, the noisier one is the one that is not averaged
+        typical = float(np.median(ratios)) if len(members) > 2 else max(ratios)
+        for item, variance in zip(members, variances, strict=True):
+            single = read_DN2 + typical * signals[item.name]
+            if variance < single / math.sqrt(2.0) and single > 2.0 * read_DN2:
+                values = {
+                    "count": max(2, round(single / variance)) * item.averaged,
+                    "how": f"its noise is {math.sqrt(single / variance):.2g} times less than that of the other flats",
+                    "declared": item.averaged,
+                }
+                found.append(Finding(code=FindingCode.AVERAGED, series=item.name, values=values))
     return found
 
 

@@ -303,6 +303,8 @@ def _judged(
 ) -> SceneCheck:
     shape = (int(means.shape[1]), int(means.shape[2]))
     count = len(means)
+    # frames with next to no light have no scale for level and shape
+    lit = lit and float(np.median(means)) > 0.5 * sigma_DN
     terms = _smooth_terms(shape)
     moving = [number for number in range(1, count) if not np.array_equal(means[number], means[number - 1])]
     later = sorted({round(value) for value in np.linspace(1, count - 1, min(_LONG_PAIRS, count - 1))} - {1})

@@ -14,6 +14,7 @@ FALSE_ALARM = 1e-6  # of one test of one series: hundreds of series are tested a
 _MOST_AVERAGED = 256
 _CODES_AT_TOP = 10
 _GRID = 8  # pixels a side of what JPEG and its kin transform
+_NEIGHBOURS_SHARE = 1.1  # taking off the mean of 5 x 5 neighbours correlates pixels of a row a little
 _PILE_UP = 10.0  # times as many values at the top as at the codes below it
 # turned and mirrored pictures, as numpy makes them and as people say it
 _TURNS: tuple[tuple[str, int, bool], ...] = (
@@ -204,13 +205,14 @@ def swapped_rows(pattern: NDArray[np.float32], reference: NDArray[np.float32]) -
         centred = values - values.mean(axis=1, keepdims=True)
         return np.asarray(centred / np.maximum(np.sqrt((centred**2).mean(axis=1, keepdims=True)), 1e-12))
 
-    # each row without its neighbours: what is left of a row that is alike along the rows is noise
-    own, there = rows_of(pattern), rows_of(reference)
-    table = own @ there.T / columns
-    here = np.diag(table)
-    least = 2.0 * _significant(columns)
+    table = rows_of(pattern) @ rows_of(reference).T / columns
     best = np.argmax(table, axis=1)
-    moved = np.flatnonzero((best != np.arange(len(best))) & (table.max(axis=1) > here + least))
+    height = table.max(axis=1)
+    # two rows that point at each other by chance: rows^2 / 2 times the square of one such probability
+    from scipy.special import ndtri
+
+    least = float(-ndtri(math.sqrt(2.0 * FALSE_ALARM) / len(table))) * _NEIGHBOURS_SHARE / math.sqrt(columns)
+    moved = np.flatnonzero((best != np.arange(len(best))) & (height > least) & (np.diag(table) < 0.5 * height))
     for row in moved:
         partner = int(best[row])
         if partner in moved and int(best[partner]) == int(row):
@@ -220,10 +222,10 @@ def swapped_rows(pattern: NDArray[np.float32], reference: NDArray[np.float32]) -
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixedPattern:
-    """Pixel-to-pixel response of a flat: rms (relative to the signal) and the rms that could have been seen."""
+    """Pixel-to-pixel response of a flat, rms relative to the signal, and the most that it can be."""
 
     relative: float
-    seen_from: float
+    at_most: float
 
 
 def fixed_pattern(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.float64], frames: int) -> FixedPattern:
@@ -236,7 +238,7 @@ def fixed_pattern(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.f
     """
     level = float(np.median(mean_signal_DN))
     if not level > 0 or not differences.size:
-        return FixedPattern(relative=math.nan, seen_from=math.inf)
+        return FixedPattern(relative=math.nan, at_most=math.inf)
 
     def steps(values: NDArray[np.float64]) -> float:
         found = np.diff(values, axis=-1)
@@ -247,6 +249,5 @@ def fixed_pattern(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.f
     pixels = mean_signal_DN.size
     # error of a robust variance (efficiency 0.37); steps share pixels
     error = both * math.sqrt(2.0 / 0.37 * 2.0 / pixels)
-    return FixedPattern(
-        relative=math.sqrt(max(both - temporal, 0.0)) / level, seen_from=math.sqrt(temporal + 5.0 * error) / level
-    )
+    excess = max(both - temporal, 0.0)
+    return FixedPattern(relative=math.sqrt(excess) / level, at_most=math.sqrt(excess + 5.0 * error) / level)

@@ -15,7 +15,7 @@ from .findings import Finding, FindingCode
 # a detector whose response bends by up to 5 %.
 LEVEL_FITS = 0.15
 _GAP = 2.5  # usual intervals: at least one frame and a half is missing
-_DARK_APART = 0.2  # of the lowest flat's signal: no dark drifts by so much
+_DARK_APART = 0.3  # of a flat's signal, in the median: no dark drifts by so much
 
 Levels = Mapping[str, float]
 
@@ -35,9 +35,10 @@ def kind_findings(series: Sequence[Series], levels_DN: Levels, noise_DN: Levels)
     found = []
     dark = min(levels_DN[item.name] for item in darks)
     highest = max(levels_DN[item.name] for item in lit)
+    typical = float(np.median([levels_DN[item.name] for item in lit]))
     for item in darks:
         level = levels_DN[item.name]
-        limit = max(_DARK_APART * (highest - dark), 5.0 * _or_zero(noise_DN[item.name]))
+        limit = max(_DARK_APART * (typical - dark), 5.0 * _or_zero(noise_DN[item.name]))
         if level - dark > limit > 0 and not _grows_with_exposure(item, darks, levels_DN):
             found.append(
                 Finding(code=FindingCode.DARK_WITH_LIGHT, series=item.name, values={"level": level, "dark": dark})

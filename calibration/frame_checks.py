@@ -23,7 +23,11 @@ LEVEL_CHANGE = 0.5
 SHAPE_CHANGE = 0.03
 PATTERN_CHANGE = 1e-3
 DARK_PATTERN_SIGMAS = 0.1  # of darks, over the noise of a pixel: the row noise that any panel has
-LINE_SIGMAS = 2.0  # rms of row or column offsets over the noise of a pixel: the largest plausible row noise
+# Largest offset of a block of rows or columns over the noise of a pixel: rows of the largest plausible noise (2 sigmas
+# each) reach less, averaged over a block, in any field. Where it jumps once, to more than half of that noise and ...
+LINE_SIGMAS, LINE_JUMP_SIGMAS = 3.0, 0.5
+_JUMPS = 6.0  # ... this many times the usual offset: the largest of a thousand normal numbers is 3.2 times that of ten
+_ENOUGH_PAIRS = 4
 _SPECKS = 2  # dust and cosmic rays: single places that differ do not make another scene, ...
 _SPECK_SHARE = 0.01  # ... nor does this share of the field
 _TESTS_A_SPECK = 4  # mixed differences that one block is part of
@@ -244,7 +248,7 @@ def _smooth_terms(shape: tuple[int, int]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True)
 class _Change:
-    """Of one frame to another: level and smooth shape (relative), rms of lines (DN), what is left (block row, column)."""
+    """Of one frame to another: level and smooth shape (relative), largest offset of lines (DN), what is left (block row, column)."""
 
     level: float
     shape: float
@@ -277,7 +281,10 @@ def _change(
     scale = np.linalg.norm(matrix, axis=0) + 1e-30
     solution = np.zeros(len(design))
     for _ in range(3):
-        solution = np.linalg.lstsq((matrix / scale)[use], target[use], rcond=1e-6)[0] / scale
+        # by normal equations: a few unknowns and thousands of blocks
+        rows_in_use = (matrix / scale)[use]
+        gram = rows_in_use.T @ rows_in_use
+        solution = np.linalg.lstsq(gram, rows_in_use.T @ target[use], rcond=1e-11)[0] / scale
         left = target - matrix @ solution
         spread = 1.4826 * float(np.median(np.abs(left[use])))
         use = np.abs(left) <= max(5.0 * spread, 1e-12)
@@ -294,7 +301,7 @@ def _change(
         by_noise = spread**2 * float(chi2.isf(FALSE_ALARM, len(design)))
         shape = math.sqrt(max(float(np.var(smooth - level * earlier)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
-    lines = max(float(np.std(np.median(left, axis=axis))) for axis in (0, 1))
+    lines = max(float(np.max(np.abs(np.median(left, axis=axis)))) for axis in (0, 1))
     return _Change(level=level, shape=shape, lines_DN=lines, left=left)
 
 
@@ -333,7 +340,13 @@ def _judged(
     growth, grows = _growth(left, local, noise, pattern_DN, consecutive, block)
     level = max((item.level for item in changes), key=abs, default=0.0)
     smooth = max(item.shape for item in changes)
-    lines = max(item.lines_DN for item in changes)
+    lines_DN = np.array([item.lines_DN for item in changes])
+    odd_lines = lines_DN > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN
+    if len(moving) >= _ENOUGH_PAIRS:
+        # row noise is in every pair: what jumps once is no noise
+        usual = float(np.median(lines_DN[: len(moving)]))
+        jumps = lines_DN > max(_JUMPS * usual, LINE_JUMP_SIGMAS * math.sqrt(2.0) * sigma_DN)
+        odd_lines |= jumps & (np.arange(len(pairs)) < len(moving))
     most = max(_SPECK_SHARE * places.size, _SPECKS * _TESTS_A_SPECK)
     change: SceneChange | None = None
     at = None
@@ -344,13 +357,13 @@ def _judged(
     if lit and abs(level) > LEVEL_CHANGE:
         change = SceneChange.LEVEL
         at = first_of(np.array([abs(item.level) > LEVEL_CHANGE for item in changes]))
-    elif sigma_DN > 0 and lines > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN:
-        change = SceneChange.LINES
-        at = first_of(np.array([item.lines_DN > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN for item in changes]))
     elif places.sum() > most or grows:
         change = SceneChange.STRUCTURE
         counts = beyond.reshape(len(pairs), -1).sum(axis=1)
         at = first_of(counts > 0.5 * counts.max())
+    elif sigma_DN > 0 and odd_lines.any():
+        change = SceneChange.LINES
+        at = first_of(odd_lines)
     elif lit and smooth > SHAPE_CHANGE:
         change = SceneChange.SHAPE
         at = first_of(np.array([item.shape > SHAPE_CHANGE for item in changes]))

@@ -205,7 +205,6 @@ def turning(frames: NDArray[Any], panel: Panel) -> NDArray[Any]:
 def nudged(frames: NDArray[Any], panel: Panel) -> NDArray[Any]:
     """A step wedge in the beam whose table moves by a pixel in the middle of the series."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    # an edge along the rows or columns to the pixel would look like lines of the readout
     step = gaussian_filter(np.where(x + 0.15 * y < 60, 1.0, 0.3), 0.6)
     return rounded(np.array([panel.frames(1200.0 * np.roll(step, k // 4, axis=1), 1)[0] for k in range(len(frames))]))
 

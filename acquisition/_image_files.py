@@ -144,19 +144,29 @@ def _decoded(path: Path) -> NDArray[Any]:
 
 
 @contextmanager
-def _quiet_about_harmless_tags() -> Iterator[None]:
-    """tifffile logs every tag that it cannot read; those that do not matter to the picture are not passed on."""
+def _quiet_about_harmless_faults() -> Iterator[None]:
+    """tifffile logs whatever it does not like. A file that cannot be read is told by its error, and a broken tag that does
+    not matter to the picture by nobody; the rest is passed on at the end.
+    """
+    kept: list[logging.LogRecord] = []
 
-    def matters(record: logging.LogRecord) -> bool:
+    def keep(record: logging.LogRecord) -> bool:
         tags = _BROKEN_TAG.findall(record.getMessage())
-        return not tags or any(int(tag) in _TIFF_TAGS_THAT_COUNT for tag in tags)
+        if not tags or any(int(tag) in _TIFF_TAGS_THAT_COUNT for tag in tags):
+            kept.append(record)
+        return False
 
     logger = logging.getLogger("tifffile")
-    logger.addFilter(matters)
+    logger.addFilter(keep)
     try:
         yield
+    except BaseException:
+        kept.clear()
+        raise
     finally:
-        logger.removeFilter(matters)
+        logger.removeFilter(keep)
+        for record in kept:
+            logger.callHandlers(record)
 
 
 def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
@@ -194,7 +204,7 @@ def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
     import tifffile
 
     try:
-        with _quiet_about_harmless_tags(), tifffile.TiffFile(path) as file:
+        with _quiet_about_harmless_faults(), tifffile.TiffFile(path) as file:
             if not file.series:
                 raise ValueError("no image in it")
             series = file.series[0]

@@ -312,7 +312,7 @@ def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None =
                 raise error
             damage.append(error)
             del scenes[series.scene]
-    instrument = _instrument(child(file, "instrument"), path=path)
+    instrument = read_instrument(child(file, "instrument"), path=path)
     ordered = tuple(numbered + unnumbered)
     if instrument.counting and not any(series.kind == "dark" for series in ordered):
         # a detector that counts photons has a dark of 0 by declaration: its frames are as if a dark were taken off
@@ -518,7 +518,12 @@ def _scene(group: Any, name: str, *, path: str) -> Scene:
     )
 
 
-def _instrument(node: Any, *, path: str) -> Instrument:
+def read_instrument(node: Any, *, path: str) -> Instrument:
+    """The instrument in the attributes of an HDF5 group; None: nothing is known.
+
+    Raises:
+        FileFormatError: an attribute of another type, or out of range.
+    """
     if node is None:
         return Instrument()
     where = f"{path}, instrument"

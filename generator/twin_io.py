@@ -144,49 +144,33 @@ def read_twin(path: str | os.PathLike[str]) -> Twin:
     Raises:
         FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing.
     """
-    import h5py
+    from ..acquisition._hdf5 import HDF5_ERRORS, open_hdf5
 
     if not os.path.isfile(path):
         raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
-    try:
-        file = h5py.File(path, "r")
-    except OSError:
-        raise FileFormatError(
-            f"twin {path}",
-            received="a file that is not HDF5 or is cut off",
-            expected="a file that `raytwin calibrate` wrote",
-        ) from None
-    with file:
-        found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
-        if found != (FORMAT, VERSION):
-            raise FileFormatError(
-                f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
-            )
+    with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file:
         try:
+            found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
+            if found != (FORMAT, VERSION):
+                raise FileFormatError(
+                    f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
+                )
             return _twin_from_file(file, path)
         except InputError:
             raise
-        except (KeyError, OSError, TypeError, ValueError, IndexError) as error:
+        except HDF5_ERRORS as error:
             raise FileFormatError(
                 f"twin {path}",
-                received=f"a damaged file ({error})",
+                received=f"a damaged file ({' '.join(str(error).split()) or type(error).__name__})",
                 expected="a complete twin file",
                 remedy="calibrate again",
             ) from None
 
 
 def _twin_from_file(file: Any, path: object) -> Twin:
-    values: dict[str, Any] = {}
-    names = {entry.name for entry in fields(Instrument)}
-    for name, value in file["instrument"].attrs.items():
-        if name not in names:
-            continue
-        if name in LAYER_FIELDS:
-            values[name] = filters_from_text(_text(value))
-        elif isinstance(value, str | bytes):
-            values[name] = _text(value)
-        else:
-            values[name] = value.item() if isinstance(value, np.generic) else value
+    from ..acquisition.acquisition_io import read_instrument
+
+    instrument = read_instrument(file["instrument"], path=f"twin {path}")
     maps = file["maps"]
     noise = file["noise"]
     levels = []
@@ -238,7 +222,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
         )
     return Twin(
-        instrument=Instrument(**values),
+        instrument=instrument,
         maps=DetectorMaps(
             dark_DN=_array(maps, "dark_DN", np.float32),
             dark_exposure_ms=_optional_float(maps, "dark_exposure_ms"),

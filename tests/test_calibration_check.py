@@ -73,8 +73,41 @@ def test_the_json_answer_holds_what_scripts_read(session, capsys):
 
 def test_every_code_has_a_sentence_of_its_values():
     values = dict.fromkeys(
-        "what shape other other_shape frame how percent count frames first origin value top level dark low high declared step"
-        " rows columns second quantity fits unit kV other_kV filters other_filters gap usual interval_ms exposure_ms".split(),
+        [
+            "what",
+            "shape",
+            "other",
+            "other_shape",
+            "frame",
+            "how",
+            "percent",
+            "count",
+            "frames",
+            "first",
+            "origin",
+            "value",
+            "top",
+            "level",
+            "dark",
+            "low",
+            "high",
+            "declared",
+            "step",
+            "rows",
+            "columns",
+            "second",
+            "quantity",
+            "fits",
+            "unit",
+            "kV",
+            "other_kV",
+            "filters",
+            "other_filters",
+            "gap",
+            "usual",
+            "interval_ms",
+            "exposure_ms",
+        ],
         1.0,
     )
     for code in FindingCode:

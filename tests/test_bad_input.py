@@ -1,6 +1,7 @@
 """Bad input through the command line: exit 2, one line on standard error, nothing on standard output, no file left."""
 
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -357,3 +358,33 @@ def test_whatever_hdf5_raises_at_damaged_bytes_is_one_line(files, tmp_path, caps
     with monkeypatch.context() as patch:
         patch.setattr(h5py.Group, "__iter__", fails)
         refused(capsys, tmp_path, ["calibrate", files["session"], "-o", tmp_path / "twin.h5"], mentions="session.h5")
+
+
+DYING = """
+import os, signal, sys
+import h5py
+def dies(*_, **__):
+    os.kill(os.getpid(), signal.SIGSEGV)
+h5py.File = dies
+from raytwin.cli import main
+sys.argv = ["raytwin", *sys.argv[1:]]
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes cannot be copied there")
+def test_a_library_that_dies_at_a_file_is_one_line_too(files, tmp_path):
+    def run(*words):
+        command = [sys.executable, "-c", DYING, *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    (tmp_path / ".twin.h5.abc.part").write_text("half")
+    died = run("calibrate", files["session"], "-o", tmp_path / "twin.h5")
+    assert died.returncode == 2
+    assert died.stdout == ""
+    assert len(died.stderr.splitlines()) == 1
+    assert "session.h5" in died.stderr and "SIGSEGV" in died.stderr
+    assert list(tmp_path.iterdir()) == []
+    # and where nothing dies, the code of the copy is that of the command
+    assert run("check", tmp_path / "absent.h5").returncode == 2
+    assert run("check", "--help").returncode == 0

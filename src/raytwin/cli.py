@@ -34,6 +34,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
+# commands that read HDF5 files of others: the library itself may die at damaged ones
+READING = frozenset(
+    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect"}
+)
+
+
 class _Parser(argparse.ArgumentParser):
     """Bad usage is one clear line and exit code 2."""
 
@@ -70,6 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 success, 1 internal failure, 2 bad input."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     selected = next((word for word in words if not word.startswith("-")), None)
+    if arguments is None and selected in READING:
+        from ._guard import code_of_child
+
+        code_there = code_of_child(words)
+        if code_there is not None:
+            return code_there
     try:
         parsed = _parser(selected if selected in COMMANDS else None).parse_args(words)
         code: int = parsed.run(parsed)

@@ -84,3 +84,6 @@ def _remove_halves(words: Sequence[str], *, since: float) -> None:
             for path in final.parent.glob(f".{final.name}.*.part"):
                 if path.stat().st_mtime >= since - 1.0:
                     path.unlink(missing_ok=True)
+            # a folder that it made and had not come to fill
+            if final.is_dir() and not any(final.iterdir()) and final.stat().st_mtime >= since:
+                final.rmdir()

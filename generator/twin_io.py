@@ -221,6 +221,17 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
             calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
         )
+    if spectral is not None:
+        wide = len(spectral.names)
+        samples, best = spectral.samples, spectral.best
+        whole = samples.ndim == 2 and len(samples) > 0 and samples.shape[1] == wide and best.shape == (wide,)
+        if not (whole and bool(np.isfinite(samples).all()) and bool(np.isfinite(best).all())):
+            raise FileFormatError(
+                f"twin {path}, spectral",
+                received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
+                expected=f"finite draws (n, {wide}) and best ({wide},)",
+                remedy="calibrate again",
+            )
     return Twin(
         instrument=instrument,
         maps=DetectorMaps(

@@ -454,6 +454,8 @@ def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | Non
     dataset = child(node, "time_s")
     if dataset is None:
         return None
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
+        raise FileFormatError(f"{where}/time_s", received="something that is no list of numbers", expected="times in s")
     with reading(f"{where}/time_s"):
         time_s = np.asarray(dataset[()], dtype=np.float64)
     if time_s.shape != (n_frames,) or not bool(np.all(np.isfinite(time_s))) or bool(np.any(np.diff(time_s) < 0)):

@@ -34,7 +34,8 @@ def code_step(values: NDArray[Any]) -> float | None:
     Args:
         values: any shape, DN.
     """
-    if values.dtype.kind == "f" and not bool(np.all(values == np.rint(values))):
+    # floats beyond 2^53 are whole whatever they stand for
+    if values.dtype.kind == "f" and not bool(np.all((values == np.rint(values)) & (np.abs(values) < 2.0**53))):
         return None
     codes = np.unique(values).astype(np.int64)
     if codes.size < 3:

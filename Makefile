@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -33,6 +33,11 @@ validation: $(READY)
 	$(BIN)/python validation/gvxr_transmission.py
 	$(BIN)/python validation/reference_transfer.py --json build/reference_transfer.json
 	$(BIN)/python validation/effects_against_lab.py --json build/effects_against_lab.json
+
+# sessions broken on purpose, and damaged files, through the command line: an hour
+validation-input: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python validation/broken_sessions.py --json build/broken_sessions.json
+	OMP_NUM_THREADS=1 $(BIN)/python validation/damaged_files.py --cases 10000 --json build/damaged_files.json
 
 # generated frames against the lab's: statistics and classifiers, figures in build/generator_vs_lab; half an hour a system
 validation-generator: $(READY)

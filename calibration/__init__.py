@@ -11,8 +11,22 @@ if TYPE_CHECKING:
         calibrate_twin,
         calibration_answer,
     )
+    from .check import (
+        CheckResult,
+        check_acquisition,
+    )
+    from .findings import (
+        Finding,
+        FindingCode,
+        Severity,
+    )
     from .flat_levels import (
         SeriesPoint,
+    )
+    from .frame_checks import (
+        SceneCheck,
+        repeated_frame_indices,
+        same_scene,
     )
     from .frame_sums import (
         FrameSums,
@@ -54,6 +68,14 @@ if TYPE_CHECKING:
     )
 
 _LAZY = {
+    "CheckResult": "check",
+    "check_acquisition": "check",
+    "Finding": "findings",
+    "FindingCode": "findings",
+    "Severity": "findings",
+    "SceneCheck": "frame_checks",
+    "repeated_frame_indices": "frame_checks",
+    "same_scene": "frame_checks",
     "FrameSums": "frame_sums",
     "NextMeasurement": "next_measurement",
     "NoisePower": "noise_power",
@@ -83,12 +105,17 @@ _LAZY = {
 
 __all__ = [
     "PRIORS",
+    "CheckResult",
+    "Finding",
+    "FindingCode",
     "FrameSums",
     "NextMeasurement",
     "NoisePower",
     "PhotonTransfer",
     "Prior",
+    "SceneCheck",
     "SeriesPoint",
+    "Severity",
     "SpectralFit",
     "SpreadFit",
     "Validation",
@@ -96,6 +123,7 @@ __all__ = [
     "advice",
     "calibrate_twin",
     "calibration_answer",
+    "check_acquisition",
     "compute_difference_power",
     "compute_noise_power",
     "compute_photon_transfer",
@@ -105,6 +133,8 @@ __all__ = [
     "geometry_factor",
     "merge_frame_sums",
     "rank_measurements",
+    "repeated_frame_indices",
+    "same_scene",
     "sum_frames",
     "validate_twin",
 ]

@@ -224,6 +224,10 @@ def validate_twin(
         signal = total.mean_DN - dark
         mean = float(np.median(signal[good]))
         variance = float(np.mean(total.pair_variance_DN2[good]))
+        if not (mean > 0 and variance > 0):
+            nothing = "no signal above dark" if variance > 0 else "all frames alike: copies, or no noise"
+            skipped.append(f"{item.name}: {nothing}")
+            continue
         try:
             predicted = predict_flatfield(twin, setting, after_calibration=not seen)
         except InputError as error:

@@ -181,58 +181,41 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
     Raises:
         FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing.
     """
-    import h5py
+    from ..acquisition._hdf5 import HDF5_ERRORS, open_hdf5
 
     if not os.path.isfile(path):
         raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
-    try:
-        file = h5py.File(path, "r")
-    except OSError:
-        raise FileFormatError(
-            f"twin {path}",
-            received="a file that is not HDF5 or is cut off",
-            expected="a file that `raytwin calibrate` wrote",
-        ) from None
-    with file:
-        found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
-        if found != (FORMAT, VERSION):
-            raise FileFormatError(
-                f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
-            )
+    with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file:
         try:
+            found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
+            if found != (FORMAT, VERSION):
+                raise FileFormatError(
+                    f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
+                )
             if _text(file.attrs.get("part", "")) == TUBE:
-                return _tube_from_file(file)
+                return _tube_from_file(file, path)
             return _twin_from_file(file, path)
         except InputError:
             raise
-        except (KeyError, OSError, TypeError, ValueError, IndexError) as error:
+        except HDF5_ERRORS as error:
             raise FileFormatError(
                 f"twin {path}",
-                received=f"a damaged file ({error})",
+                received=f"a damaged file ({' '.join(str(error).split()) or type(error).__name__})",
                 expected="a complete twin file",
                 remedy="calibrate again",
             ) from None
 
 
-def _instrument_from_file(file: Any) -> Instrument:
-    values: dict[str, Any] = {}
-    names = {entry.name for entry in fields(Instrument)}
-    for name, value in file["instrument"].attrs.items():
-        if name not in names:
-            continue
-        if name in LAYER_FIELDS:
-            values[name] = filters_from_text(_text(value))
-        elif isinstance(value, str | bytes):
-            values[name] = _text(value)
-        else:
-            values[name] = value.item() if isinstance(value, np.generic) else value
-    return Instrument(**values)
+def _instrument_from_file(file: Any, path: object) -> Instrument:
+    from ..acquisition.acquisition_io import read_instrument
+
+    return read_instrument(file["instrument"], path=f"twin {path}")
 
 
-def _tube_from_file(file: Any) -> TubeTwin:
+def _tube_from_file(file: Any, path: object) -> TubeTwin:
     return TubeTwin(
-        instrument=_instrument_from_file(file),
-        spectral=_spectral_from_group(file["spectral"]),
+        instrument=_instrument_from_file(file, path),
+        spectral=_spectral_from_group(file["spectral"], path),
         output_known=bool(file.attrs["output_known"]),
         evidence=json.loads(_text(file.attrs["evidence"])),
         warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
@@ -241,6 +224,7 @@ def _tube_from_file(file: Any) -> TubeTwin:
 
 
 def _twin_from_file(file: Any, path: object) -> Twin:
+    instrument = _instrument_from_file(file, path)
     maps = file["maps"]
     noise = file["noise"]
     levels = []
@@ -267,9 +251,9 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         raise FileFormatError(
             f"twin {path}", received=f"maps of shapes {sorted(shapes)}", expected="maps (row, column) of one shape"
         )
-    spectral = _spectral_from_group(file["spectral"]) if "spectral" in file else None
+    spectral = _spectral_from_group(file["spectral"], path) if "spectral" in file else None
     return Twin(
-        instrument=_instrument_from_file(file),
+        instrument=instrument,
         maps=DetectorMaps(
             dark_DN=_array(maps, "dark_DN", np.float32),
             dark_exposure_ms=_optional_float(maps, "dark_exposure_ms"),
@@ -309,9 +293,9 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
     )
 
 
-def _spectral_from_group(group: Any) -> SpectralPosterior:
+def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
     attributes = group.attrs
-    return SpectralPosterior(
+    spectral = SpectralPosterior(
         names=tuple(json.loads(_text(attributes["names"]))),
         samples=_array(group, "samples", np.float64),
         best=_array(group, "best", np.float64),
@@ -332,6 +316,17 @@ def _spectral_from_group(group: Any) -> SpectralPosterior:
         calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
         calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
     )
+    wide = len(spectral.names)
+    samples, best = spectral.samples, spectral.best
+    whole = samples.ndim == 2 and len(samples) > 0 and samples.shape[1] == wide and best.shape == (wide,)
+    if not (whole and bool(np.isfinite(samples).all()) and bool(np.isfinite(best).all())):
+        raise FileFormatError(
+            f"twin {path}, spectral",
+            received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
+            expected=f"finite draws (n, {wide}) and best ({wide},)",
+            remedy="calibrate again",
+        )
+    return spectral
 
 
 def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:

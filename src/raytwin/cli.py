@@ -15,6 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the main job end to end on the virtual lab"),
     "spectrum": ("spectrum", "tube spectrum behind filters"),
     "mu": ("mu", "effective attenuation of a material"),
+    "check": ("check", "what measurements allow, what is suspicious, what to measure next"),
     "calibrate": ("calibrate", "measured flat and dark series -> calibrated twin"),
     "contrast": ("contrast", "contrast of a foreign object in a product, and maps of it"),
     "predict": ("predict", "flatfield at a setting, measured or not"),
@@ -31,6 +32,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
 }
+
+
+# commands that read HDF5 files of others: the library itself may die at damaged ones
+READING = frozenset(
+    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect"}
+)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -69,6 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 success, 1 internal failure, 2 bad input."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     selected = next((word for word in words if not word.startswith("-")), None)
+    if arguments is None and selected in READING:
+        from ._guard import code_of_child
+
+        code_there = code_of_child(words)
+        if code_there is not None:
+            return code_there
     try:
         parsed = _parser(selected if selected in COMMANDS else None).parse_args(words)
         code: int = parsed.run(parsed)

@@ -6,8 +6,6 @@ once, with others in between, show how steady the line is: predictions of a stea
 """
 
 import argparse
-import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -58,41 +56,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin calibrate`."""
-    import numpy as np
+    from ..api._progress import Bar
+    from ..api.twins import calibrate
 
-    from .. import __version__
-    from ..acquisition import open_acquisition
-    from ..acquisition.sessions import merge_sessions, one_layer
-    from ..calibration.calibrate import calibrate_twin, calibration_answer
-    from ..files import sha256_of_file
-    from ..generator.twin_io import write_twin
-    from ..spectra import spectrum_from_file
-
-    spectra = []
+    spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")
         if not colon or not _is_number(voltage):
             raise InputError(
                 "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
             )
-        spectra.append(spectrum_from_file(file, kV=float(voltage)))
-    with ExitStack() as stack:
-        opened = [stack.enter_context(open_acquisition(path)) for path in arguments.acquisition]
-        acquisition = one_layer(merge_sessions(opened), arguments.layer)
-        twin = calibrate_twin(
-            acquisition,
-            rng=np.random.default_rng(arguments.seed),
+        spectra[float(voltage)] = file
+    with Bar(only_on_terminal=True) as bar:
+        twin = calibrate(
+            arguments.acquisition,
             spectra=spectra,
             estimator=arguments.estimator,
-            progress=_stage if sys.stderr.isatty() else None,
-            provenance={
-                "acquisition_sha256": "+".join(sha256_of_file(path) for path in arguments.acquisition),
-                "raytwin_version": __version__,
-                "seed": arguments.seed,
-            },
+            layer=arguments.layer,
+            seed=arguments.seed,
+            progress=bar,
         )
-    write_twin(arguments.output, twin)
-    result = calibration_answer(twin)
+    twin.save(arguments.output)
+    result = twin.to_dict()
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))
@@ -104,10 +89,6 @@ def _is_number(text: str) -> bool:
         return float(text) > 0
     except ValueError:
         return False
-
-
-def _stage(name: str) -> None:
-    say(f"calibrating: {name}")
 
 
 def _interval(value: dict[str, float] | None, unit: str) -> str:

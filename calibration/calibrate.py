@@ -8,11 +8,11 @@ import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
-from ..acquisition.setting import Filter, text_from_filters
+from ..acquisition.setting import Filter
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
-from ..generator.tube_twin import TubeTwin
-from ..generator.twin import BAD_PIXEL_CODES, Estimate, SpreadEstimate, Twin
+from ..generator.twin import BAD_PIXEL_CODES, Twin
+from ..generator.twin_answer import calibration_answer
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
     DEFAULT_MODEL,
@@ -31,6 +31,8 @@ from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, 
 from .transmission_table import TransmissionTable
 from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
+
+__all__ = ["bad_pixel_counts", "calibrate_twin", "calibration_answer"]
 
 # relative, either way: draws of the posterior hardly go further than 0.05, and a varying voltage asks a step of 0.02 beyond
 _POSTERIOR_KV_ERROR = 0.07
@@ -206,103 +208,4 @@ def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
         reason: int(np.count_nonzero(transfer.maps.bad_pixels == code))
         for reason, code in BAD_PIXEL_CODES.items()
         if code != 0
-    }
-
-
-def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
-    """The optical spread as the answer has it: family, model, and each parameter with its interval."""
-    value = spread.value
-    return {
-        "family": spread.family,
-        "model": value.model,
-        **{
-            name: (spread.intervals[name].as_dict() if name in spread.intervals else getattr(value, name))
-            for name in ("sigma_px", "aspect", "tail_share", "tail_px")
-        },
-        "variance_share": value.variance_share,
-    }
-
-
-def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
-    """The answer of `raytwin calibrate --json`; of a tube alone, what needs a detector is null."""
-    if isinstance(twin, TubeTwin):
-        return _tube_answer(twin)
-
-    def plain(estimate: Estimate | None) -> dict[str, float] | None:
-        return None if estimate is None else estimate.as_dict()
-
-    spectral = twin.spectral
-    filtration = flux = None
-    warnings = list(twin.warnings)
-    if spectral is not None:
-        filtration = spectral.interval("inherent_filtration_mm_Al")
-        if any(level.rate_DN_per_mAs for level in twin.levels):
-            flux = _output_scale(twin)
-    if twin.noise.spread.gaussian_px is None:
-        warnings.append(
-            "psf_sigma_px is null: most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`"
-        )
-    if filtration is None:
-        warnings.append("inherent_filtration_mm_Al is null: the twin has no spectral part")
-    if flux is None:
-        warnings.append("flux_scale is null: it needs kV and tube load")
-    return {
-        "psf_sigma_px": plain(twin.noise.spread.gaussian_px),
-        "spread": spread_answer(twin.noise.spread),
-        "read_noise_DN": plain(twin.noise.read_noise_DN),
-        "dark_DN": plain(twin.dark_DN),
-        "inherent_filtration_mm_Al": plain(filtration),
-        "flux_scale": plain(flux),
-        "levels": [
-            {
-                "kV": level.kV,
-                "filter": text_from_filters(level.filters),
-                "gain_DN": level.gain_DN.value,
-                "gain_DN_low": level.gain_DN.low,
-                "gain_DN_high": level.gain_DN.high,
-                "photon_transfer_slope_DN": level.photon_transfer_slope_DN.value,
-                "photon_transfer_slope_DN_low": level.photon_transfer_slope_DN.low,
-                "photon_transfer_slope_DN_high": level.photon_transfer_slope_DN.high,
-                "rate_DN_per_mAs": plain(level.rate_DN_per_mAs),
-                "saturation_DN": level.saturation_DN,
-                "series": list(level.series),
-            }
-            for level in twin.levels
-        ],
-        "bad_pixels": {
-            "count": int(np.count_nonzero(twin.maps.bad_pixels)),
-            "share_percent": 100.0 * float(np.mean(twin.maps.bad_pixels > 0)),
-            "reasons": twin.evidence.get("bad_pixels", {}),
-        },
-        "undetermined": list(spectral.undetermined) if spectral is not None else [],
-        "next_measurement": twin.evidence.get("next_measurement"),
-        "evidence": dict(twin.evidence),
-        "warnings": warnings,
-    }
-
-
-def _output_scale(twin: Twin | TubeTwin) -> Estimate | None:
-    """Output of the tube over the spectrum model's."""
-    if twin.spectral is None:
-        return None
-    low, middle, high = np.quantile(np.exp(twin.spectral.column("log_output")), [0.025, 0.5, 0.975])
-    return Estimate(value=float(middle), low=float(low), high=float(high))
-
-
-def _tube_answer(twin: TubeTwin) -> dict[str, Any]:
-    flux = _output_scale(twin) if twin.output_known else None
-    missing = ("psf_sigma_px", "read_noise_DN", "dark_DN", *(() if flux is not None else ("flux_scale",)))
-    return {
-        "psf_sigma_px": None,
-        "spread": None,
-        "read_noise_DN": None,
-        "dark_DN": None,
-        "inherent_filtration_mm_Al": twin.spectral.interval("inherent_filtration_mm_Al").as_dict(),
-        "flux_scale": None if flux is None else flux.as_dict(),
-        "levels": [],
-        "bad_pixels": None,
-        "undetermined": list(twin.spectral.undetermined),
-        "next_measurement": None,
-        "evidence": dict(twin.evidence),
-        "warnings": [*twin.warnings, f"null: {', '.join(missing)}, bad_pixels"],
     }

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,15 @@ from ..acquisition.setting import text_from_filters
 from ..errors import FileFormatError, InputError
 from ..generator.twin_io import FORMAT as TWIN_FORMAT
 from ..generator.twin_io import read_twin
+from ..results import Result, Table, frame, plain
 from . import frame_signs
 from .findings import Finding, FindingCode, Severity
 from .frame_checks import LEVEL_CHANGE, SceneChange
 from .label_checks import beam_findings, clock_findings, kind_findings, load_findings
 from .series_scan import SeriesScan, scan_series
+
+if TYPE_CHECKING:
+    import pandas
 
 _JUMP = 0.03  # of the signal from one frame to the next: the largest plausible rms of a tube's output
 _EVEN = 3e-3  # pixels of X-ray panels and cameras respond less alike than this (rms) before correction: 0.5 % and more
@@ -81,8 +85,8 @@ class Allowed:
         return {"what": self.what, "possible": self.possible, "why": self.why}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckResult:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class CheckResult(Result):
     """The answer of a check.
 
     Fields: path; what (`acquisition`, `twin`, or the layout of a folder); series; findings (errors first); allows;
@@ -102,16 +106,30 @@ class CheckResult:
         """Findings by severity."""
         return {str(one): sum(item.severity is one for item in self.findings) for one in Severity}
 
-    def __repr__(self) -> str:
-        told = ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in self.counts.items())
-        able = sum(item.possible for item in self.allows)
-        return (
-            f"CheckResult({self.path!r}: {self.what}, {len(self.series)} series, {told};"
-            f" {able} of {len(self.allows)} things are possible)"
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row a finding: code, series, severity, text."""
+        return frame(self.to_dict()["findings"])
+
+    def _table(self) -> Table:
+        counts = self.counts
+        told = ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
+        able = [item for item in self.allows if item.possible]
+        rows = tuple((str(item.severity), item.series, item.text) for item in self.findings)
+        title = f"{self.path}: {self.what}, {len(self.series)} series; {told}"
+        notes = [
+            f"{len(able)} of {len(self.allows)} things are possible",
+            *(f"next: {text}" for text in self.next_measurements[:2]),
+        ]
+        return Table(
+            title=title, header=("severity", "series", "finding") if rows else (), rows=rows, notes=tuple(notes)
         )
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin check --json` prints."""
+        found: dict[str, Any] = plain(self._answer())
+        return found
+
+    def _answer(self) -> dict[str, Any]:
         return {
             "path": self.path,
             "what": self.what,

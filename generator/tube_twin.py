@@ -1,6 +1,7 @@
 """The twin of a tube alone: a spectrum and an output calibrated with a dosimeter, and what they say of a setting."""
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from ..materials import material_from_name, mu_per_mm
+from ..results import Result, Table, interval_text, plain
 from ..spectra import BIN_WIDTH_KEV, Response, Spectrum, checked_kV, half_value_layer_mm, mean_energy_keV
 from .line_limits import check_limits
 from .predict import estimate_from_log_draws, spectrum_outside
@@ -25,8 +27,8 @@ NO_DETECTOR = "the twin is of the tube alone: flats would calibrate a detector"
 NO_OUTPUT = "no air kerma was measured, only ratios: the tube's output is not known"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TubeTwin:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class TubeTwin(Result):
     """A calibrated tube without a detector.
 
     Fields: instrument (anode, angle, limits; what its owner declares), spectral (posterior of the tube's parameters; those of
@@ -40,18 +42,40 @@ class TubeTwin:
     warnings: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def __repr__(self) -> str:
-        low, high = self.spectral.calibrated_kV
-        filtration = self.spectral.interval("inherent_filtration_mm_Al")
-        return (
-            f"TubeTwin({self.spectral.anode} anode, {self.spectral.anode_angle_deg:g} degrees, {low:g} to {high:g} kV:"
-            f" inherent filtration {filtration.value:.3g} ({filtration.low:.3g} to {filtration.high:.3g}) mm Al,"
-            f" output {'measured' if self.output_known else 'not measured'})"
-        )
+    def predict(self, settings: Any = None, /, **words: Any) -> Any:
+        """Air kerma of a setting or of several, with 95 % intervals; settings and words as for `Twin.predict`.
+
+        Raises:
+            InputError: an unknown word or material, no tube load, or a setting that the tube cannot have.
+        """
+        from .predict_settings import asked_settings
+
+        asked = asked_settings(settings, words)
+        if isinstance(asked, Setting):
+            return predict_tube(self, asked)
+        return tuple(predict_tube(self, item) for item in asked)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the twin to a file (HDF5), whole or not at all; `raytwin.read_twin` reads it."""
+        from .twin_io import write_twin
+
+        write_twin(path, self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin calibrate --json` prints."""
+        from .twin_answer import calibration_answer
+
+        found: dict[str, Any] = plain(calibration_answer(self))
+        return found
+
+    def _table(self) -> Table:
+        from .twin_answer import tube_table
+
+        return tube_table(self)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TubePrediction:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class TubePrediction(Result):
     """What a tube alone says of a setting: air kerma of one exposure, uGy (None: not known); warnings say why."""
 
     setting: Setting
@@ -59,8 +83,14 @@ class TubePrediction:
     extrapolated: bool
     warnings: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """The answer of `raytwin predict --json`: what needs a detector is null."""
+    def _table(self) -> Table:
+        kerma = None if self.air_kerma_uGy is None else self.air_kerma_uGy.as_dict()
+        notes = tuple(f"warning: {text}" for text in self.warnings)
+        rows = (("air_kerma_uGy", *interval_text(kerma), "uGy a frame"),)
+        return Table(title=str(self.setting), header=("", "value", "95 % interval", "unit"), rows=rows, notes=notes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin predict --json` prints: what needs a detector is null."""
         return {
             "setting": str(self.setting),
             "mean_DN": None,

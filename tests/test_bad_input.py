@@ -189,7 +189,7 @@ def test_a_session_with_a_wrong_value(files, tmp_path, capsys, case):
 PREDICTIONS = {
     "kV above the table": (["--kv", "500", *PREDICT], "kV"),
     "kV of nothing": (["--kv", "nan", *PREDICT], "kV"),
-    "negative exposure": (["--kv", "60", "--power-w", "40", "--exposure-ms", "-20"], "exposure_ms"),
+    "negative exposure": (["--kv", "60", "--power-w", "40", "--exposure-ms", "-20"], "--exposure-ms"),
     "no power": (["--kv", "60", "--power-w", "0", "--exposure-ms", "20"], "power_W"),
     "unknown filter": (["--kv", "60", "--filter", "unobtanium:1", *PREDICT], "unobtanium"),
     "filter without thickness": (["--kv", "60", "--filter", "Cu", *PREDICT], "MATERIAL:mm"),

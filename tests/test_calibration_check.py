@@ -61,7 +61,7 @@ def test_a_good_session_is_not_suspected_and_its_series_serve(session):
     assert {"dark level", "read noise", "gain, blur and photons a pixel", "linearity"} <= possible
     assert {"spectrum: other kV and filters", "output of the tube, dose"} <= possible
     assert "lag" not in possible
-    assert len(repr(result).splitlines()) == 1
+    assert len(repr(result).splitlines()) <= 20
 
 
 def test_the_json_answer_holds_what_scripts_read(session, capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.next_series import FRAMES, _separation, best_measurement, measurements_lacking, proposal_text
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")

@@ -13,7 +13,7 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.assemble import build_problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import _clears
+from raytwin.diagnosis.diagnose_session import _clears
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.plausibility import check_plausibility

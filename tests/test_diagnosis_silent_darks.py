@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.lab.effects import request_from_text
 from raytwin.lab.protocols import run_protocol
 from raytwin.lab.session import GEOMETRIES, session_system

@@ -6,8 +6,6 @@ once, with others in between, show how steady the line is: predictions of a stea
 """
 
 import argparse
-import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +14,6 @@ from ._answer import answer, say
 
 if TYPE_CHECKING:
     from ..acquisition.instrument import Instrument
-    from ..calibration.output_table import OutputTable
-    from ..calibration.transmission_table import TransmissionTable
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol calibration --seed 1
@@ -84,117 +78,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin calibrate`."""
-    import numpy as np
+    from ..api._progress import Bar
+    from ..api.twins import calibrate
 
-    from ..acquisition import open_acquisition
-    from ..acquisition.sessions import merge_sessions, one_layer
-    from ..calibration.calibrate import calibrate_twin, calibration_answer
-    from ..calibration.tube import calibrate_tube
-    from ..generator.twin_io import write_twin
-    from ..spectra import spectrum_from_file
-
-    spectra = []
+    spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")
         if not colon or not _is_number(voltage):
             raise InputError(
                 "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
             )
-        spectra.append(spectrum_from_file(file, kV=float(voltage)))
-    with ExitStack() as stack:
-        opened = [stack.enter_context(open_acquisition(path)) for path in arguments.acquisition]
-        instrument = _instrument(arguments, opened[0].instrument if opened else None)
-        tables = _tables(arguments, instrument)
-        common: dict[str, Any] = {
-            "rng": np.random.default_rng(arguments.seed),
-            "progress": _stage if sys.stderr.isatty() else None,
-            "provenance": _provenance(arguments),
-        }
-        twin: Twin | TubeTwin
-        if opened:
-            twin = calibrate_twin(
-                one_layer(merge_sessions(opened), arguments.layer),
-                spectra=spectra,
-                estimator=arguments.estimator,
-                output_table=tables[0],
-                transmission_table=tables[1],
-                **common,
-            )
-        else:
-            twin = calibrate_tube(output=tables[0], transmission=tables[1], instrument=instrument, **common)
-    write_twin(arguments.output, twin)
-    result = calibration_answer(twin)
+        spectra[float(voltage)] = file
+    with Bar(only_on_terminal=True) as bar:
+        twin = calibrate(
+            arguments.acquisition or None,
+            output_table=arguments.output_table,
+            transmission=arguments.transmission,
+            instrument=_instrument(arguments),
+            spectra=spectra,
+            estimator=arguments.estimator,
+            layer=arguments.layer,
+            seed=arguments.seed,
+            progress=bar,
+        )
+    twin.save(arguments.output)
+    result = twin.to_dict()
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))
     return 0
 
 
-def _instrument(arguments: argparse.Namespace, measured: "Instrument | None") -> "Instrument":
-    """The acquisition's instrument, or what the options say of a tube alone."""
+def _instrument(arguments: argparse.Namespace) -> "Instrument | None":
+    """What the options say of a tube alone; None: nothing.
+
+    Raises:
+        InputError: an acquisition states its own tube.
+    """
     from ..acquisition.instrument import Instrument
-    from ..acquisition.setting import filters_from_text
-    from ..materials import material_from_name
+    from ..generator.predict_settings import as_filters
 
     options = {name: getattr(arguments, name) for name in ("anode", "angle", "inherent")}
     given = [f"--{name}" for name, value in options.items() if value is not None]
-    if measured is not None:
-        if given:
-            raise InputError(
-                ", ".join(given),
-                received="an acquisition too",
-                expected="one statement of the tube: the acquisition's",
-                remedy="leave the option out, or correct the acquisition's instrument",
-            )
-        return measured
-    if arguments.output_table is None and arguments.transmission is None:
+    if given and arguments.acquisition:
         raise InputError(
-            "ACQ",
-            received="nothing",
-            expected="an acquisition file with flats and darks",
-            remedy="or --output-table FILE for a tube alone",
+            ", ".join(given),
+            received="an acquisition too",
+            expected="one statement of the tube: the acquisition's",
+            remedy="leave the option out, or correct the acquisition's instrument",
         )
-    if arguments.spectrum or arguments.layer is not None:
-        raise InputError(
-            "--spectrum" if arguments.spectrum else "--layer",
-            received="no acquisition",
-            expected="an acquisition file too",
-        )
-    inherent = None if options["inherent"] is None else filters_from_text(options["inherent"])
-    for layer in inherent or ():
-        material_from_name(layer.material)
+    if not given:
+        return None
+    inherent = None if options["inherent"] is None else as_filters(options["inherent"])
     return Instrument(anode=options["anode"], anode_angle_deg=options["angle"], inherent_filtration=inherent)
-
-
-def _tables(
-    arguments: argparse.Namespace, instrument: "Instrument"
-) -> "tuple[OutputTable | None, TransmissionTable | None]":
-    from ..calibration.output_table import read_output_table
-    from ..calibration.transmission_table import read_transmission_table
-
-    anode = instrument.anode or "W"
-    output = transmission = None
-    if arguments.output_table is not None:
-        output = read_output_table(arguments.output_table, anode=anode)
-    if arguments.transmission is not None:
-        transmission = read_transmission_table(
-            arguments.transmission, anode=anode, has_detector=bool(arguments.acquisition)
-        )
-    return output, transmission
-
-
-def _provenance(arguments: argparse.Namespace) -> dict[str, Any]:
-    from .. import __version__
-    from ..files import sha256_of_file
-
-    result: dict[str, Any] = {"raytwin_version": __version__, "seed": arguments.seed}
-    if arguments.acquisition:
-        result["acquisition_sha256"] = "+".join(sha256_of_file(path) for path in arguments.acquisition)
-    for name in ("output_table", "transmission"):
-        path = getattr(arguments, name)
-        if path is not None:
-            result[f"{name}_sha256"] = sha256_of_file(path)
-    return result
 
 
 def _is_number(text: str) -> bool:
@@ -202,10 +138,6 @@ def _is_number(text: str) -> bool:
         return float(text) > 0
     except ValueError:
         return False
-
-
-def _stage(name: str) -> None:
-    say(f"calibrating: {name}")
 
 
 def _interval(value: dict[str, float] | None, unit: str) -> str:

@@ -7,7 +7,6 @@ calibration or stop it.
 
 import argparse
 import shutil
-import sys
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,19 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin check`."""
-    from ..calibration.check import check_acquisition
+    from ..api._progress import Bar
+    from ..api.sessions import check
 
-    progress = _reading if sys.stderr.isatty() else None
-    result = check_acquisition(arguments.path, progress=progress)
-    if progress is not None:
-        sys.stderr.write("\r\033[K")
+    with Bar(only_on_terminal=True) as bar:
+        result = check(arguments.path, progress=bar)
     answer(result.to_dict(), as_json=arguments.json, text=text_of(result))
     return 0
-
-
-def _reading(name: str) -> None:
-    sys.stderr.write(f"\r\033[Kreading {name}")
-    sys.stderr.flush()
 
 
 def say_short(result: "CheckResult") -> None:

@@ -126,54 +126,38 @@ def _families(names: list[str] | None) -> tuple[str, ...] | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ..lab.effects import request_from_text
-    from ..lab.protocols import run_protocol, truth_path
-    from ..lab.session import SESSIONS
+    from ..api._progress import Bar
+    from ..api.sessions import lab_session
     from ..lab.unkindness import NONE
 
-    effects = [request_from_text(text) for text in arguments.effect]
-    usual = "128" if arguments.protocol in SESSIONS else "128x160"
-    rows, columns = _size(usual if arguments.size is None else arguments.size)
-    bar: Any = None
-
-    def begin(frames: int) -> None:
-        from tqdm import tqdm
-
-        nonlocal bar
-        bar = tqdm(total=frames, unit="frame", disable=None, desc=arguments.protocol)
-
-    def advance() -> None:
-        bar.update()
-
-    try:
-        truth = run_protocol(
+    given: dict[str, Any] = {
+        "size": None if arguments.size is None else _size(arguments.size),
+        "bones_mm": _lengths(arguments.bones_mm),
+    }
+    with Bar(only_on_terminal=True, unit="frame") as bar:
+        found = lab_session(
             arguments.output,
             protocol=arguments.protocol,
             seed=arguments.seed,
-            rows=rows,
-            columns=columns,
             pixel_mm=arguments.pixel_mm,
             frames=arguments.frames,
             products=arguments.products,
             product_mm=arguments.product_mm,
-            bones_mm=_lengths(arguments.bones_mm),
             source_detector_mm=arguments.source_detector_mm,
             session=arguments.session,
             geometry=arguments.geometry,
             families=_families(arguments.family),
             unkindness=NONE if arguments.no_unkindness else None,
-            effects=effects,
+            effects=arguments.effect,
             leave_out=arguments.leave_out,
             only=arguments.only,
-            begin=begin,
-            advance=advance,
+            progress=bar,
+            **given,
         )
-    finally:
-        if bar is not None:
-            bar.close()
+    rows, columns = found.shape
     lines = [
-        f"{arguments.output}: {len(truth['series'])} series of {rows} x {columns} pixels ({arguments.protocol})",
-        f"{truth_path(arguments.output)}: the truth",
+        f"{arguments.output}: {len(found.truth['series'])} series of {rows} x {columns} pixels ({arguments.protocol})",
+        f"{found.truth_path}: the truth",
     ]
-    answer(truth, as_json=arguments.json, text="\n".join(lines))
+    answer(found.to_dict(), as_json=arguments.json, text="\n".join(lines))
     return 0

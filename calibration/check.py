@@ -107,8 +107,8 @@ class CheckResult(Result):
         return {str(one): sum(item.severity is one for item in self.findings) for one in Severity}
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row a finding: code, series, severity, text."""
-        return frame(self.to_dict()["findings"])
+        """A row a finding: code, series, text, severity."""
+        return frame(self.to_dict()["findings"], columns=("code", "series", "text", "severity"))
 
     def _table(self) -> Table:
         counts = self.counts

@@ -4,7 +4,7 @@ A frame pair's difference holds noise, and what changed between the two: one fac
 beam's shape, offsets of rows and columns. Squares of the frame are therefore taken one by one (the regions of interest of
 IEC 62220-1): the common factor is subtracted, the difference is divided by the local signal, and every part of it that is
 constant or linear along a row or along a column is projected out. What the projection takes from white noise is known
-exactly and given back; frequencies that it leaves less than half of are left out.
+exactly and given back; frequencies that it leaves little of are left out.
 
 Conventions: frequency in cycles per pixel, `power` in DN^2, so that white noise of variance v has the power v at every
 frequency, and the mean over all frequencies is the variance of a pixel.
@@ -24,9 +24,12 @@ from .frame_sums import effective_frames
 
 LARGEST_SQUARE_PX = 64  # a spread of 3 px leaves half of the power at the lowest frequency in use
 SMALLEST_SQUARE_PX = 8
+_LOW_BINS = 8  # sum of the two orders, up to which power stands for that of whole frames and lines
 _LEAST_GOOD_SHARE = 0.7  # of a square's pixels, for the projection to be as in a whole one
 _LEAST_LEFT = 0.15  # of white noise, after the projection, for a frequency to be used
-_REMOVED_TERMS = 2  # constant and linear, along each axis
+_SLOPES_FROM_PX = (
+    32  # squares from this side lose slopes too; in smaller ones these hold a quarter of all modes and more
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -118,10 +121,11 @@ def _taper(side: int) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def _removed(side: int) -> FloatArray:
-    """Orthonormal tapered lines that are projected out (side, term): constant and linear."""
+    """Orthonormal tapered lines that are projected out (side, term): constant and, in large squares, linear."""
     taper = _taper(side)
     position = np.linspace(-1.0, 1.0, side)
-    lines = np.stack([taper * position**power for power in range(_REMOVED_TERMS)], axis=1)
+    terms = 2 if side >= _SLOPES_FROM_PX else 1
+    lines = np.stack([taper * position**power for power in range(terms)], axis=1)
     return np.asarray(np.linalg.qr(lines)[0])
 
 
@@ -407,7 +411,8 @@ class _PowerSum:
         modes = np.where(used, 0.5 * mode_share(side) * self.squares.pixels * degrees, 0.0)
         # a plateau's height, for what the pixels' own noise adds to whole frames and lines
         lowest = int(np.argmax(used.any(axis=1))) + 1
-        plateau = float(power[lowest, lowest])
+        low = used & (np.add.outer(np.arange(side // 2 + 1), np.arange(side // 2 + 1)) <= _LOW_BINS)
+        plateau = float(np.sum(modes[low] * power[low]) / modes[low].sum())
         signal = float(np.mean(self.squares.level)) if self.has_signal else 0.0
         common = 0.0
         if self.has_signal:

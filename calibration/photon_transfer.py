@@ -25,6 +25,7 @@ from .frame_sums import sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
 from .noise_of_flats import PIECE_BYTES, FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
 from .repeated_frames import (
+    OPEN,
     Beam,
     RepeatedFrames,
     beam_of,
@@ -270,10 +271,9 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
         if reason == _SINGLE and beam_of(item) in single and float(np.median(total.mean_DN - darks.of(item))) > 0
     ]
     pairs = pairs_of_singles(lone)
-    paired = {pair.beam for pair in pairs}
     noted: list[str] = []
     noise_series = []
-    for item in series_of_beams(repeated, sorted(single - paired, key=str), session.shape):
+    for item in series_of_beams(repeated, sorted(single, key=str), session.shape):
         change = _scene_change(item, float(np.median(darks.of(item))))
         if change:
             noted.append(f"{item.name} is not used for noise: {change}; declare each scene as a series of its own")
@@ -298,8 +298,12 @@ def _sum_flats(session: _Session, darks: DarkFrames, sums_of: SumsOf, *, repeate
         usable=usable,
         good=good,
     )
+    # frames in a row hold less besides noise than flats of different series, but not where an object hardens the beam
+    paired = {pair.beam for pair in pairs}
+    others = tuple(item for item in others if item.where == OPEN or item.beam not in paired)
+    pairs = tuple(pair for pair in pairs if pair.beam not in {item.beam for item in others})
     if others or pairs:
-        beams = {other.beam for other in others} | paired
+        beams = {other.beam for other in others} | {pair.beam for pair in pairs}
         sums = [(item, total, _reason_beside(item, total, reason, beams, darks, good)) for item, total, reason in sums]
         lit = {beam_of(item) for item, _, reason in sums if not reason}
         others = tuple(item for item in others if item.beam in lit)
@@ -396,7 +400,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
         noise=NoiseModel(
             spread=spread_estimate(fit),
             white_fraction=float(np.clip(np.nan_to_num(np.nanmean(fit.white_fraction)), 0.0, None)),
-            read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2),
+            read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2, fit.most_read_DN2),
             quantised=quantised,
         ),
         dark_DN=dark_DN,
@@ -421,8 +425,9 @@ def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
     )
 
 
-def _root_estimate(variance: float, sd: float) -> Estimate:
-    """Standard deviation with its interval from a variance with its own."""
+def _root_estimate(variance: float, sd: float, most: float) -> Estimate:
+    """Standard deviation with its interval from a variance with its own, which is at most `most`."""
     half = 1.959964 * sd
-    value, low, high = (math.sqrt(max(v, 0.0)) for v in (variance, variance - half, variance + half))
+    ends = (variance, variance - half, max(min(variance + half, most), variance))
+    value, low, high = (math.sqrt(max(v, 0.0)) for v in ends)
     return Estimate(value=value, low=low, high=high)

@@ -29,21 +29,21 @@ _ROUNDING_DN2 = 1.0 / 12.0  # of an ADC in whole numbers
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
-_BOUNDS = {"sigma_px": (0.0, 12.0), "log_aspect": (-1.6, 1.6), "tail_share": (0.0, 1.0), "log_tail_px": (-1.6, 1.6)}
+_BOUNDS = {"sigma_px2": (0.0, 144.0), "log_aspect": (-1.6, 1.6), "tail_share": (0.0, 1.0), "log_tail_px": (-1.6, 1.6)}
 # A tail that squares of M px cannot show passes for a smaller gain: it is glare, not spread. The longest reach L is that whose
 # transfer function is still 0.8 at 2 / M, the lowest frequency in full use: 2 pi L (2 / M) = 1/2.
 _LONGEST_TAIL = 1.0 / (8.0 * math.pi)
-_STARTS = {"sigma_px": 0.5, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0}
-_WIDTHS = ("sigma_px", "log_aspect")
+_STARTS = {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0}
+_WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
 _TAIL = ("tail_share", "log_tail_px")
 _LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
 # description of the pixels, order of the tail, parameters
 _FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
-    "Gaussian, light collected in pixels": ("aperture", _LORENTZIAN, ("sigma_px",)),
-    "Gaussian, quanta counted in pixels": ("sampled", _LORENTZIAN, ("sigma_px",)),
+    "Gaussian, light collected in pixels": ("aperture", _LORENTZIAN, ("sigma_px2",)),
+    "Gaussian, quanta counted in pixels": ("sampled", _LORENTZIAN, ("sigma_px2",)),
     "Gaussian with two widths": ("aperture", _LORENTZIAN, _WIDTHS),
-    "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px", *_TAIL)),
-    "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px", *_TAIL)),
+    "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px2", *_TAIL)),
+    "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px2", *_TAIL)),
     "two widths with a Lorentzian tail": ("aperture", _LORENTZIAN, (*_WIDTHS, *_TAIL)),
     "two widths with an exponential tail": ("aperture", _EXPONENTIAL, (*_WIDTHS, *_TAIL)),
 }
@@ -57,7 +57,7 @@ class SpreadFit:
     tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the spread's share restored;
     slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
     white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
-    in it, read_sd_DN2; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees: of the fit;
+    in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
     excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its standard
     deviation; criteria (family -> Schwarz's criterion above the best); expected_DN2: power of each series.
     """
@@ -72,6 +72,7 @@ class SpreadFit:
     white_fraction: FloatArray
     read_variance_DN2: float
     read_sd_DN2: float
+    most_read_DN2: float
     row_variance_DN2: float
     column_variance_DN2: float
     chi_square: float
@@ -173,11 +174,12 @@ class _Problem:
             # cells of one bin scatter as overlapping squares do, wide ones as their modes say
             self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
         self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
-        # white noise is at no frequency more than what was measured there
-        pairs = zip(self.data, self.modes, strict=True)
-        self.most_read_DN2 = min(float(np.min(data * (1.0 + 5.0 / np.sqrt(modes)))) for data, modes in pairs)
-        if most_read_DN2 is not None:
-            self.most_read_DN2 = min(self.most_read_DN2, most_read_DN2)
+        self.most_read_DN2 = math.inf
+        if min(group) >= 0:
+            # darks were not repeated, but white noise is at no frequency more than what was measured there
+            pairs = zip(self.data, self.modes, strict=True)
+            measured = [float(np.min(data * (1.0 + 5.0 / np.sqrt(modes)))) for data, modes in pairs]
+            self.most_read_DN2 = min([*measured, math.inf if most_read_DN2 is None else most_read_DN2])
         # each series has a level of its own: weights begin from its mean
         self.weigh([np.full(data.size, max(float(np.mean(data)), 1e-12)) for data in self.data])
 
@@ -305,7 +307,7 @@ def _spread_of(family: str, theta: FloatArray) -> Spread:
     values = dict(zip(names, (float(value) for value in theta), strict=True))
     return Spread(
         model=model,
-        sigma_px=max(values["sigma_px"], 0.0),
+        sigma_px=math.sqrt(max(values["sigma_px2"], 0.0)),
         aspect=math.exp(values.get("log_aspect", 0.0)),
         tail_share=min(max(values.get("tail_share", 0.0), 0.0), 1.0),
         tail_px=math.exp(values.get("log_tail_px", 0.0)),
@@ -422,6 +424,7 @@ def _electronic(value: float, sd: float, most: float) -> tuple[float, float]:
 
     The prior of a scale is uniform in its logarithm (Jeffreys), from the rounding of whole numbers up.
     """
+    most = min(most, max(value, 0.0) + 8.0 * sd)
     least = min(_ROUNDING_DN2, 1e-4 * most)
     if not most > least > 0:
         return max(value, 0.0), sd
@@ -533,6 +536,7 @@ def fit_spread(
         read_sd_DN2=math.hypot(
             math.sqrt(max(inflation * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd
         ),
+        most_read_DN2=problem.most_read_DN2,
         row_variance_DN2=max(rows, 0.0),
         column_variance_DN2=max(columns, 0.0),
         chi_square=chosen.chi_square,
@@ -594,8 +598,10 @@ def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:
     own = {
         name: max(inflation * float(item.covariance[linear + i, linear + i]), 0.0) for i, name in enumerate(item.names)
     }
+    # the width at one standard deviation of its square: right also where the width is near 0
+    sigma_px = item.spread.sigma_px
     return {
-        "sigma_px": own.get("sigma_px", 0.0),
+        "sigma_px": (math.sqrt(sigma_px**2 + math.sqrt(own["sigma_px2"])) - sigma_px) ** 2,
         "aspect": own.get("log_aspect", 0.0) * item.spread.aspect**2,
         "tail_share": own.get("tail_share", 0.0),
         "tail_px": own.get("log_tail_px", 0.0) * item.spread.tail_px**2,

@@ -301,7 +301,6 @@ def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
         ["predict", "twin.h5"],
         ["predict", "twin.h5", "--kv", "sixty", "--power-w", "1", "--exposure-ms", "1"],
         ["calibrate", "a.h5", "-o", "b.h5", "--unknown"],
-        ["nonsense"],
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
@@ -309,6 +308,14 @@ def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
         main(words)
     captured = capsys.readouterr()
     assert stop.value.code == 2
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith("raytwin")
+
+
+def test_an_unknown_command_is_one_line_and_exit_2(capsys):
+    assert main(["nonsense"]) == 2
+    captured = capsys.readouterr()
     assert captured.out == ""
     assert len(captured.err.splitlines()) == 1
     assert captured.err.startswith("raytwin")

@@ -190,7 +190,7 @@ def test_binning_shares_rise_from_one_pixel_s_to_that_of_the_quanta(model, sigma
         blur_variance_share(model, sigma), rel=1e-6
     )
     assert share <= Spread(model=model, sigma_px=sigma).binned_variance_share(binning + 1) + 1e-12 <= 1.0 + 1e-9
-    assert Spread(model=model, sigma_px=sigma).binned_variance_share(400) == pytest.approx(1.0, abs=0.01)
+    assert Spread(model=model, sigma_px=sigma).binned_variance_share(1000) == pytest.approx(1.0, abs=0.01)
 
 
 def test_binned_flatfields_add_signal_noise_and_photons_as_the_readout_does(twin):

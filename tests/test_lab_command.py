@@ -142,7 +142,7 @@ def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--protocol", "tomography"], "protocol: got 'tomography'; expected one of calibration, set1, set2, full,"),
+        (["--protocol", "tomography"], "protocol: got 'tomography'; expected one of calibration, set1, set2,"),
         (["--protocol", "set1", "--size", "7"], "--size: got '7'; expected N or ROWSxCOLUMNS from 8 to 8192 pixels"),
         (["--protocol", "set1", "--size", "ax3"], "--size: got 'ax3'"),
         (["--protocol", "set1", "--product-mm", "300"], "one that fits into 52 x 66 mm, the field without its borders"),

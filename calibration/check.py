@@ -19,8 +19,9 @@ from ..acquisition.import_any import draft_sidecar, import_folder, layout_of
 from ..acquisition.pairs import object_pairs
 from ..acquisition.setting import text_from_filters
 from ..errors import FileFormatError, InputError
+from ..generator.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
 from ..generator.twin_io import FORMAT as TWIN_FORMAT
-from ..generator.twin_io import read_twin
+from ..generator.twin_io import read_any_twin
 from ..results import Result, Table, frame, plain
 from . import frame_signs
 from .findings import Finding, FindingCode, Severity
@@ -240,9 +241,11 @@ def _checked_import(place: Path, layout: str, progress: Progress | None) -> Chec
 
 def _checked_twin(place: Path) -> CheckResult:
     try:
-        twin = read_twin(place)
+        twin = read_any_twin(place)
     except InputError as error:
         return _broken(str(place), "twin", error)
+    if isinstance(twin, TubeTwin):
+        return _checked_tube(place, twin)
     rows = tuple(
         SeriesRow(
             name=", ".join(level.series),
@@ -282,6 +285,30 @@ def _checked_twin(place: Path) -> CheckResult:
         findings=tuple(Finding(code=FindingCode.TWIN_WARNING, values={"what": line}) for line in twin.warnings),
         allows=tuple(allows),
         next_measurements=(text,) if text else (),
+    )
+
+
+def _checked_tube(place: Path, twin: TubeTwin) -> CheckResult:
+    low, high = twin.spectral.calibrated_kV
+    return CheckResult(
+        path=str(place),
+        what="twin of a tube",
+        series=(),
+        findings=tuple(Finding(code=FindingCode.TWIN_WARNING, values={"what": line}) for line in twin.warnings),
+        allows=(
+            Allowed(
+                what="spectrum, attenuation and contrast at any kV and filter",
+                possible=True,
+                why=f"calibrated at {low:g} to {high:g} kV",
+            ),
+            Allowed(
+                what="air kerma",
+                possible=twin.output_known,
+                why="a dosimeter read it" if twin.output_known else NO_OUTPUT,
+            ),
+            Allowed(what="noise and level", possible=False, why=NO_DETECTOR),
+        ),
+        next_measurements=("flats and darks of the detector",),
     )
 
 

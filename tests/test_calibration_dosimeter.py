@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
 from raytwin.calibration.dose_data import KermaRatio, KermaReading
@@ -252,6 +253,23 @@ def test_a_tube_twin_reads_back_and_is_no_whole_twin(tube, tmp_path):
     )
     with pytest.raises(InputError, match="the twin of a tube alone"):
         read_twin(path)
+
+
+def test_python_shows_a_calibrated_tubes_intervals_and_the_check_knows_it(tube, tmp_path):
+    path = tmp_path / "tube.h5"
+    tube.save(path)
+    beam = rt.spectrum(kV=60, filter="Al:1", twin=path)
+    half = beam.intervals["hvl_mm_Al"]
+    assert half["low"] < beam.hvl_mm_Al < half["high"]
+    assert f"{half['low']:.4g} to {half['high']:.4g}" in repr(beam)
+    through = rt.mu("aluminium", kV=60, twin=path, thickness_mm=2)
+    interval = through.intervals["mu_eff_at_thickness_per_mm"]
+    assert f"{interval['low']:.6g} to {interval['high']:.6g}" in repr(through)
+    checked = rt.check(path)
+    assert checked.counts["error"] == 0
+    possible = {item.what: item.possible for item in checked.allows}
+    assert possible["air kerma"] is tube.output_known is True
+    assert possible["noise and level"] is False
 
 
 def test_numbers_of_a_calibrated_beam_hold_the_labs(tube):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..acquisition.setting import Filter, Setting, filter_from_text, text_from_filters
 from ..errors import InputError
 from ..materials import Library, library_from_files, material_from_name, nist_identifier
-from ..results import Result, Table, axes_or_new, frame, number_text, plain
+from ..results import Result, Table, axes_or_new, frame, interval_text, number_text, plain
 from ._given import PathLike, as_any_twin
 from ._progress import Progress, Telling
 
@@ -101,17 +101,21 @@ class BeamSpectrum(Result):
         return axes
 
     def _table(self) -> Table:
-        rows = [
-            ("mean energy", number_text(self.mean_energy_keV), "keV"),
-            ("half-value layer", number_text(self.hvl_mm_Al), "mm Al"),
-            ("second half-value layer", number_text(self.second_hvl_mm_Al), "mm Al"),
-            ("half-value layer", number_text(self.hvl_mm_Cu), "mm Cu"),
-            ("air kerma", number_text(self.air_kerma_uGy_per_mAs), "uGy per mAs at 1 m"),
-            ("photons", number_text(self.photons_per_cm2_mAs), "per cm2 and mAs at 1 m"),
-        ]
-        notes = [f"note: {text}" for text in self.warnings]
+        rows = tuple(
+            (title, *_cells(name, value, self.intervals), unit)
+            for title, name, value, unit in (
+                ("mean energy", "mean_energy_keV", self.mean_energy_keV, "keV"),
+                ("half-value layer", "hvl_mm_Al", self.hvl_mm_Al, "mm Al"),
+                ("second half-value layer", "second_hvl_mm_Al", self.second_hvl_mm_Al, "mm Al"),
+                ("half-value layer", "hvl_mm_Cu", self.hvl_mm_Cu, "mm Cu"),
+                ("air kerma", "air_kerma_uGy_per_mAs", self.air_kerma_uGy_per_mAs, "uGy per mAs at 1 m"),
+                ("photons", "photons_per_cm2_mAs", self.photons_per_cm2_mAs, "per cm2 and mAs at 1 m"),
+            )
+        )
+        interval = () if self.intervals is None else ("95 % interval",)
+        notes = tuple(f"note: {text}" for text in self.warnings)
         return Table(
-            title=describe_beam(self.spectrum), header=("", "value", "unit"), rows=tuple(rows), notes=tuple(notes)
+            title=describe_beam(self.spectrum), header=("", "value", *interval, "unit"), rows=rows, notes=notes
         )
 
 
@@ -158,12 +162,16 @@ class Attenuation(Result):
         return found
 
     def _table(self) -> Table:
-        rows = [("at the energy" if self.energy_keV is not None else "thin object", f"{self.mu_eff_per_mm:.6g}")]
+        title = "at the energy" if self.energy_keV is not None else "thin object"
+        values = [(title, "mu_eff_per_mm", self.mu_eff_per_mm)]
         if self.energy_keV is None and self.mu_eff_at_thickness_per_mm is not None:
-            rows.append((f"through {self.thickness_mm:g} mm", f"{self.mu_eff_at_thickness_per_mm:.6g}"))
+            through = f"through {self.thickness_mm:g} mm"
+            values.append((through, "mu_eff_at_thickness_per_mm", self.mu_eff_at_thickness_per_mm))
+        rows = tuple((title, *_cells(name, value, self.intervals, digits=6)) for title, name, value in values)
+        interval = () if self.intervals is None else ("95 % interval",)
         title = f"{self.material.name}, {self.material.density_g_cm3:.4g} g/cm3, {self.where}"
         notes = tuple(f"note: {text}" for text in self.warnings)
-        return Table(title=title, header=("", "mu, /mm"), rows=tuple(rows), notes=notes)
+        return Table(title=title, header=("", "mu, /mm", *interval), rows=rows, notes=notes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -350,14 +358,23 @@ def as_layers(value: Layers, library: Library) -> tuple[Filter, ...]:
     return tuple(layers)
 
 
+def _cells(name: str, value: float | None, intervals: Mapping[str, Any] | None, *, digits: int = 4) -> tuple[str, ...]:
+    """A value for a table; where intervals were asked for, the value's own in the next column."""
+    text = number_text(value, digits)
+    if intervals is None:
+        return (text,)
+    return text, interval_text(intervals.get(name), digits)[1]
+
+
 def describe_beam(beam: "Spectrum") -> str:
     """One line about where a spectrum comes from."""
     behind = " behind " + " + ".join(f"{layer.thickness_mm:g} mm {layer.material}" for layer in beam.filters)
+    version = f" ({beam.model_version})" if beam.model_version else ""
     if beam.anode is None:
         return f"{beam.model}{behind if beam.filters else ''}"
     return (
         f"{beam.kV:g} kV, {beam.anode} anode at {beam.anode_angle_deg:g} degrees, {beam.model}"
-        f" ({beam.model_version}){behind if beam.filters else ', unfiltered'}"
+        f"{version}{behind if beam.filters else ', unfiltered'}"
     )
 
 

@@ -9,7 +9,7 @@ from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis import changes as scales
 from raytwin.diagnosis.calibrated_maps import CalibratedMaps
 from raytwin.diagnosis.defects import new_outliers
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.line_noise import usual_line_noise
 from raytwin.diagnosis.nuisance_columns import _shapes
 from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series

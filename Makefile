@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -34,6 +34,11 @@ validation: $(READY)
 	$(BIN)/python validation/reference_transfer.py --json build/reference_transfer.json
 	$(BIN)/python validation/effects_against_lab.py --json build/effects_against_lab.json
 
+# sessions broken on purpose, and damaged files, through the command line: an hour
+validation-input: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python validation/broken_sessions.py --json build/broken_sessions.json
+	OMP_NUM_THREADS=1 $(BIN)/python validation/damaged_files.py --cases 10000 --json build/damaged_files.json
+
 # generated frames against the lab's: statistics and classifiers, figures in build/generator_vs_lab; half an hour a system
 validation-generator: $(READY)
 	for seed in 0 2; do $(BIN)/python validation/generator_vs_lab.py --seed $$seed --output build/generator_vs_lab/$$seed --json build/generator_vs_lab/$$seed.json || exit 1; done
@@ -42,6 +47,7 @@ validation-generator: $(READY)
 validation-prediction: $(READY)
 	for kind in nominal departing coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --processes 2 --next 20 --json build/prediction_limit/$$kind.json || exit 1; done
 	for kind in nominal departing; do OMP_NUM_THREADS=1 $(BIN)/python validation/prediction_limit.py --kind $$kind --repeats 3 --first 2000 --systems 40 --processes 2 --json build/prediction_limit/$${kind}_repeated.json || exit 1; done
+	OMP_NUM_THREADS=1 $(BIN)/python validation/foreign_lines.py --processes 2 --json build/foreign_lines/coverage.json
 
 # the diagnosis on sessions of other programs, a quarter of an hour a line (gvxr and gecatsim are installed apart; without one its lines are left out)
 validation-simulators: $(READY)

@@ -12,6 +12,21 @@ import numpy as np
 
 from ..errors import FileFormatError, InputError
 
+# What h5py and HDF5 raise at bytes that are not what they should be: whatever they like. `MemoryError` is an extent that
+# no memory holds, `AttributeError` and `IndexError` come from h5py's own code after a call that failed.
+HDF5_ERRORS = (
+    OSError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    SystemError,
+)
+
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
 
@@ -24,7 +39,7 @@ def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
         raise FileFormatError(str(path), received=given, expected=what, remedy="check the path")
     try:
         return h5py.File(location, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
-    except OSError as error:
+    except HDF5_ERRORS as error:
         if h5py.is_hdf5(location):
             raise FileFormatError(
                 str(path),
@@ -117,7 +132,7 @@ def whole_attribute(node: Any, name: str, *, where: str, lowest: int | None = No
 def _attribute(node: Any, name: str, *, where: str) -> Any:
     try:
         value = node.attrs.get(name)
-    except (OSError, RuntimeError) as error:
+    except HDF5_ERRORS as error:
         raise FileFormatError(
             f"{where}, attribute {name}", received=_reason(error), expected="a readable attribute"
         ) from None
@@ -130,7 +145,8 @@ def _attribute(node: Any, name: str, *, where: str) -> Any:
 
 def plain_attributes(node: Any, *, where: str) -> Mapping[str, Any]:
     """All attributes as Python values, in a new dictionary."""
-    return {name: _plain(_attribute(node, name, where=where)) for name in node.attrs}
+    with reading(where):
+        return {name: _plain(_attribute(node, name, where=where)) for name in node.attrs}
 
 
 def _plain(value: Any) -> Any:
@@ -143,18 +159,18 @@ def child(node: Any, name: str) -> Any:
     """The object called `name` below `node`, or None where it is absent or its link leads nowhere."""
     try:
         return node.get(name)
-    except (KeyError, OSError, RuntimeError):
+    except HDF5_ERRORS:
         return None
 
 
 @contextmanager
 def reading(where: str) -> Iterator[None]:
-    """Turn the low-level errors of reading array data into one FileFormatError."""
+    """Turn whatever HDF5 raises within the block into one FileFormatError that names `where`."""
     try:
         yield
     except InputError:
         raise
-    except (OSError, RuntimeError, ValueError) as error:  # h5py raises ValueError at types that no file should hold
+    except HDF5_ERRORS as error:
         raise FileFormatError(
             where,
             received=f"data that cannot be read ({_reason(error)})",

@@ -1,9 +1,11 @@
-"""Images out of TIFF, PNG and raw files, one at a time; every fault names the file."""
+"""Images out of TIFF, PNG, FITS and raw files, one at a time; every fault names the file."""
 
+import logging
 import math
 import re
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileFormatError, InputError
+from ..errors import FileFormatError, InputError, MissingDependencyError
 
 TIFF_ENDINGS = (".tif", ".tiff")
 RAW_ENDINGS = (".raw", ".bin", ".img")
-IMAGE_ENDINGS = (*TIFF_ENDINGS, ".png", ".bmp", *RAW_ENDINGS)
+FITS_ENDINGS = (".fits", ".fit", ".fts")
+IMAGE_ENDINGS = (*TIFF_ENDINGS, ".png", ".bmp", *RAW_ENDINGS, *FITS_ENDINGS)
+# TIFF tags that say where the numbers of a picture lie and how to read them; any other may be broken without harm
+_TIFF_TAGS_THAT_COUNT = frozenset(
+    {
+        256,
+        257,
+        258,
+        259,
+        262,
+        266,
+        273,
+        277,
+        278,
+        279,
+        284,
+        292,
+        293,
+        317,
+        322,
+        323,
+        324,
+        325,
+        330,
+        338,
+        339,
+        347,
+        32997,
+    }
+)
+_BROKEN_TAG = re.compile(r"TiffTag (\d+) @")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,12 +99,16 @@ def iter_images(path: Path, *, raw: RawLayout | None = None) -> Iterator[NDArray
     ending = path.suffix.lower()
     if ending in TIFF_ENDINGS:
         yield from _tiff_pages(path)
+    elif ending in FITS_ENDINGS:
+        yield from _fits_planes(path)
     elif ending in RAW_ENDINGS:
         yield from _raw_images(path, raw)
     elif ending in (".png", ".bmp"):
         yield _one_channel(path, _decoded(path))
     else:
-        raise FileFormatError(str(path), received=f"a file {ending or 'without ending'}", expected="TIFF, PNG or raw")
+        raise FileFormatError(
+            str(path), received=f"a file {ending or 'without ending'}", expected="TIFF, PNG, FITS or raw"
+        )
 
 
 def read_image(path: Path, *, raw: RawLayout | None = None) -> NDArray[Any]:
@@ -107,11 +143,68 @@ def _decoded(path: Path) -> NDArray[Any]:
         raise _damaged(path, error) from None
 
 
+@contextmanager
+def _quiet_about_harmless_faults() -> Iterator[None]:
+    """tifffile logs whatever it does not like. A file that cannot be read is told by its error, and a broken tag that does
+    not matter to the picture by nobody; the rest is passed on at the end.
+    """
+    kept: list[logging.LogRecord] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        tags = _BROKEN_TAG.findall(record.getMessage())
+        if not tags or any(int(tag) in _TIFF_TAGS_THAT_COUNT for tag in tags):
+            kept.append(record)
+        return False
+
+    logger = logging.getLogger("tifffile")
+    logger.addFilter(keep)
+    try:
+        yield
+    except BaseException:
+        kept.clear()
+        raise
+    finally:
+        logger.removeFilter(keep)
+        for record in kept:
+            logger.callHandlers(record)
+
+
+def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
+    """The first HDU that holds an image, (row, column) or (n, row, column); FITS stores the row at the bottom first."""
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: got a FITS file; expected the library that reads it; install it with `pip install 'raytwin[fits]'`"
+        ) from None
+    try:
+        with warnings.catch_warnings():
+            # a file that was cut off is read with a warning and zeros in place of what is missing
+            warnings.simplefilter("error")
+            with path.open("rb") as stream, fits.open(stream, memmap=False) as file:
+                found = next((hdu for hdu in file if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2), None)
+                if found is None:
+                    raise ValueError("no image in it")
+                # BZERO makes whole numbers of what FITS has no type for: unsigned ones
+                values = np.asarray(found.data)
+    except Exception as error:  # astropy raises whatever it likes at damaged files
+        raise _damaged(path, error) from None
+    values = values.astype(values.dtype.newbyteorder("="), copy=False)
+    if values.ndim == 2:
+        values = values[None]
+    if values.ndim != 3:
+        raise FileFormatError(
+            str(path), received=f"an array of {values.ndim} axes", expected="an image (row, column) or a stack of them"
+        )
+    for plane in values:
+        yield _one_channel(path, plane)
+
+
 def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
     import tifffile
 
     try:
-        with tifffile.TiffFile(path) as file:
+        with _quiet_about_harmless_faults(), tifffile.TiffFile(path) as file:
             if not file.series:
                 raise ValueError("no image in it")
             series = file.series[0]

@@ -2,11 +2,11 @@
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType, TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import h5py
 import numpy as np
@@ -38,6 +38,7 @@ ROLES = ("calibration", "evaluation")
 PANEL_LAYERS = ("front", "back")
 PIECE_BYTES = 64 * 2**20
 
+_Made = TypeVar("_Made")
 _LARGEST_EXACT_FLOAT32 = 2**24
 _CHUNK_BYTES = 2**17
 
@@ -249,11 +250,12 @@ class AcquisitionFile:
         return tuple(series for series in self.series if series.kind in kinds)
 
 
-def open_acquisition(path: str | os.PathLike[str]) -> AcquisitionFile:
+def open_acquisition(path: str | os.PathLike[str], *, damage: list[FileFormatError] | None = None) -> AcquisitionFile:
     """Open an acquisition file and check everything but the frames' values; those are checked as they are read.
 
     Args:
         path: HDF5 file with root attributes `format = "raytwin-acquisition"`, `version = 1`.
+        damage: where a list is given, series and scenes that cannot be read are left out and their errors put there.
 
     Returns:
         The open file, a context manager.
@@ -265,33 +267,56 @@ def open_acquisition(path: str | os.PathLike[str]) -> AcquisitionFile:
     file = open_hdf5(path, what="an acquisition file")
     try:
         with reading(str(path)):
-            return _acquisition(file, path=str(path))
+            return _acquisition(file, path=str(path), damage=damage)
     except BaseException:
         file.close()
         raise
 
 
-def _acquisition(file: Any, *, path: str) -> AcquisitionFile:
+def _each(
+    group: Any, path: str, make: Callable[..., _Made], damage: list[FileFormatError] | None
+) -> list[tuple[str, _Made]]:
+    """What `make` makes of every member of a group, by name; members at fault go to `damage` where that is a list."""
+    made = []
+    for name in group:
+        try:
+            with reading(f"{path}, {name}"):
+                made.append((name, make(group, name, path=path)))
+        except FileFormatError as error:
+            if damage is None:
+                raise
+            damage.append(error)
+    return made
+
+
+def _acquisition(file: Any, *, path: str, damage: list[FileFormatError] | None = None) -> AcquisitionFile:
     check_format(file, path=path, format_name=FORMAT, version=VERSION)
     group = child(file, "series")
     if not isinstance(group, h5py.Group) or len(group) == 0:
         raise FileFormatError(path, received="no series", expected="at least one series of frames below /series")
-    found = [_series(group, name, path=path) for name in group]
+    found = [series for _, series in _each(group, path, _series, damage)]
     numbered = sorted((series for series in found if series.index >= 0), key=lambda series: (series.index, series.name))
     # Series without an index come last, in the order of their names.
     unnumbered = sorted((series for series in found if series.index < 0), key=lambda series: series.name)
-    scenes = _scenes(file, path=path)
+    scenes = _scenes(file, path=path, damage=damage)
     for series in found:
         scene = scenes.get(series.scene)
         if scene is not None and scene.shape not in (None, series.shape):
-            raise FileFormatError(
+            error = FileFormatError(
                 f"{path}, scene {scene.name}",
                 received=f"masks or maps of {_by(scene.shape)} pixels",
                 expected=f"{_by(series.shape)} pixels as in the frames of series {series.name}",
                 remedy="give masks on the detector's own pixels",
             )
-    instrument = _instrument(child(file, "instrument"), path=path)
+            if damage is None:
+                raise error
+            damage.append(error)
+            del scenes[series.scene]
+    instrument = read_instrument(child(file, "instrument"), path=path)
     ordered = tuple(numbered + unnumbered)
+    if instrument.counting and not any(series.kind == "dark" for series in ordered):
+        # a detector that counts photons has a dark of 0 by declaration: its frames are as if a dark were taken off
+        ordered = tuple(replace(series, corrected=series.corrected | {"offset"}) for series in ordered)
     return AcquisitionFile(
         path=path,
         instrument=instrument,
@@ -341,11 +366,8 @@ def _series(group: Any, name: str, *, path: str) -> Series:
         return number_attribute(node, attribute, where=where, lowest=0, unit=unit) or None
 
     kV, current_mA, power_W = load("kV", "kV"), load("current_mA", "mA"), load("power_W", "W")
-    exposure_ms = (
-        number_attribute(node, "exposure_ms", where=where, lowest=0, unit="ms")
-        if dark
-        else positive("exposure_ms", "ms")
-    )
+    # 0 ms: shorter than the clock tells, or the light is pulsed; there is then no load and no setting
+    exposure_ms = number_attribute(node, "exposure_ms", where=where, lowest=0, unit="ms")
     filters = _layers(node, "filter", where=where) or ()
     averaged = whole_attribute(node, "averaged", where=where, lowest=1) or 1
     source_detector_mm = positive("source_detector_mm", "mm")
@@ -432,6 +454,8 @@ def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | Non
     dataset = child(node, "time_s")
     if dataset is None:
         return None
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
+        raise FileFormatError(f"{where}/time_s", received="something that is no list of numbers", expected="times in s")
     with reading(f"{where}/time_s"):
         time_s = np.asarray(dataset[()], dtype=np.float64)
     if time_s.shape != (n_frames,) or not bool(np.all(np.isfinite(time_s))) or bool(np.any(np.diff(time_s) < 0)):
@@ -444,9 +468,9 @@ def _times(node: Any, *, n_frames: int, where: str) -> NDArray[np.float64] | Non
     return time_s
 
 
-def _scenes(file: Any, *, path: str) -> dict[str, Scene]:
+def _scenes(file: Any, *, path: str, damage: list[FileFormatError] | None) -> dict[str, Scene]:
     group = child(file, "scenes")
-    return {} if not isinstance(group, h5py.Group) else {name: _scene(group, name, path=path) for name in group}
+    return dict(_each(group, path, _scene, damage)) if isinstance(group, h5py.Group) else {}
 
 
 def _scene(group: Any, name: str, *, path: str) -> Scene:
@@ -496,7 +520,12 @@ def _scene(group: Any, name: str, *, path: str) -> Scene:
     )
 
 
-def _instrument(node: Any, *, path: str) -> Instrument:
+def read_instrument(node: Any, *, path: str) -> Instrument:
+    """The instrument in the attributes of an HDF5 group; None: nothing is known.
+
+    Raises:
+        FileFormatError: an attribute of another type, or out of range.
+    """
     if node is None:
         return Instrument()
     where = f"{path}, instrument"
@@ -524,7 +553,11 @@ def _missing(series: tuple[Series, ...], instrument: Instrument, *, unnumbered: 
     if unnumbered:
         told.append(f"{unnumbered} series without index: their order in time is taken from their names")
     if "dark" not in kinds:
-        told.append("no dark series: dark level and read noise cannot be measured")
+        told.append(
+            "no dark series: a detector that counts photons has a dark of 0"
+            if instrument.counting
+            else "no dark series: dark level and read noise cannot be measured"
+        )
     if "flat" not in kinds:
         told.append("no flat series: gain, flux and blur cannot be calibrated, nor objects be corrected")
     without_kV = sum(one.kV is None for one in lit)

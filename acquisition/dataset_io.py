@@ -23,6 +23,8 @@ SPLITS = ("train", "val", "test")
 
 Selection = int | slice | Sequence[int] | NDArray[Any]
 
+_MOST_LOG = 24 * math.log(2.0)  # of detector numbers of at most 24 bits
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetRow:
@@ -152,6 +154,13 @@ class Dataset:
                 received="a value that is not finite",
                 expected="finite values",
                 remedy="remove the image from the dataset or make it again",
+            )
+        if name == "images" and values.size and float(values.min()) < -_MOST_LOG:
+            raise FileFormatError(
+                f"{self.path}, images",
+                received=f"-log(I/I0) of {float(values.min()):g}",
+                expected=f"values above {-_MOST_LOG:.3g}: no pixel is brighter than the open beam by a whole range of 24 bits",
+                remedy="the file looks damaged: make it again",
             )
         return values
 

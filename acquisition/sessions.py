@@ -9,6 +9,8 @@ from ..errors import InputError
 from .acquisition_io import AcquisitionFile, Scene, Series
 from .instrument import Instrument
 
+LATER_S = 3600.0  # from the end of a session to what was measured later
+
 
 class _Several:
     """Files that are closed together."""
@@ -57,6 +59,34 @@ def merge_sessions(acquisitions: Sequence[AcquisitionFile]) -> AcquisitionFile:
         missing=tuple(dict.fromkeys(line for acquisition in acquisitions for line in acquisition.missing)),
         _file=_Several([acquisition._file for acquisition in acquisitions]),
     )
+
+
+def continued_session(sessions: Sequence[AcquisitionFile], *, layer: str | None = None) -> AcquisitionFile:
+    """A session with what was measured later on the same line behind it in time, which calibrates nothing.
+
+    Each file has a clock of its own: a later one begins LATER_S after the end of the one before it.
+
+    Args:
+        sessions: the session first, then the later ones in order.
+        layer: as `one_layer`.
+
+    Raises:
+        InputError: as `merge_sessions` and `one_layer`.
+    """
+    merged = one_layer(merge_sessions(sessions), layer)
+    if len(sessions) == 1:
+        return merged
+    series: list[Series] = []
+    begins_s, last_s, session = 0.0, 0.0, 0
+    for item in merged.series:
+        if item.session != session:
+            session, begins_s = item.session, last_s + LATER_S
+        time_s = None if item.time_s is None else item.time_s + begins_s
+        if time_s is not None:
+            last_s = max(last_s, float(time_s[-1]))
+        role = item.role if item.session == 0 else "evaluation"
+        series.append(replace(item, time_s=time_s, role=role))
+    return replace(merged, series=tuple(series))
 
 
 def select_layer(acquisition: AcquisitionFile, layer: str) -> AcquisitionFile:

@@ -11,8 +11,22 @@ if TYPE_CHECKING:
         calibrate_twin,
         calibration_answer,
     )
+    from .check import (
+        CheckResult,
+        check_acquisition,
+    )
+    from .findings import (
+        Finding,
+        FindingCode,
+        Severity,
+    )
     from .flat_levels import (
         SeriesPoint,
+    )
+    from .frame_checks import (
+        SceneCheck,
+        repeated_frame_indices,
+        same_scene,
     )
     from .frame_sums import (
         FrameSums,
@@ -22,6 +36,7 @@ if TYPE_CHECKING:
     )
     from .next_measurement import (
         NextMeasurement,
+        advice,
         rank_measurements,
     )
     from .noise_power import (
@@ -53,6 +68,14 @@ if TYPE_CHECKING:
     )
 
 _LAZY = {
+    "CheckResult": "check",
+    "check_acquisition": "check",
+    "Finding": "findings",
+    "FindingCode": "findings",
+    "Severity": "findings",
+    "SceneCheck": "frame_checks",
+    "repeated_frame_indices": "frame_checks",
+    "same_scene": "frame_checks",
     "FrameSums": "frame_sums",
     "NextMeasurement": "next_measurement",
     "NoisePower": "noise_power",
@@ -64,6 +87,7 @@ _LAZY = {
     "SpreadFit": "spread_fit",
     "Validation": "validate",
     "ValidationRow": "validate",
+    "advice": "next_measurement",
     "calibrate_twin": "calibrate",
     "calibration_answer": "calibrate",
     "compute_difference_power": "noise_power",
@@ -81,18 +105,25 @@ _LAZY = {
 
 __all__ = [
     "PRIORS",
+    "CheckResult",
+    "Finding",
+    "FindingCode",
     "FrameSums",
     "NextMeasurement",
     "NoisePower",
     "PhotonTransfer",
     "Prior",
+    "SceneCheck",
     "SeriesPoint",
+    "Severity",
     "SpectralFit",
     "SpreadFit",
     "Validation",
     "ValidationRow",
+    "advice",
     "calibrate_twin",
     "calibration_answer",
+    "check_acquisition",
     "compute_difference_power",
     "compute_noise_power",
     "compute_photon_transfer",
@@ -102,6 +133,8 @@ __all__ = [
     "geometry_factor",
     "merge_frame_sums",
     "rank_measurements",
+    "repeated_frame_indices",
+    "same_scene",
     "sum_frames",
     "validate_twin",
 ]

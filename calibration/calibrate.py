@@ -1,6 +1,5 @@
 """Measured flats and darks -> a calibrated twin."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,10 +8,11 @@ import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
-from ..acquisition.setting import Filter, text_from_filters
+from ..acquisition.setting import Filter
 from ..errors import FitError
 from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
-from ..generator.twin import BAD_PIXEL_CODES, Estimate, SpreadEstimate, Twin
+from ..generator.twin import BAD_PIXEL_CODES, Twin
+from ..generator.twin_answer import calibration_answer
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
     DEFAULT_MODEL,
@@ -23,13 +23,19 @@ from ..spectra import (
     energy_grid_keV,
     tube_fluence_interpolated,
 )
-from .next_measurement import rank_measurements, voltages_within_reach
+from .next_measurement import advice, voltages_within_reach
+from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
-from .spectral_fit import SpectralFit, fit_spectrum, model_for
+from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for
+from .transmission_table import TransmissionTable
+from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
 
-_POSTERIOR_KV_ERROR = 0.045  # relative, either way: draws of the posterior hardly go further
+__all__ = ["bad_pixel_counts", "calibrate_twin", "calibration_answer"]
+
+# relative, either way: draws of the posterior hardly go further than 0.05, and a varying voltage asks a step of 0.02 beyond
+_POSTERIOR_KV_ERROR = 0.07
 
 
 def calibrate_twin(
@@ -42,6 +48,8 @@ def calibrate_twin(
     spectra: Sequence[Spectrum] = (),
     estimator: str = "pairs",
     repeated: Sequence[Series] | None = None,
+    output_table: OutputTable | None = None,
+    transmission_table: TransmissionTable | None = None,
 ) -> Twin:
     """The twin of a measured session; without kV or tube load it has no spectral part, and says so.
 
@@ -54,6 +62,7 @@ def calibrate_twin(
         spectra: measured ones, in place of the tube model at their voltages.
         estimator: variances from `pairs` of successive frames, or from the `stack` about its mean.
         repeated: flats and objects that the noise of single-frame flats may be read from, in place of the acquisition's.
+        output_table, transmission_table: what a dosimeter read on this line; `calibrate_tube` does without an acquisition.
         advise: also find the measurement that would narrow the predictions most (spectra at some more kV).
 
     Raises:
@@ -66,7 +75,8 @@ def calibrate_twin(
     warnings = [*cut_off, *transfer.warnings]
     evidence = dict(transfer.evidence)
     spectral = None
-    if any(level.kV is not None for level in transfer.levels):
+    doses = dose_data(output_table, transmission_table)
+    if any(level.kV is not None for level in transfer.levels) or doses.any:
         tell("spectrum")
         if not any(level.rate_DN_per_mAs for level in transfer.levels if level.kV is not None):
             warnings.append("no tube current or power in the flats: levels cannot be predicted, only gains")
@@ -76,37 +86,37 @@ def calibrate_twin(
             )
         voltages = {level.kV for level in transfer.levels if level.kV is not None}
         beams = {(level.kV, level.filters) for level in transfer.levels if level.kV is not None}
-        if len(beams) == 1:
+        if len(beams) == 1 and not doses.any:
             warnings.append(
                 "flats at one kV and filter only: filtration, scintillator and kV are hardly known; add a second kV or"
                 " the same kV with a known filter"
             )
-        elif len(voltages) == 1:
+        elif len(voltages) == 1 and not doses.any:
             warnings.append("flats at one kV only: other tube voltages rest on the spectrum model; add a second kV")
         wedges = measure_transmissions(acquisition, transfer.maps)
         evidence["wedges"] = wedge_evidence(wedges)
         warnings += [f"wedge left out: {item.skipped}" for item in wedges if item.skipped]
         transmissions = [value for item in wedges for value in item.transmissions]
-        try:
-            fit = fit_spectrum(
+
+        def fit_of(chosen: DoseData, behind: Sequence[Transmission] = transmissions) -> SpectralFit:
+            return fit_spectrum(
                 transfer.levels,
                 acquisition.instrument,
                 rng=rng,
                 spectra=spectra,
-                transmissions=transmissions,
+                transmissions=behind,
                 noise=transfer.noise,
                 repeats=transfer.evidence["repeated_settings"],
+                kermas=chosen.kermas,
+                ratios=chosen.ratios,
             )
-            if transmissions and _contradicts(fit):
-                without = fit_spectrum(
-                    transfer.levels,
-                    acquisition.instrument,
-                    rng=rng,
-                    spectra=spectra,
-                    noise=transfer.noise,
-                    repeats=transfer.evidence["repeated_settings"],
-                )
-                if not _contradicts(without):
+
+        try:
+            fit, doses, told = fit_without_strays(doses, fit_of)
+            warnings += told
+            if transmissions and contradicts(fit):
+                without = fit_of(doses, ())
+                if not contradicts(without):
                     fit = without
                     evidence["wedges"] = [{**row, "used": False} for row in evidence["wedges"]]
                     warnings.append(
@@ -123,15 +133,9 @@ def calibrate_twin(
                     f"spectra were measured at {voltages_kV} kV; at other voltages the tube model is corrected as between or"
                     " nearest to these"
                 )
-            evidence["spectrum"] = {
-                "chi_square": fit.chi_square,
-                "data": fit.data,
-                "effective_draws": fit.effective_draws,
-                "undetermined": list(spectral.undetermined),
-                "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
-                "prior": dict(spectral.prior),
-            }
-            if _contradicts(fit):
+            evidence["spectrum"] = fit_evidence(fit)
+            evidence |= table_evidence(spectral, doses, output=output_table, transmission=transmission_table)
+            if contradicts(fit):
                 warnings.append(
                     f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"
                     " data): check kV, filter and power of the series"
@@ -152,8 +156,7 @@ def calibrate_twin(
     )
     if advise and spectral is not None:
         tell("next measurement")
-        ranked = rank_measurements(twin)
-        twin = replace(twin, evidence=evidence | {"next_measurement": ranked[0].as_dict() if ranked else None})
+        twin = replace(twin, evidence=evidence | {"next_measurement": advice(twin)})
     return twin
 
 
@@ -180,7 +183,7 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
             for_sums=name == DEFAULT_MODEL,
         )
     materials = [layer.material for item in flats for layer in item.filters]
-    wanted = dict.fromkeys(measured, PRIORS["kV_error"].high)
+    wanted = dict.fromkeys(measured, -PRIORS["kV_error"].low)
     for kV in voltages_within_reach(measured, anode) if advise else ():
         wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
     for highest_kV in sorted({measured[-1], max(wanted)}):
@@ -199,87 +202,10 @@ def _shares(names: Sequence[str]) -> list[str]:
     return [name for name in names if name.startswith(OTHER_TABLES)]
 
 
-def _contradicts(fit: SpectralFit) -> bool:
-    """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
-    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
-
-
 def bad_pixel_counts(transfer: PhotonTransfer) -> dict[str, int]:
     """Number of bad pixels by reason."""
     return {
         reason: int(np.count_nonzero(transfer.maps.bad_pixels == code))
         for reason, code in BAD_PIXEL_CODES.items()
         if code != 0
-    }
-
-
-def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
-    """The optical spread as the answer has it: family, model, and each parameter with its interval."""
-    value = spread.value
-    return {
-        "family": spread.family,
-        "model": value.model,
-        **{
-            name: (spread.intervals[name].as_dict() if name in spread.intervals else getattr(value, name))
-            for name in ("sigma_px", "aspect", "tail_share", "tail_px")
-        },
-        "variance_share": value.variance_share,
-    }
-
-
-def calibration_answer(twin: Twin) -> dict[str, Any]:
-    """The answer of `raytwin calibrate --json`."""
-
-    def plain(estimate: Estimate | None) -> dict[str, float] | None:
-        return None if estimate is None else estimate.as_dict()
-
-    spectral = twin.spectral
-    filtration = flux = None
-    warnings = list(twin.warnings)
-    if spectral is not None:
-        filtration = spectral.interval("inherent_filtration_mm_Al")
-        if any(level.rate_DN_per_mAs for level in twin.levels):
-            draws = np.exp(spectral.column("log_output"))
-            low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975])
-            flux = Estimate(value=float(middle), low=float(low), high=float(high))
-    if twin.noise.spread.gaussian_px is None:
-        warnings.append(
-            "psf_sigma_px is null: most of the light is in the tail of the spread, which no Gaussian width describes; see `spread`"
-        )
-    if filtration is None:
-        warnings.append("inherent_filtration_mm_Al is null: the twin has no spectral part")
-    if flux is None:
-        warnings.append("flux_scale is null: it needs kV and tube load")
-    return {
-        "psf_sigma_px": plain(twin.noise.spread.gaussian_px),
-        "spread": spread_answer(twin.noise.spread),
-        "read_noise_DN": plain(twin.noise.read_noise_DN),
-        "dark_DN": plain(twin.dark_DN),
-        "inherent_filtration_mm_Al": plain(filtration),
-        "flux_scale": plain(flux),
-        "levels": [
-            {
-                "kV": level.kV,
-                "filter": text_from_filters(level.filters),
-                "gain_DN": level.gain_DN.value,
-                "gain_DN_low": level.gain_DN.low,
-                "gain_DN_high": level.gain_DN.high,
-                "photon_transfer_slope_DN": level.photon_transfer_slope_DN.value,
-                "photon_transfer_slope_DN_low": level.photon_transfer_slope_DN.low,
-                "photon_transfer_slope_DN_high": level.photon_transfer_slope_DN.high,
-                "rate_DN_per_mAs": plain(level.rate_DN_per_mAs),
-                "saturation_DN": level.saturation_DN,
-                "series": list(level.series),
-            }
-            for level in twin.levels
-        ],
-        "bad_pixels": {
-            "count": int(np.count_nonzero(twin.maps.bad_pixels)),
-            "share_percent": 100.0 * float(np.mean(twin.maps.bad_pixels > 0)),
-            "reasons": twin.evidence.get("bad_pixels", {}),
-        },
-        "undetermined": list(spectral.undetermined) if spectral is not None else [],
-        "next_measurement": twin.evidence.get("next_measurement"),
-        "evidence": dict(twin.evidence),
-        "warnings": warnings,
     }

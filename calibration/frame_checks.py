@@ -8,7 +8,7 @@ import enum
 import hashlib
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,11 @@ LEVEL_CHANGE = 0.5
 SHAPE_CHANGE = 0.03
 PATTERN_CHANGE = 1e-3
 DARK_PATTERN_SIGMAS = 0.1  # of darks, over the noise of a pixel: the row noise that any panel has
-LINE_SIGMAS = 2.0  # rms of row or column offsets over the noise of a pixel: the largest plausible row noise
+# Largest offset of a block of rows or columns over the noise of a pixel: rows of the largest plausible noise (2 sigmas
+# each) reach less, averaged over a block, in any field. Where it jumps once, to more than half of that noise and ...
+LINE_SIGMAS, LINE_JUMP_SIGMAS = 3.0, 0.5
+_JUMPS = 6.0  # ... this many times the usual offset: the largest of a thousand normal numbers is 3.2 times that of ten
+_ENOUGH_PAIRS = 4
 _SPECKS = 2  # dust and cosmic rays: single places that differ do not make another scene, ...
 _SPECK_SHARE = 0.01  # ... nor does this share of the field
 _TESTS_A_SPECK = 4  # mixed differences that one block is part of
@@ -150,22 +154,48 @@ def same_scene(pieces: Iterable[NDArray[Any]], *, offset_DN: float = 0.0, lit: b
     Returns:
         The answer; `same` is None for a single frame and for fields of fewer than 16 pixels a side.
     """
-    first = next(iterator := iter(pieces), None)
-    if first is None:
-        return _cannot_tell(1, (0, 0))
-    block = _block_side(first.shape[1:])
-    if not block:
-        return _cannot_tell(1, (0, 0))
-    kept = _block_means(_chained(first, iterator), block)
-    indices, means, sigma_DN = kept
-    if len(means) < 2:
-        return _cannot_tell(block, means.shape[1:])
-    return _judged(indices, means - offset_DN, sigma_DN, block, lit=lit)
+    scan = SceneScan()
+    for piece in pieces:
+        scan.add(piece)
+    return scan.result(offset_DN=offset_DN, lit=lit)
 
 
-def _chained(first: NDArray[Any], rest: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-    yield first
-    yield from rest
+class SceneScan:
+    """`same_scene` for frames that are handed over one piece after the other."""
+
+    def __init__(self) -> None:
+        self._side = 1
+        self._kept: list[NDArray[np.float64]] = []
+        self._indices: list[int] = []
+        self._spreads: list[float] = []
+        self._last: NDArray[np.float64] | None = None
+        self._stride, self._number = 1, 0
+
+    def add(self, piece: NDArray[Any]) -> None:
+        """Take the next frames (m, row, column), DN."""
+        if self._number == 0:
+            self._side = _block_side(piece.shape[1:])
+        step = max(1, int(np.prod(piece.shape[1:])) // _KEPT_PIXELS)
+        for frame in piece if self._side else ():
+            sample = frame.reshape(-1)[::step].astype(np.float64)
+            if self._last is not None and len(self._spreads) < _MOST_FRAMES:
+                change = sample - self._last
+                self._spreads.append(float(np.median(np.abs(change - np.median(change)))))
+            self._last = sample
+            if self._number % self._stride == 0:
+                self._kept.append(block_means(frame[None], self._side)[0])
+                self._indices.append(self._number)
+            self._number += 1
+            if len(self._kept) > _MOST_FRAMES:
+                self._kept, self._indices, self._stride = self._kept[::2], self._indices[::2], 2 * self._stride
+
+    def result(self, *, offset_DN: float = 0.0, lit: bool = True) -> SceneCheck:
+        """The answer for the frames taken so far; see `same_scene`."""
+        if len(self._kept) < 2:
+            return _cannot_tell(self._side, (0, 0))
+        sigma_DN = 1.4826 * float(np.median(self._spreads)) / math.sqrt(2.0)
+        indices = np.array(self._indices, dtype=np.intp)
+        return _judged(indices, np.array(self._kept) - offset_DN, sigma_DN, self._side, lit=lit)
 
 
 def _cannot_tell(block: int, shape: tuple[int, ...]) -> SceneCheck:
@@ -196,31 +226,6 @@ def block_means(frames: NDArray[Any], side: int) -> NDArray[np.float64]:
     return np.asarray(lines.reshape(count, rows, columns, side).sum(axis=3) / side**2)
 
 
-def _block_means(pieces: Iterable[NDArray[Any]], side: int) -> tuple[NDArray[np.intp], NDArray[np.float64], float]:
-    """Indices of the frames kept, their block means, and the temporal noise of one pixel (DN)."""
-    kept: list[NDArray[np.float64]] = []
-    indices: list[int] = []
-    spreads: list[float] = []
-    last: NDArray[np.float64] | None = None
-    stride, number = 1, 0
-    for piece in pieces:
-        step = max(1, int(np.prod(piece.shape[1:])) // _KEPT_PIXELS)
-        for frame in piece:
-            sample = frame.reshape(-1)[::step].astype(np.float64)
-            if last is not None and len(spreads) < _MOST_FRAMES:
-                change = sample - last
-                spreads.append(float(np.median(np.abs(change - np.median(change)))))
-            last = sample
-            if number % stride == 0:
-                kept.append(block_means(frame[None], side)[0])
-                indices.append(number)
-            number += 1
-            if len(kept) > _MOST_FRAMES:
-                kept, indices, stride = kept[::2], indices[::2], 2 * stride
-    sigma_DN = 1.4826 * float(np.median(spreads)) / math.sqrt(2.0) if spreads else 0.0
-    return np.array(indices, dtype=np.intp), np.array(kept), sigma_DN
-
-
 def _mixed(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mixed second differences of neighbours (..., row - 1, column - 1): row and column offsets leave no trace."""
     down = values[..., 1:, :] - values[..., :-1, :]
@@ -243,7 +248,7 @@ def _smooth_terms(shape: tuple[int, int]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True)
 class _Change:
-    """Of one frame to another: level and smooth shape (relative), rms of lines (DN), what is left (block row, column)."""
+    """Of one frame to another: level and smooth shape (relative), largest offset of lines (DN), what is left (block row, column)."""
 
     level: float
     shape: float
@@ -276,7 +281,10 @@ def _change(
     scale = np.linalg.norm(matrix, axis=0) + 1e-30
     solution = np.zeros(len(design))
     for _ in range(3):
-        solution = np.linalg.lstsq((matrix / scale)[use], target[use], rcond=1e-6)[0] / scale
+        # by normal equations: a few unknowns and thousands of blocks
+        rows_in_use = (matrix / scale)[use]
+        gram = rows_in_use.T @ rows_in_use
+        solution = np.linalg.lstsq(gram, rows_in_use.T @ target[use], rcond=1e-11)[0] / scale
         left = target - matrix @ solution
         spread = 1.4826 * float(np.median(np.abs(left[use])))
         use = np.abs(left) <= max(5.0 * spread, 1e-12)
@@ -293,7 +301,7 @@ def _change(
         by_noise = spread**2 * float(chi2.isf(FALSE_ALARM, len(design)))
         shape = math.sqrt(max(float(np.var(smooth - level * earlier)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
-    lines = max(float(np.std(np.median(left, axis=axis))) for axis in (0, 1))
+    lines = max(float(np.max(np.abs(np.median(left, axis=axis)))) for axis in (0, 1))
     return _Change(level=level, shape=shape, lines_DN=lines, left=left)
 
 
@@ -302,6 +310,8 @@ def _judged(
 ) -> SceneCheck:
     shape = (int(means.shape[1]), int(means.shape[2]))
     count = len(means)
+    # frames with next to no light have no scale for level and shape
+    lit = lit and float(np.median(means)) > 0.5 * sigma_DN
     terms = _smooth_terms(shape)
     moving = [number for number in range(1, count) if not np.array_equal(means[number], means[number - 1])]
     later = sorted({round(value) for value in np.linspace(1, count - 1, min(_LONG_PAIRS, count - 1))} - {1})
@@ -330,7 +340,13 @@ def _judged(
     growth, grows = _growth(left, local, noise, pattern_DN, consecutive, block)
     level = max((item.level for item in changes), key=abs, default=0.0)
     smooth = max(item.shape for item in changes)
-    lines = max(item.lines_DN for item in changes)
+    lines_DN = np.array([item.lines_DN for item in changes])
+    odd_lines = lines_DN > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN
+    if len(moving) >= _ENOUGH_PAIRS:
+        # row noise is in every pair: what jumps once is no noise
+        usual = float(np.median(lines_DN[: len(moving)]))
+        jumps = lines_DN > max(_JUMPS * usual, LINE_JUMP_SIGMAS * math.sqrt(2.0) * sigma_DN)
+        odd_lines |= jumps & (np.arange(len(pairs)) < len(moving))
     most = max(_SPECK_SHARE * places.size, _SPECKS * _TESTS_A_SPECK)
     change: SceneChange | None = None
     at = None
@@ -341,13 +357,13 @@ def _judged(
     if lit and abs(level) > LEVEL_CHANGE:
         change = SceneChange.LEVEL
         at = first_of(np.array([abs(item.level) > LEVEL_CHANGE for item in changes]))
-    elif sigma_DN > 0 and lines > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN:
-        change = SceneChange.LINES
-        at = first_of(np.array([item.lines_DN > LINE_SIGMAS * math.sqrt(2.0) * sigma_DN for item in changes]))
     elif places.sum() > most or grows:
         change = SceneChange.STRUCTURE
         counts = beyond.reshape(len(pairs), -1).sum(axis=1)
         at = first_of(counts > 0.5 * counts.max())
+    elif sigma_DN > 0 and odd_lines.any():
+        change = SceneChange.LINES
+        at = first_of(odd_lines)
     elif lit and smooth > SHAPE_CHANGE:
         change = SceneChange.SHAPE
         at = first_of(np.array([item.shape > SHAPE_CHANGE for item in changes]))

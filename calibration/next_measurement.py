@@ -20,6 +20,8 @@ from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
 _PLATES = ("", "Cu:0.1", "Al:2", "Cu:0.5")
 _WEDGE_MM = (1.0, 2.0, 4.0, 8.0)
 _WEDGE_SD = 0.003  # of each step's transmission
+# relative sd of one reading: IEC 61674 allows 5 % of a dosemeter for diagnostic beams, 95 % bounds; distance adds 1 to 2 %
+_DOSE_SD = 0.03
 _DESIGN_PLATES = ("", "Cu:0.1", "Al:2")
 _REACH = 1.33  # design and candidates go so far above the highest measured kV
 _LONGEST = 10.0  # times the longest exposure measured
@@ -31,32 +33,80 @@ _RIDGE = 1e-12
 class NextMeasurement:
     """One more measurement and what it does to the predictions.
 
-    Fields: text (a sentence); setting (what to dial in); layers (behind which the flat is taken step by step, where it is a
-    wedge; else none); shrinks_to (mean width of the intervals of level and noise over a grid of settings, of what it is
-    now); width_percent (mean half width of the level's interval now); kV and filters of the grid.
+    Fields: kind (`flats`, `wedge` or `dose`, one reading of air kerma); text (a sentence); setting (what to dial in); layers
+    (behind which the flat is taken step by step, where it is a wedge; else none); shrinks_to (mean width of the intervals of
+    level and noise over a grid of settings, of what it is now); dose_shrinks_to (the same of the air kerma); width_percent
+    (mean half width of the level's interval now); other_kV_percent, measured_kV_percent (the same, of the grid's voltages that
+    were not measured and of those that were, behind other filters; None where the grid has none); kV and filters of the grid.
     """
 
+    kind: str
     text: str
     setting: Setting
     layers: tuple[Filter, ...]
     shrinks_to: float
+    dose_shrinks_to: float
     width_percent: float
+    other_kV_percent: float | None
+    measured_kV_percent: float | None
     grid: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """`next_measurement` of `raytwin calibrate --json`."""
         return {
+            "kind": self.kind,
             "text": self.text,
             "setting": str(self.setting),
             "wedge": text_from_filters(self.layers) or None,
             "shrinks_to": self.shrinks_to,
+            "dose_shrinks_to": self.dose_shrinks_to,
             "width_percent_now": self.width_percent,
+            "width_percent_other_kV": self.other_kV_percent,
+            "width_percent_measured_kV": self.measured_kV_percent,
             "grid": list(self.grid),
         }
 
 
+def advice(twin: Twin) -> dict[str, Any] | None:
+    """The measurement that helps most, how far the voltages measured carry, and what the other kinds of measurement would do.
+
+    Args:
+        twin: calibrated.
+
+    Returns:
+        `NextMeasurement.as_dict` of the first of `rank_measurements`; `carries`, a sentence on the voltages that were not
+        measured, which also follows the `text`; `alternatives`, the best flats at another voltage and at a measured one, the
+        best wedge and the best reading of dose, as dicts of `kind`, `text`, `setting`, `shrinks_to` and `dose_shrinks_to`.
+        None: nothing can be named.
+    """
+    ranked = rank_measurements(twin)
+    if not ranked:
+        return None
+    voltages = {level.kV for level in twin.levels}
+    best: dict[tuple[str, bool], NextMeasurement] = {}
+    for item in ranked:
+        best.setdefault((item.kind, item.kind == "flats" and item.setting.kV in voltages), item)
+    kept = ("kind", "text", "setting", "shrinks_to", "dose_shrinks_to")
+    rows = [{name: value for name, value in item.as_dict().items() if name in kept} for item in best.values()]
+    carries = _carries(ranked[0], twin)
+    text = ranked[0].text if carries is None else f"{ranked[0].text}. {carries}"
+    return ranked[0].as_dict() | {"text": text, "carries": carries, "alternatives": rows}
+
+
+def _carries(first: NextMeasurement, twin: Twin) -> str | None:
+    """How well levels at voltages that were not measured are known, in a sentence."""
+    if first.other_kV_percent is None:
+        return None
+    measured = sorted({level.kV for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None})
+    names = " and ".join(filter(None, (", ".join(f"{kV:g}" for kV in measured[:-1]), f"{measured[-1]:g}")))
+    text = f"From {names} kV, levels at other voltages are known to +-{first.other_kV_percent:.1f} %"
+    if first.measured_kV_percent is not None:
+        text += f", behind other filters at the same voltages to +-{first.measured_kV_percent:.1f} %"
+    return text
+
+
 def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
-    """Flats and wedges that could be measured next, the one that narrows the predictions most first.
+    """Flats, wedges and dose readings that could be measured next, the one that narrows the predictions most first.
 
     With Y the logarithms of level and noise variance over a grid of settings and C those of the candidate, over the
     posterior's draws:  var(Y | C) = var(Y) - cov(Y, C) (var(C) + R)^-1 cov(C, Y),  R the candidate's sampling noise and
@@ -78,13 +128,14 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     stacks = {filters_from_text(text) for text in posterior.calibrated_filters}
     plates = sorted({*stacks, *(filters_from_text(text) for text in _PLATES)}, key=str)
     design = sorted({*stacks, *(filters_from_text(text) for text in _DESIGN_PLATES)}, key=str)
-    signals: dict[OpenBeam, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+    signals: dict[OpenBeam, NDArray[np.float64]] = {}
 
-    def logs(kV: float, filters: tuple[Filter, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def logs(kV: float, filters: tuple[Filter, ...]) -> NDArray[np.float64]:
+        """Logarithms of level, gain and air kerma (3, draw)."""
         beam = OpenBeam(kV=kV, filters=filters)
         if beam not in signals:
             found = model.signal(posterior.samples, beam)
-            signals[beam] = (np.log(found.rate_DN_per_mAs), np.log(found.gain_DN))
+            signals[beam] = np.log([found.rate_DN_per_mAs, found.gain_DN, found.kerma_uGy_per_mAs])
         return signals[beam]
 
     known = {(float(level.kV or 0.0), frozenset(map(str, level.filters))) for level in measured}
@@ -96,17 +147,18 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
     ]
     rows = []
     for kV, filters in grid:
-        rate, gain = logs(kV, filters)
-        rows += [rate, 0.5 * (rate + gain)]
+        rate, gain, kerma = logs(kV, filters)
+        rows += [rate, 0.5 * (rate + gain), kerma]
     wanted = np.array(rows)
     wanted = wanted - wanted.mean(axis=1, keepdims=True)
     draws = wanted.shape[1]
     level_sd, gain_sd = posterior.level_discrepancy, posterior.gain_discrepancy
-    floor = np.tile([level_sd**2, 0.25 * (level_sd**2 + gain_sd**2)], len(grid))
+    floor = np.tile([level_sd**2, 0.25 * (level_sd**2 + gain_sd**2), level_sd**2], len(grid))
+    of_kerma = np.arange(len(floor)) % 3 == 2
     before = np.mean(wanted**2, axis=1)
     rate_noise = _median_relative_sd([level.rate_DN_per_mAs for level in measured])
     gain_noise = _median_relative_sd([level.photon_transfer_slope_DN for level in measured])
-    candidates: list[tuple[Setting, tuple[Filter, ...], NDArray[np.float64], NDArray[np.float64]]] = []
+    candidates: list[tuple[str, Setting, tuple[Filter, ...], NDArray[np.float64], NDArray[np.float64]]] = []
     for kV in every_kV:
         for filters in plates:
             if (kV, frozenset(map(str, filters))) in known or not _passes(filters, kV):
@@ -114,7 +166,12 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
             setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
             if setting is not None:
                 noise = np.array([math.hypot(rate_noise, level_sd), math.hypot(gain_noise, gain_sd)]) ** 2
-                candidates.append((setting, (), np.array(logs(kV, filters)), noise))
+                candidates.append(("flats", setting, (), logs(kV, filters)[:2], noise))
+    for kV in every_kV:
+        for filters in sorted(stacks, key=str):
+            setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
+            if _passes(filters, kV) and setting is not None:
+                candidates.append(("dose", setting, (), logs(kV, filters)[2:], np.array([_DOSE_SD**2 + level_sd**2])))
     for level in measured:
         kV, filters = float(level.kV or 0.0), level.filters
         setting = _exposed(twin, kV, filters, float(np.exp(np.median(logs(kV, filters)[0]))))
@@ -123,25 +180,35 @@ def rank_measurements(twin: Twin) -> tuple[NextMeasurement, ...]:
         steps = tuple(Filter(material="Al", thickness_mm=mm) for mm in _WEDGE_MM)
         open_rate = logs(kV, filters)[0]
         behind = np.array([logs(kV, (*filters, step))[0] - open_rate for step in steps])
-        candidates.append((setting, steps, behind, np.full(len(steps), _WEDGE_SD**2 + level_sd**2)))
+        candidates.append(("wedge", setting, steps, behind, np.full(len(steps), _WEDGE_SD**2 + level_sd**2)))
     ranked = []
     half_width = 1.96 * np.sqrt(before + floor)
-    width = 100.0 * float(np.mean(half_width[::2]))
+    width = 100.0 * float(np.mean(half_width[::3]))
+    elsewhere = np.array([kV not in voltages for kV, _ in grid], dtype=bool)
+    of_levels = 100.0 * half_width[::3]
+    other_kV = float(np.mean(of_levels[elsewhere])) if elsewhere.any() else None
+    measured_kV = float(np.mean(of_levels[~elsewhere])) if not elsewhere.all() else None
     names = tuple(f"{kV:g} kV {text_from_filters(filters)}".strip() for kV, filters in grid)
-    for setting, steps, seen, noise in candidates:
+    for kind, setting, steps, seen, noise in candidates:
         centred = seen - seen.mean(axis=1, keepdims=True)
         cross = wanted @ centred.T / draws
         own = centred @ centred.T / draws + np.diag(noise + _RIDGE)
         gained = np.sum(cross * np.linalg.solve(own, cross.T).T, axis=1)
         after = 1.96 * np.sqrt(np.maximum(before - gained, 0.0) + floor)
-        shrinks_to = float(np.mean(after) / np.mean(half_width))
+        shrinks_to, dose_shrinks_to = (
+            float(np.mean(after[chosen]) / np.mean(half_width[chosen])) for chosen in (~of_kerma, of_kerma)
+        )
         ranked.append(
             NextMeasurement(
-                text=_sentence(setting, steps, shrinks_to),
+                kind=kind,
+                text=_sentence(kind, setting, steps, shrinks_to, dose_shrinks_to),
                 setting=setting,
                 layers=steps,
                 shrinks_to=shrinks_to,
+                dose_shrinks_to=dose_shrinks_to,
                 width_percent=width,
+                other_kV_percent=other_kV,
+                measured_kV_percent=measured_kV,
                 grid=names,
             )
         )
@@ -207,9 +274,14 @@ def _exposed(twin: Twin, kV: float, filters: tuple[Filter, ...], rate_DN_per_mAs
     return Setting(kV=kV, power_W=float(f"{power_W:.3g}"), exposure_ms=float(f"{exposure_ms:.2g}"), filters=filters)
 
 
-def _sentence(setting: Setting, steps: tuple[Filter, ...], shrinks_to: float) -> str:
+def _sentence(kind: str, setting: Setting, steps: tuple[Filter, ...], shrinks_to: float, dose_shrinks_to: float) -> str:
     behind = f"behind {text_from_filters(setting.filters)}" if setting.filters else "without filter"
     percent = f"{100.0 * shrinks_to:.0f} %"
+    if kind == "dose":
+        return (
+            f"A reading of air kerma (to {100.0 * _DOSE_SD:g} %) at {setting.kV:g} kV {behind} ({setting}): it would take the"
+            f" intervals of other settings to {percent} of their width, those of doses to {100.0 * dose_shrinks_to:.0f} %"
+        )
     if steps:
         thicknesses = ", ".join(f"{step.thickness_mm:g}" for step in steps)
         return (

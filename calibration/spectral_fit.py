@@ -1,9 +1,10 @@
 """The spectral part of a twin: tube, filtration, scintillator and gain from levels, gains and transmissions.
 
 Only ratios between levels say anything of the spectrum, and flats alone leave much open; so the answer is a posterior.
-Filtration, scintillator thickness, tube voltage and the size of departures from the model are drawn by importance sampling. All
-else (scales, tables, exponents) acts on the logarithm of a level nearly linearly: for each draw it is integrated out
-exactly about that draw's own derivatives, and drawn back from its conditional Gaussian.
+Filtration, scintillator thickness, tube voltage, K escape and the sizes of discrepancies are drawn by importance sampling. All
+else (scales, tables, exponents, light, covers) acts on the logarithm of a level nearly linearly: for each draw it is
+integrated out about that draw's own derivatives, taken where the data put these parameters, and drawn back so that the levels
+are met by the model itself and not by its derivatives.
 """
 
 import math
@@ -19,25 +20,37 @@ from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError, InputError
 from ..generator.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
+    KERMA_OUTPUT,
     OTHER_TABLES,
     OpenBeam,
     SpectralModel,
     SpectrumCorrection,
+    absorber_of_parameter,
     attenuation_scale_name,
 )
 from ..generator.twin import Level, NoiseModel, SpectralPosterior
 from ..generator.twin_spectrum import slope_over_gain
 from ..spectra import BIN_WIDTH_KEV, Spectrum
+from .dose_data import (
+    DOSE_FILTRATION,
+    DOSE_PRIORS,
+    DOSIMETER_CALIBRATION,
+    DOSIMETER_HARDNESS,
+    FREE_KERMA_OUTPUT,
+    KERMA_DISCREPANCY,
+    RATIO_DISCREPANCY,
+    KermaRatio,
+    KermaReading,
+    absorber_priors,
+    dose_parameters,
+)
 from .priors import (
     ATTENUATION_SCALE,
     COUNTING_SWANK,
-    DEPARTURE_FACTOR,
-    DEPARTURES,
     FREE_OUTPUT,
     GADOLINIUM_SHARE,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
-    LOG_DEPARTURE_SD,
     LOG_DISCREPANCY_SD,
     MEASURED_SPECTRUM,
     PRIORS,
@@ -63,7 +76,16 @@ _WIDEST_SIZE = 4.0  # prior standard deviations of the logarithm of a discrepanc
 _STUDENT_DEGREES = 5.0
 _MIXTURE = (0.75, 0.2, 0.05)
 _Z95 = 1.959964
-SHAPE_PARAMETERS = ("inherent_filtration_mm_Al", "log_scintillator_thickness", "kV_error", ALTERNATIVE_SCINTILLATOR)
+_LINEARISED_ABOUT = 64  # draws whose mean is the point at which the linear parameters' derivatives are taken
+_STEP_SHARES = (1.0, 0.3, 0.1, 0.0)  # of a Newton step, the next where the last one leads uphill
+_NEWTON_STEPS = 3  # of the linear parameters of each draw, towards the model itself
+SHAPE_PARAMETERS = (
+    "inherent_filtration_mm_Al",
+    "log_scintillator_thickness",
+    "kV_error",
+    "escape_scale",
+    ALTERNATIVE_SCINTILLATOR,
+)
 DEFAULT_SCINTILLATOR = (Filter(material="CsI", thickness_mm=0.5),)
 OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 
@@ -82,6 +104,23 @@ class SpectralFit:
     discrepancy: Mapping[str, tuple[float, float, float]]
 
 
+def contradicts(fit: SpectralFit) -> bool:
+    """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
+    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
+
+
+def fit_evidence(fit: SpectralFit) -> dict[str, Any]:
+    """What a twin keeps of its fit, in plain numbers."""
+    return {
+        "chi_square": fit.chi_square,
+        "data": fit.data,
+        "effective_draws": fit.effective_draws,
+        "undetermined": list(fit.posterior.undetermined),
+        "discrepancy": {name: list(values) for name, values in fit.discrepancy.items()},
+        "prior": dict(fit.posterior.prior),
+    }
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transmission:
     """Signal behind known layers over the open signal at one kV and filter, with its relative standard deviation."""
@@ -96,11 +135,30 @@ class Transmission:
 
 @dataclass(frozen=True, slots=True)
 class _Datum:
-    kind: str  # rate, gain or transmission
+    kind: str  # of `_DISCREPANCY_OF`
     beam: int
-    over: int  # beam of the denominator of a transmission
+    over: int  # beam of the denominator of a ratio
     value: float  # logarithm
     sd: float
+    calibration: float = 0.0  # of a kerma: the uncertainty of its dosimeter's calibration over the table's mean
+
+
+# kind of a datum -> whose learned size is its own departure from the model; the sizes' medians
+_DISCREPANCY_OF = {
+    "rate": "level",
+    "gain": "gain",
+    "transmission": "level",
+    "kerma": "kerma",
+    "kerma_ratio": "ratio",
+    "signal_ratio": "ratio",
+}
+_DISCREPANCIES = {
+    "level": LEVEL_DISCREPANCY,
+    "gain": GAIN_DISCREPANCY,
+    "kerma": KERMA_DISCREPANCY,
+    "ratio": RATIO_DISCREPANCY,
+}
+_OF_DETECTOR = ("rate", "gain", "transmission", "signal_ratio")
 
 
 def geometry_factor(*, source_detector_mm: float | None, pixel_mm: float | None) -> float:
@@ -133,6 +191,10 @@ def priors_for(
             )
         elif name in PRIORS:
             result[name] = PRIORS[name]
+        elif name == KERMA_OUTPUT and not geometry_declared:
+            result[name] = FREE_KERMA_OUTPUT
+        elif name in DOSE_PRIORS:
+            result[name] = DOSE_PRIORS[name]
         elif any(name.startswith(f"{table}_") for table in OTHER_TABLES):
             result[name] = TABLE_SHARE
         else:
@@ -147,13 +209,14 @@ def model_for(
     highest_kV: float,
     model_name: str = "casim",
     correction: SpectrumCorrection | None = None,
+    more_names: Sequence[str] = (),
 ) -> SpectralModel:
     """The spectral model of a declared instrument; what it leaves open takes the defaults (W, 12 degrees).
 
     Without a declared scintillator CsI and Gd2O2S are both weighed (for a counting detector only CsI, as a stand-in).
     """
     undeclared = instrument.scintillator is None and not instrument.counting
-    return SpectralModel(
+    result = SpectralModel(
         anode=instrument.anode or "W",
         anode_angle_deg=instrument.anode_angle_deg or 12.0,
         model=model_name,
@@ -167,6 +230,7 @@ def model_for(
         highest_kV=max(160.0, highest_kV),
         correction=correction,
     )
+    return result.with_parameters(more_names) if more_names else result
 
 
 def correction_from_spectra(
@@ -234,8 +298,10 @@ def fit_spectrum(
     model_name: str = "casim",
     noise: NoiseModel | None = None,
     repeats: Sequence[Mapping[str, Any]] = (),
+    kermas: Sequence[KermaReading] = (),
+    ratios: Sequence[KermaRatio] = (),
 ) -> SpectralFit:
-    """Posterior of the spectral parameters from measured levels, gains and transmissions.
+    """Posterior of the spectral parameters from measured levels, gains, transmissions and dosimeter readings.
 
     Args:
         levels: measured levels; those without kV are left out.
@@ -252,36 +318,51 @@ def fit_spectrum(
             taken as the same in all beams.
         repeats: settings measured more than once (`repeated_settings` of the evidence): how far their levels scatter
             beyond sampling tells how well the line repeats itself.
+        kermas, ratios: what dosimeters say; they calibrate the tube without any level, too.
 
     Raises:
-        FitError: no level with a kV, or the posterior cannot be sampled.
+        FitError: no level with a kV and no dosimeter reading, or the posterior cannot be sampled.
     """
     known = [level for level in levels if level.kV is not None]
-    if not known:
+    if not known and not kermas and not ratios:
         raise FitError("no flat series states its kV, so nothing can be said of the spectrum")
     if spectra:
         correction = correction_from_spectra(spectra, instrument, model_name=model_name)
     layers = [layer for level in known for layer in level.filters]
     layers += [layer for item in transmissions for layer in (*item.filters, *item.layers)]
+    layers += [layer for ratio in ratios for layer in (*ratio.filters, *ratio.layers)]
+    layers += [layer for reading in kermas for layer in reading.filters]
+    read = [(item.kV, item.filters) for item in kermas] + [(item.kV, item.filters) for item in ratios]
     model = model_for(
         instrument,
         materials=[layer.material for layer in layers],
-        highest_kV=max([level.kV or 0.0 for level in known] + [item.kV for item in transmissions]),
+        highest_kV=max(
+            [level.kV or 0.0 for level in known] + [item.kV for item in transmissions] + [kV for kV, _ in read]
+        ),
         model_name=model_name,
         correction=correction,
+        more_names=dose_parameters(kermas, ratios, with_flats=bool(known)),
     )
     priors = priors_for(
         model,
         scintillator_declared=instrument.scintillator is not None,
-        geometry_declared=instrument.pixel_mm is not None and all(level.source_detector_mm for level in known),
+        geometry_declared=not known
+        or (instrument.pixel_mm is not None and all(level.source_detector_mm for level in known)),
     )
+    if (kermas or ratios) and correction is None:
+        priors["inherent_filtration_mm_Al"] = DOSE_FILTRATION
+    absorbers = absorber_priors(model, np.array([priors[name].centre for name in model.names]), ratios)
+    if absorbers:
+        model, priors = model.with_parameters(tuple(absorbers)), priors | absorbers
     beams: dict[OpenBeam, int] = {}
-    data = _data(known, transmissions, instrument, noise, beams)
+    data = [*_data(known, transmissions, instrument, noise, beams), *_dose_data(kermas, ratios, beams)]
     fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
     posterior = _Posterior(model, priors, tuple(beams), data, fixed, _repeated_levels(repeats))
     best, samples, discrepancies, effective = posterior.sample(rng)
     names = model.names
-    voltages = [level.kV or 0.0 for level in known]
+    voltages = [level.kV or 0.0 for level in known] or [kV for kV, _ in read]
+    measured = [level.filters for level in known] or [filters for _, filters in read]
+    own = {name: _sd_of_mixture(draws) for name, draws in discrepancies.items()}
     return SpectralFit(
         posterior=SpectralPosterior(
             names=names,
@@ -298,10 +379,11 @@ def fit_spectrum(
             correction=correction,
             cover=model.cover,
             counting=model.counting,
-            level_discrepancy=_sd_of_mixture(discrepancies["level"]),
-            gain_discrepancy=_sd_of_mixture(discrepancies["gain"]),
+            level_discrepancy=own.get("level", LEVEL_DISCREPANCY),
+            gain_discrepancy=own.get("gain", GAIN_DISCREPANCY),
+            kerma_discrepancy=own.get("kerma"),
             calibrated_kV=(min(voltages), max(voltages)),
-            calibrated_filters=tuple(sorted({text_from_filters(level.filters) for level in known})),
+            calibrated_filters=tuple(sorted({text_from_filters(filters) for filters in measured})),
         ),
         effective_draws=effective,
         chi_square=posterior.chi_square(best),
@@ -368,6 +450,23 @@ def _data(
     return data
 
 
+def _dose_data(
+    kermas: Sequence[KermaReading], ratios: Sequence[KermaRatio], beams: dict[OpenBeam, int]
+) -> list[_Datum]:
+    def number(kV: float, filters: tuple[Filter, ...], absorber: str = "") -> int:
+        return beams.setdefault(OpenBeam(kV=kV, filters=filters, absorber=absorber), len(beams))
+
+    data = []
+    for item in kermas:
+        value = math.log(item.value)
+        data.append(_Datum("kerma", number(item.kV, item.filters), -1, value, item.relative_sd, item.calibration_sd))
+    for ratio in ratios:
+        behind = number(ratio.kV, (*ratio.filters, *ratio.layers), ratio.absorber)
+        kind = "signal_ratio" if ratio.of_signal else "kerma_ratio"
+        data.append(_Datum(kind, behind, number(ratio.kV, ratio.filters), math.log(ratio.value), ratio.relative_sd))
+    return data
+
+
 def _repeated_levels(repeats: Sequence[Mapping[str, Any]]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Logarithms of the levels of each repeated setting, and their sampling's relative sd (series,) each."""
     found = []
@@ -387,8 +486,9 @@ def _relative_sd(estimate: object) -> float:
 class _Posterior:
     """Log posterior of the shapes in units of the prior, u = (parameter - centre) / sd.
 
-    For each draw of the shapes: y ~ N(f, W + J J'), with W the noise and discrepancy of the data and J the derivatives
-    of the linear parameters times their prior sd.
+    For each draw of the shapes: y ~ N(f - J a, W + J J'), with W the noise and discrepancy of the data, f the model and J the
+    derivatives of the linear parameters times their prior sd, both at a, where the data put the linear parameters (in units
+    of their prior sd; the prior's centre until something is known).
     """
 
     def __init__(
@@ -404,8 +504,9 @@ class _Posterior:
         self.beams = beams
         self.data = data
         names = model.names
-        self.shape = np.array([i for i, name in enumerate(names) if name in SHAPE_PARAMETERS])
-        self.linear = np.array([i for i, name in enumerate(names) if name not in SHAPE_PARAMETERS])
+        shapes = {name for name in names if name in SHAPE_PARAMETERS or absorber_of_parameter(name)}
+        self.shape = np.array([i for i, name in enumerate(names) if name in shapes])
+        self.linear = np.array([i for i, name in enumerate(names) if name not in shapes])
         self.linear_names = [names[i] for i in self.linear]
         self.centre = np.array([priors[name].centre for name in names])
         self.sd = np.array([priors[name].sd for name in names])
@@ -415,10 +516,13 @@ class _Posterior:
         self.noise = np.array([item.sd for item in data])
         self.fixed = dict(discrepancies)
         self.repeats = tuple(repeats)
-        self.learned = [name for name in ("level", "gain") if self.fixed[name] is None]
-        self.is_gain = np.array([item.kind == "gain" for item in data])
-        self.dimensions = len(self.shape) + len(self.learned) + 1  # the last is the factor of the departures
-        self.departs = np.array([name.startswith(DEPARTURES) for name in self.linear_names])
+        self.departing = [_DISCREPANCY_OF[item.kind] for item in data]
+        # levels and gains count where there are any flats: even a kind without data then strays as its prior says
+        of_flats = not data or any(item.kind in ("rate", "gain") for item in data)
+        kinds = {*self.departing, *(("level", "gain") if of_flats else ())}
+        self.learned = [name for name in _DISCREPANCIES if name in kinds and self.fixed.get(name) is None]
+        self.dimensions = len(self.shape) + len(self.learned)
+        self.about = np.zeros(len(self.linear))
         # one of the tables is right, so shares of two others exclude each other: what one takes is missing to the other
         self.mixing = np.eye(len(self.linear))
         for first, second in self._share_pairs():
@@ -439,8 +543,9 @@ class _Posterior:
         ]
 
     def parameters(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter), the linear ones at their prior centres, from shapes (draw, shape)."""
+        """Full parameter sets (draw, parameter), the linear ones where the data put them, from shapes (draw, shape)."""
         full = np.tile(self.centre, (len(u), 1))
+        full[:, self.linear] += self.linear_sd * (self.mixing @ self.about)
         full[:, self.shape] += self.sd[self.shape] * u[:, : len(self.shape)]
         if self.alternative is not None:
             # a Gaussian latent with the threshold that gives the prior's share
@@ -451,44 +556,73 @@ class _Posterior:
         return full
 
     def discrepancies(self, u: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Relative sd of levels and of gains beyond the model (draw,) each."""
+        """Relative sd of each kind of data beyond the model (draw,) each."""
         result = {}
-        for name, centre in (("level", LEVEL_DISCREPANCY), ("gain", GAIN_DISCREPANCY)):
-            fixed = self.fixed[name]
+        for name, centre in _DISCREPANCIES.items():
+            fixed = self.fixed.get(name)
             if fixed is not None:
                 result[name] = np.full(len(u), fixed)
-            else:
+            elif name in self.learned:
                 column = len(self.shape) + self.learned.index(name)
                 result[name] = centre * np.exp(LOG_DISCREPANCY_SD * u[:, column])
         return result
 
-    def linear_sd(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Prior standard deviations of the linear parameters (draw, linear), with each draw's factor of departures."""
-        factor = DEPARTURE_FACTOR * np.exp(LOG_DEPARTURE_SD * u[:, -1])
-        return np.asarray(self.sd[self.linear] * np.where(self.departs, factor[:, None], 1.0))
+    @property
+    def linear_sd(self) -> NDArray[np.float64]:
+        """Prior standard deviations of the linear parameters (linear,)."""
+        return np.asarray(self.sd[self.linear])
 
     def variances(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance of each datum's logarithm (draw, datum)."""
         found = self.discrepancies(u)
-        extra = np.where(self.is_gain, found["gain"][:, None], found["level"][:, None])
+        extra = np.stack([found[name] for name in self.departing], axis=1)
         return np.asarray(self.noise**2 + extra**2 + 1e-12)
 
     def expectation(self, parameters: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Logarithms that the model expects (draw, datum) and their derivatives (draw, datum, linear)."""
-        deposits = self.model.deposit_tables(parameters)
-        found = [
-            self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits) for beam in self.beams
-        ]
         value = np.empty((len(parameters), len(self.data)))
         slope = np.empty((len(parameters), len(self.data), len(self.linear)))
+        self._expected_kermas(parameters, value, slope)
+        seen = {place for item in self.data if item.kind in _OF_DETECTOR for place in (item.beam, item.over)}
+        if not seen:
+            return value, slope
+        deposits = self.model.deposit_tables(parameters)
+        found = {
+            place: self.model.log_derivatives(parameters, beam, self.linear_names, deposits=deposits)
+            for place, beam in enumerate(self.beams)
+            if place in seen
+        }
         for column, item in enumerate(self.data):
+            if item.kind not in _OF_DETECTOR:
+                continue
             logs, rate, gain = found[item.beam]
             value[:, column] = logs[1] if item.kind == "gain" else logs[0]
             slope[:, column] = gain if item.kind == "gain" else rate
-            if item.kind == "transmission":
+            if item.over >= 0:
                 value[:, column] -= found[item.over][0][0]
                 slope[:, column] -= found[item.over][1]
         return value, slope
+
+    def _expected_kermas(
+        self, parameters: NDArray[np.float64], value: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> None:
+        """Fill in what the model expects of the kermas and their ratios: see `expectation`."""
+        kinds = [(column, item) for column, item in enumerate(self.data) if item.kind not in _OF_DETECTOR]
+        found = {
+            place: self.model.log_kerma_derivatives(parameters, self.beams[place], self.linear_names)
+            for place in {place for _, item in kinds for place in (item.beam, item.over) if place >= 0}
+        }
+        for column, item in kinds:
+            value[:, column], slope[:, column], hardness = found[item.beam]
+            if item.over >= 0:
+                value[:, column] -= found[item.over][0]
+                slope[:, column] -= found[item.over][1]
+                hardness = hardness - found[item.over][2]
+            for name, by in ((DOSIMETER_HARDNESS, hardness), (DOSIMETER_CALIBRATION, item.calibration)):
+                if name in self.linear_names:
+                    slope[:, column, self.linear_names.index(name)] = by
+                    # the derivatives may stand where the data put this parameter
+                    value[:, column] += parameters[:, self.model.names.index(name)] * by
 
     def chi_square(self, parameters: NDArray[np.float64]) -> float:
         """Squared misfit over noise and the largest plausible discrepancy, at one parameter set (parameter,)."""
@@ -496,25 +630,34 @@ class _Posterior:
         misfit = self.value - self.expectation(parameters[None, :])[0][0]
         return float(np.sum(misfit**2 / variance))
 
-    def _conditional(
-        self, u: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Log likelihood (draw,), parameters, and mean and lower root of the precision of the linear ones given u."""
-        full = self.parameters(u)
-        expected, slope = self.expectation(full)
-        slope = (slope * self.linear_sd(u)[:, None, :]) @ self.mixing
+    def _conditional(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Log likelihood (draw,) and mean (draw, linear) of the linear parameters given u, in units of their prior sd."""
+        expected, slope = self.expectation(self.parameters(u))
+        slope = (slope * self.linear_sd) @ self.mixing
         variance = self.variances(u)
-        misfit = self.value - expected
-        weighted = slope / variance[:, :, None]
-        precision = np.eye(len(self.linear)) + np.swapaxes(slope, 1, 2) @ weighted
-        lower = np.asarray(np.linalg.cholesky(precision), dtype=np.float64)
-        right = np.einsum("ndk,nd->nk", weighted, misfit)
+        misfit = self.value - expected + slope @ self.about
+        lower, right = self._normal_equations(slope, variance, misfit)
         half = np.linalg.solve(lower, right[:, :, None])[:, :, 0]
         mean = np.asarray(np.linalg.solve(np.swapaxes(lower, 1, 2), half[:, :, None])[:, :, 0], dtype=np.float64)
         logarithm: NDArray[np.float64] = -0.5 * (np.sum(misfit**2 / variance, axis=1) - np.sum(half**2, axis=1))
         logarithm -= 0.5 * np.sum(np.log(variance), axis=1)
         logarithm -= np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
-        return logarithm, full, mean, lower
+        return logarithm, mean
+
+    @staticmethod
+    def _normal_equations(
+        slope: NDArray[np.float64], variance: NDArray[np.float64], misfit: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower root of the linear parameters' precision (draw, linear, linear) and the right side (draw, linear)."""
+        weighted = slope / variance[:, :, None]
+        precision = np.eye(slope.shape[2]) + np.swapaxes(slope, 1, 2) @ weighted
+        lower = np.asarray(np.linalg.cholesky(precision), dtype=np.float64)
+        return lower, np.einsum("ndk,nd->nk", weighted, misfit)
+
+    def relinearise(self, u: NDArray[np.float64], weight: NDArray[np.float64], rng: np.random.Generator) -> None:
+        """Take derivatives from now on where draws (draw, dimension) of these weights (draw,) put the linear parameters."""
+        chosen = u[_resampled(weight, _LINEARISED_ABOUT, rng)]
+        self.about = self._conditional(chosen)[1].mean(axis=0)
 
     def _log_likelihood_of_repeats(self, level_sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log likelihood (draw,) of the scatter between repeats of a setting, whatever its level: y ~ N(m, s^2 + sd^2)."""
@@ -534,21 +677,54 @@ class _Posterior:
         result = np.full(len(u), -np.inf)
         if inside.any():
             result[inside] = self._conditional(u[inside])[0]
-            result[inside] += self._log_likelihood_of_repeats(self.discrepancies(u[inside])["level"])
+            if self.repeats:
+                result[inside] += self._log_likelihood_of_repeats(self.discrepancies(u[inside])["level"])
         return result
 
     def with_linear(self, u: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.float64]:
-        """Full parameter sets (draw, parameter): the linear ones drawn given the shapes; without rng their mean."""
-        _, full, z, lower = self._conditional(u)
+        """Full parameter sets (draw, parameter): the linear ones drawn given the shapes; without rng the most probable.
+
+        Each draw solves the least-squares problem whose data and prior centres were moved by draws of their noise, which is
+        exact for a linear model and meets the data where it bends.
+
+        Source: Bardsley, Solonen, Haario and Laine (2014), SIAM J Sci Comput 36:A1895.
+        """
+        full, variance = self.parameters(u), self.variances(u)
+        z = np.tile(self.about, (len(u), 1))
+        moved, pulled = self.value, np.zeros(z.shape)
         if rng is not None:
-            normal = rng.standard_normal(z.shape)
-            z = z + np.linalg.solve(np.swapaxes(lower, 1, 2), normal[:, :, None])[:, :, 0]
-        full[:, self.linear] += self.linear_sd(u) * (z @ self.mixing.T)
-        escape = list(self.model.names).index("escape_scale")
-        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
-        full[:, escape] = np.clip(full[:, escape], bounds[0][escape], bounds[1][escape])
-        # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
+            moved = self.value + np.sqrt(variance) * rng.standard_normal(variance.shape)
+            pulled = rng.standard_normal(z.shape)
+
+        def cost(rows: NDArray[np.intp], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+            data = np.sum((moved[rows] - expected) ** 2 / variance[rows], axis=1)
+            return np.asarray(data + np.sum((z[rows] - pulled[rows]) ** 2, axis=1))
+
+        every = np.arange(len(u))
+        moved = np.broadcast_to(moved, variance.shape)
+        expected, slope = self.expectation(full)
+        least = cost(every, expected)
+        for _ in range(_NEWTON_STEPS):
+            slope = (slope * self.linear_sd) @ self.mixing
+            misfit = moved - expected + np.einsum("ndk,nk->nd", slope, z)
+            lower, right = self._normal_equations(slope, variance, misfit)
+            half = np.linalg.solve(lower, (right + pulled)[:, :, None])
+            step = np.linalg.solve(np.swapaxes(lower, 1, 2), half)[:, :, 0] - z
+            expected, slope = np.empty_like(expected), np.empty_like(slope)
+            rows, before = every, z.copy()
+            for share in _STEP_SHARES:
+                z[rows] = before[rows] + share * step[rows]
+                full[np.ix_(rows, self.linear)] = self.centre[self.linear] + self.linear_sd * (z[rows] @ self.mixing.T)
+                expected[rows], slope[rows] = self.expectation(full[rows])
+                found = cost(rows, expected[rows])
+                better = found <= least[rows]
+                least[rows[better]] = found[better]
+                rows = rows[~better]
+                if not rows.size:
+                    break
         names = list(self.model.names)
+        bounds = (self.centre + self.sd * self.low, self.centre + self.sd * self.high)
+        # a bound that cuts the Swank factor is met along gain and output, so that levels and gains stay as they were
         swank, gain, output = (names.index(name) for name in ("log_swank", "log_DN_per_keV", "log_output"))
         beyond = full[:, swank] - np.clip(full[:, swank], bounds[0][swank], bounds[1][swank])
         full[:, swank] -= beyond
@@ -575,6 +751,7 @@ class _Posterior:
             weight, effective = _weights(temper * likelihood + log_ratio)
             if temper >= 1.0 and effective > _ENOUGH:
                 break
+            self.relinearise(u, weight, rng)
             mean = weight @ u
             spread = u - mean
             covariance = (spread * weight[:, None]).T @ spread
@@ -802,10 +979,7 @@ def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: di
     for name in own:
         if name == "log_DN_per_keV":
             continue
-        width = priors[name].sd
-        if name.startswith(DEPARTURES):
-            width *= DEPARTURE_FACTOR * math.exp(LOG_DEPARTURE_SD**2)  # root mean square over the factor's prior
-        share = float(np.std(samples[:, names.index(name)])) / width
+        share = float(np.std(samples[:, names.index(name)])) / priors[name].spread
         if share > 0.7:
             result.append(f"{name}: {100 * min(share, 1.0):.0f} % of the prior's width is left")
     columns = samples[:, [names.index(name) for name in own]]

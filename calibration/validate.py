@@ -19,10 +19,12 @@ from ..generator.effects import effect_of
 from ..generator.predict import predict_flatfield
 from ..generator.present_line import present_line
 from ..generator.twin import Estimate, Twin
+from ..results import Result, Table, axes_or_new, frame, plain
 from .frame_sums import effective_frames, sum_frames
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.figure import Figure
 
 _LAGS = 24  # px; farther neighbours share no light
@@ -111,8 +113,8 @@ class WedgeRow:
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Validation:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Validation(Result):
     """All rows and what was left out; wedges where the acquisition has some, left_out where that was asked for."""
 
     rows: tuple[ValidationRow, ...]
@@ -120,8 +122,8 @@ class Validation:
     wedges: tuple[WedgeRow, ...] = ()
     left_out: tuple[ValidationRow, ...] | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """The answer of `raytwin validate --json`."""
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin validate --json` prints."""
         answer: dict[str, Any] = {
             "rows": [row.as_dict() for row in self.rows],
             **_summary(self.rows),
@@ -139,7 +141,52 @@ class Validation:
                 "rows": [row.as_dict() for row in self.left_out],
                 **(_summary(self.left_out) if self.left_out else {}),
             }
-        return answer
+        found: dict[str, Any] = plain(answer)
+        return found
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each flat series: setting, measured and predicted level and noise with intervals, errors in per cent, inside."""
+        return frame([row.as_dict() for row in self.rows])
+
+    def plot(self, ax: Any = None, *, what: str | None = None) -> Any:
+        """Errors of the predictions in per cent with their 95 % intervals, row by row; returns the axes.
+
+        Args:
+            ax: matplotlib axes; None: of a new figure.
+            what: `level`, `noise` or `transmission`; None: the first of them that was compared.
+
+        Raises:
+            InputError: nothing of that kind was compared.
+        """
+        return plot_errors(self, ax=axes_or_new(ax), what=what)
+
+    def _table(self) -> Table:
+        rows = [
+            (
+                row.series,
+                str(row.setting),
+                f"{100.0 * (row.predicted_mean_DN.value / row.measured_mean_DN - 1.0):+.2f}",
+                f"{100.0 * (row.predicted_sd_DN.value / row.measured_sd_DN - 1.0):+.2f}",
+                f"{'yes' if row.inside_mean else 'NO'}/{'yes' if row.inside_sd else 'NO'}",
+            )
+            for row in self.rows
+        ]
+        title = f"{len(self.rows)} flats and {len(self.wedges)} steps of wedges against predictions"
+        notes = [f"skipped: {line}" for line in self.skipped]
+        if self.rows:
+            found = _summary(self.rows)
+            error, share = found["median_abs_error_percent"], found["coverage"]
+            notes.insert(
+                0,
+                f"median error: level {error['mean']:.2f} %, noise {error['sd']:.2f} %; inside the interval: level"
+                f" {100 * share['mean']:.0f} %, noise {100 * share['sd']:.0f} %",
+            )
+        return Table(
+            title=title,
+            header=("series", "setting", "level, %", "noise, %", "inside"),
+            rows=tuple(rows),
+            notes=tuple(notes),
+        )
 
 
 def _summary(rows: Sequence[ValidationRow]) -> dict[str, Any]:
@@ -224,6 +271,10 @@ def validate_twin(
         signal = total.mean_DN - dark
         mean = float(np.median(signal[good]))
         variance = float(np.mean(total.pair_variance_DN2[good]))
+        if not (mean > 0 and variance > 0):
+            nothing = "no signal above dark" if variance > 0 else "all frames alike: copies, or no noise"
+            skipped.append(f"{item.name}: {nothing}")
+            continue
         try:
             predicted = predict_flatfield(twin, setting, after_calibration=not seen)
         except InputError as error:
@@ -387,44 +438,61 @@ def plot_validation(result: Validation) -> "Figure":
     """Errors of predicted level, noise and transmission in per cent, with their 95 % intervals, row by row."""
     from matplotlib.figure import Figure
 
-    left_out = result.left_out or ()
-    groups: list[tuple[str, str, float, Estimate, str]] = []
-    for row in result.rows:
-        name = f"{row.setting.kV:g} kV {text_from_filters(row.setting.filters)}".strip()
-        name += f", {row.setting.exposure_ms:g} ms"
-        kind = "calibrated with" if row.used_in_calibration else "extrapolated" if row.extrapolated else "not seen"
-        groups.append((name, "level", row.measured_mean_DN, row.predicted_mean_DN, kind))
-        groups.append((name, "noise", row.measured_sd_DN, row.predicted_sd_DN, kind))
-    for row in left_out:
-        groups.append((row.series, "level", row.measured_mean_DN, row.predicted_mean_DN, "left out"))
-        groups.append((row.series, "noise", row.measured_sd_DN, row.predicted_sd_DN, "left out"))
-    for step in result.wedges:
-        kind = "calibrated with" if step.used_in_calibration else "not seen"
-        groups.append((f"{step.kV:g} kV {step.layers}", "transmission", step.measured, step.predicted, kind))
-    panels = [what for what in ("level", "noise", "transmission") if any(group[1] == what for group in groups)]
-    tallest = max(sum(group[1] == what for group in groups) for what in panels)
-    figure = Figure(figsize=(4.6 * len(panels), 1.2 + tallest * min(0.22, 12.0 / tallest)), layout="constrained")
-    for axes, what in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        mine = [group for group in groups if group[1] == what]
-        for position, (_, _, measured, predicted, kind) in enumerate(mine):
-            error, low, high = (
-                100.0 * (value / measured - 1.0) for value in (predicted.value, predicted.low, predicted.high)
-            )
-            axes.plot([low, high], [position, position], color=_COLOURS[kind], lw=1.5, solid_capstyle="butt")
-            axes.plot(error, position, "o", color=_COLOURS[kind], ms=4)
-        axes.axvline(0.0, color="#6b7280", lw=0.8)
-        every = math.ceil(len(mine) / 55)  # names of more rows would overlap
-        axes.set_yticks(range(0, len(mine), every), [group[0] for group in mine][::every], fontsize=7)
-        axes.invert_yaxis()
-        axes.set_xlabel(f"error of the {what} (%)")
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-        if what == panels[0]:
-            seen = dict.fromkeys(group[4] for group in groups)
+    groups = _compared(result)
+    tallest = max(len(mine) for mine in groups.values())
+    figure = Figure(figsize=(4.6 * len(groups), 1.2 + tallest * min(0.22, 12.0 / tallest)), layout="constrained")
+    for axes, what in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
+        plot_errors(result, ax=axes, what=what)
+        if what == next(iter(groups)):
+            seen = dict.fromkeys(kind for mine in groups.values() for _, _, _, kind in mine)
             for kind in seen:
                 axes.plot([], [], "o-", color=_COLOURS[kind], ms=4, lw=1.5, label=kind)
             figure.legend(loc="outside upper left", ncols=len(seen), frameon=False, fontsize=8)
     return figure
+
+
+def plot_errors(result: Validation, *, ax: Any, what: str | None = None) -> Any:
+    """Errors of one quantity in per cent on the axes given; see `Validation.plot`."""
+    groups = _compared(result)
+    if what is not None and what not in groups:
+        raise InputError("what", received=repr(what), expected="one of " + ", ".join(groups))
+    chosen = what or next(iter(groups))
+    mine = groups[chosen]
+    for position, (_, measured, predicted, kind) in enumerate(mine):
+        error, low, high = (
+            100.0 * (value / measured - 1.0) for value in (predicted.value, predicted.low, predicted.high)
+        )
+        ax.plot([low, high], [position, position], color=_COLOURS[kind], lw=1.5, solid_capstyle="butt")
+        ax.plot(error, position, "o", color=_COLOURS[kind], ms=4)
+    ax.axvline(0.0, color="#6b7280", lw=0.8)
+    every = math.ceil(len(mine) / 55)  # names of more rows would overlap
+    ax.set_yticks(range(0, len(mine), every), [name for name, _, _, _ in mine][::every], fontsize=7)
+    ax.invert_yaxis()
+    ax.set_xlabel(f"error of the {chosen} (%)")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
+def _compared(result: Validation) -> dict[str, list[tuple[str, float, Estimate, str]]]:
+    """Quantity -> (name, measured, predicted, kind) of each row that has it."""
+    groups: dict[str, list[tuple[str, float, Estimate, str]]] = {}
+
+    def add(what: str, name: str, measured: float, predicted: Estimate, kind: str) -> None:
+        groups.setdefault(what, []).append((name, measured, predicted, kind))
+
+    for row in result.rows:
+        name = f"{row.setting.kV:g} kV {text_from_filters(row.setting.filters)}".strip()
+        name += f", {row.setting.exposure_ms:g} ms"
+        kind = "calibrated with" if row.used_in_calibration else "extrapolated" if row.extrapolated else "not seen"
+        add("level", name, row.measured_mean_DN, row.predicted_mean_DN, kind)
+        add("noise", name, row.measured_sd_DN, row.predicted_sd_DN, kind)
+    for row in result.left_out or ():
+        add("level", row.series, row.measured_mean_DN, row.predicted_mean_DN, "left out")
+        add("noise", row.series, row.measured_sd_DN, row.predicted_sd_DN, "left out")
+    for step in result.wedges:
+        kind = "calibrated with" if step.used_in_calibration else "not seen"
+        add("transmission", f"{step.kV:g} kV {step.layers}", step.measured, step.predicted, kind)
+    return groups
 
 
 def _widened(estimate: Estimate, sd: float) -> Estimate:

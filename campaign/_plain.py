@@ -2,27 +2,12 @@
 
 import hashlib
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from ..results import plain
 
-
-def plain(value: Any) -> Any:
-    """Numpy values as JSON's own; NaN and infinities become null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+__all__ = ["canonical", "digest", "plain", "read_object"]
 
 
 def canonical(value: Any) -> bytes:

@@ -77,7 +77,7 @@ def check_frozen_code(folder: Path) -> None:
         RaytwinError: it cannot; the message has Python's last line.
     """
     code = (
-        "import raytwin.diagnosis.diagnose, raytwin.lab.protocols, raytwin.campaign.blind_judge as judge;"
+        "import raytwin.diagnosis.diagnose_session, raytwin.lab.protocols, raytwin.campaign.blind_judge as judge;"
         "print(judge.__file__)"
     )
     path = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH", ""))))

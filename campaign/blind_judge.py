@@ -71,7 +71,7 @@ def judge_session(
     from ..diagnosis.answer import diagnosis_answer
     from ..diagnosis.assemble import build_problem
     from ..diagnosis.changes import catalogue_variants
-    from ..diagnosis.diagnose import diagnose
+    from ..diagnosis.diagnose_session import diagnose
     from ..diagnosis.preparation import calibrated_twin
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
@@ -85,7 +85,7 @@ def judge_session(
             problem = build_problem(acquisition, calibrated_twin(acquisition, rng=rng), variants=catalogue_variants())
         else:
             found = diagnose(acquisition, rng=rng, without=without)
-            problem = found.problem
+            problem = found.compared
             result["answer"] = diagnosis_answer(found, inputs={"seed": _SEED})
         result["seconds"] = time.perf_counter() - start
         result["peak_memory_MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -174,6 +174,8 @@ def _measured_line(chain: _Chain, plan: DemoPlan) -> dict[str, Any]:
     """The line that is measured, its twin, and how well that predicts flats."""
     at = chain.path
     size = ["--size", f"{plan.size[0]}x{plan.size[1]}", "--pixel-mm", f"{plan.pixel_mm:g}", "--seed", str(plan.seed)]
+    # the main job end to end, on a line without surprises
+    size += ["--family", "none", "--no-unkindness"]
     if plan.source_detector_mm is not None:
         size += ["--source-detector-mm", f"{plan.source_detector_mm:g}"]
     bones = [] if plan.bones_mm is None else ["--bones-mm", ",".join(f"{length:g}" for length in plan.bones_mm)]

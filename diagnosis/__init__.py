@@ -5,10 +5,11 @@ from typing import Any
 
 _PLACES = {
     "Diagnosis": "answer",
-    "diagnose": "diagnose",
+    "diagnose": "diagnose_session",
     "diagnosis_answer": "answer",
     "build_problem": "assemble",
     "summarise_series": "summaries",
+    "plan_session": "plan_session",
     "weigh_hypotheses": "inference",
 }
 

@@ -1,17 +1,22 @@
 """The answer of a diagnosis, and its form as a file."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
+from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.twin import Twin
+from ..results import Result, Table, axes_or_new, frame, plain
 from .assemble import Problem
 from .coarse import UNSEEN, parameters_in_pixels, pixels_in_square
 from .held_out import Gap
 from .inference import Hypothesis
 from .known_effects import with_found
 from .readings import Suspect
+
+if TYPE_CHECKING:
+    import pandas
 
 VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
 
@@ -42,14 +47,15 @@ class Place:
     z: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Diagnosis:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Diagnosis(Result):
     """The answer; `named` are the effects of the leading hypothesis, `twin` is the twin with them added.
 
     notes: how the session was looked at, where that limits the answer. strained: nuisances that what is left pulls beyond
     STRAINED_FROM of their standard deviations, and how far, the farthest first.
     mislabelled: series whose labels look wrong; no effect is named then. not_tested: effects that these series could not
-    show, each with the reason.
+    show, each with the reason. problem: what was compared, for reports; it takes no part in equality and is not pickled.
+    inputs: hashes, version and seed; task: POD before and after, where that was asked for.
     """
 
     verdict: str
@@ -67,12 +73,102 @@ class Diagnosis:
     twin: Twin
     added: tuple[AppliedEffect, ...]
     named: tuple[str, ...]
-    problem: Problem = field(repr=False)
+    problem: Problem | None = field(compare=False)
     warnings: tuple[str, ...] = ()
     mislabelled: tuple[Suspect, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     strained: tuple[tuple[str, float], ...] = ()
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+    task: Mapping[str, Any] | None = None
+
+    @property
+    def compared(self) -> Problem:
+        """What was compared.
+
+        Raises:
+            InputError: the diagnosis was read from a pickle, which leaves it out.
+        """
+        if self.problem is None:
+            raise InputError(
+                "diagnosis",
+                received="one from a pickle, without the series it compared",
+                expected="one that was made in this process",
+                remedy="diagnose the session again for its report",
+            )
+        return self.problem
+
+    def __reduce__(self) -> tuple[Any, tuple[dict[str, Any]]]:
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return _diagnosis_from_fields, ({**values, "problem": None},)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin diagnose --json` prints, the contents of diagnosis.json."""
+        found: dict[str, Any] = plain(diagnosis_answer(self))
+        return found
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row a cause, most probable first: effect, probability, strength with interval and unit, since, shrinks_by."""
+        names = ("effect", "probability", "strength", "since", "shrinks_by")
+        return frame([{name: cause[name] for name in names} for cause in self.to_dict()["causes"]], columns=names)
+
+    def plot_gap(self, ax: Any = None) -> Any:
+        """The gap on held-out probes before and after, by axis, with the floor of measured against measured; returns the axes."""
+        return plot_gap(self, ax=axes_or_new(ax))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Probability of every hypothesis that was weighed, the most probable first; returns the axes."""
+        return plot_probabilities(self, ax=axes_or_new(ax))
+
+    def _table(self) -> Table:
+        rows = [
+            (
+                cause.effect,
+                f"{cause.probability:.2f}",
+                f"{cause.strength[0]:.3g} ({cause.strength[1]:.3g} to {cause.strength[2]:.3g}) {cause.unit}".rstrip(),
+                cause.since,
+            )
+            for cause in self.causes
+        ]
+        notes = [
+            f"probability of no gap {self.probability_no_gap:.2f}, of an unknown effect {self.probability_unknown:.2f}"
+        ]
+        if self.next_measurement is not None and self.next_measurement.get("text"):
+            notes.append(f"next: {self.next_measurement['text']}")
+        notes += [f"note: {text}" for text in (*self.warnings, *self.notes)]
+        gap = self.gap
+        title = f"{self.verdict}: gap {gap.before:.3g} before, {gap.after:.3g} after, floor {gap.floor:.3g}"
+        header = ("effect", "probability", "strength (95 %)", "since") if rows else ()
+        return Table(title=title, header=header, rows=tuple(rows), notes=tuple(notes))
+
+
+def _diagnosis_from_fields(values: dict[str, Any]) -> Diagnosis:
+    return Diagnosis(**values)
+
+
+def plot_gap(diagnosis: Diagnosis, *, ax: Any) -> Any:
+    """See `Diagnosis.plot_gap`."""
+    rows = [("all", diagnosis.gap.before, diagnosis.gap.after, diagnosis.gap.floor), *diagnosis.held_out]
+    for place, (_, before, after, floor) in enumerate(rows):
+        first = place == 0
+        ax.barh(place - 0.18, before, height=0.34, color="#9aa5b1", label="before" if first else None)
+        ax.barh(place + 0.18, after, height=0.34, color="#1f5fa8", label="after" if first else None)
+        ax.plot([floor] * 2, [place - 0.4, place + 0.4], color="#d9822b", lw=2, label="floor" if first else None)
+    ax.set_yticks(range(len(rows)), [name for name, _, _, _ in rows])
+    ax.invert_yaxis()
+    ax.set_xlabel("gap on held-out probes (1 = nothing but noise)")
+    ax.legend(frameon=False)
+    return ax
+
+
+def plot_probabilities(diagnosis: Diagnosis, *, ax: Any, most: int = 12) -> Any:
+    """See `Diagnosis.plot`."""
+    shown = sorted(diagnosis.hypotheses, key=lambda item: -item.probability)[:most]
+    ax.barh(range(len(shown)), [item.probability for item in shown], color="#1f5fa8")
+    ax.set_yticks(range(len(shown)), [" + ".join(item.effects) or "no gap" for item in shown])
+    ax.invert_yaxis()
+    ax.set(xlabel="probability", xlim=(0, 1))
+    return ax
 
 
 def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
@@ -118,8 +214,8 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
     )
 
 
-def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """`diagnosis.json`, the form of the interfaces page."""
+def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The contents of `diagnosis.json`; inputs: in place of the diagnosis' own."""
 
     def interval(value: tuple[float, float, float] | None) -> dict[str, float] | None:
         return None if value is None else {"value": value[0], "low": value[1], "high": value[2]}
@@ -185,7 +281,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any]) -> dict
         "not_tested": [{"effect": effect, "reason": reason} for effect, reason in diagnosis.not_tested.items()],
         "strained": [{"nuisance": name, "sd": value} for name, value in diagnosis.strained],
         "mislabelled": [{"series": list(item.series), "text": item.text} for item in diagnosis.mislabelled],
-        "task": None,
+        "task": None if diagnosis.task is None else dict(diagnosis.task),
         "warnings": [*diagnosis.warnings, *diagnosis.notes],
-        "inputs": dict(inputs),
+        "inputs": dict(diagnosis.inputs if inputs is None else inputs),
     }

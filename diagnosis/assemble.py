@@ -16,13 +16,14 @@ from ..generator.series import ExpectedSeries, beam_conditions, expected_series,
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, spectral_sds, twin_changes, with_pauses
+from .changes import Variant, smooth_twin, spectral_sds, tails_always_there, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
 from .forward_model import Change, ForwardModel, draft_cache, strength_rows
 from .known_effects import lasting
 from .known_laws import beside_known, without_each
+from .line_noise import usual_line_noise
 from .model_scalars import expected_scalars
 from .nuisance_columns import Columns
 from .placing import place_scenes
@@ -189,6 +190,10 @@ def build_problem(
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
     steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
     changes += [Change.of_twin(step) for step in steps_taken]
+    changes += [
+        replace(model.change(variant, variant.strengths[0]), label=variant.name)
+        for variant in tails_always_there(side=side)
+    ]
     changes += without_each(model.base)
     unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
     compared = _Compared(
@@ -242,15 +247,21 @@ def _measured(
     known_good = twin.maps.bad_pixels == 0
     seen = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
     maps = calibrated_maps(seen.kept, seen.expected, seen.looks, twin=twin, good=known_good)
-    outlying = new_outliers(seen.kept, seen.expected, seen.looks, maps)
-    clean = maps.good & ~outlying
+    standing_out = new_outliers(seen.kept, seen.expected, seen.looks, maps)
+    outlying = standing_out.bad
+    clean = maps.good & ~standing_out.any
     # they count as outliers; what else is said of noise is said without them
     summaries = summarise_all(seen, clean, tell=tell)
+    lines_DN2 = usual_line_noise(seen.kept, seen.expected, summaries, clean)
+    summaries = {
+        item.name: summaries[item.name].without_lines(*(one / item.request.exposures_per_frame for one in lines_DN2))
+        for item in seen.kept
+    }
     tell("registration")
     pictures = {item.name: maps.corrected(item, seen.looks[item.name].mean_DN) for item in seen.kept}
     placed = place_scenes(seen.kept, seen.expected, pictures, clean=clean, sharp=model.sharp, expect=model.expect)
     return _Measured(
-        expected=session_model(model, maps, placed, seen, summaries, clean),
+        expected=session_model(model, maps, placed, seen, summaries, clean, lines_DN2=lines_DN2),
         pictures=pictures,
         summaries=summaries,
         memory={

@@ -96,7 +96,6 @@ KEPT_AS_THEY_ARE = frozenset(("output_drift",))
 _BOTH_ONSETS = frozenset(
     (
         "veiling_glare",
-        "mtf_tail",
         "k_fluorescence",
         "image_lag",
         "nonlinearity",
@@ -113,7 +112,7 @@ THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
 ATTENUATION_SD = 0.015  # of a material's attenuation: tables differ by 1-4 %
 ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube voltage
 LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
-OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over what departures are found to be beyond the usual
+OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over each further prior sd of the largest departure
 LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
 GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
 GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
@@ -129,11 +128,22 @@ EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
 EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again those at one distance
 ROUGH_FIELDS = 24
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
+# of a tail that was always there, which calibration takes for a part of the spread: screens have up to 20 % of their light there
+TAIL_SD_PERCENT = 10.0
+TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
-READ_NOISE_SD = 0.005
+READ_NOISE_SD = 0.01  # rows and columns of a tenth each add 2 % to the variance, and calibration may leave them out
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
 TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
-TILT_SD = 0.0005  # of the field's gradient between series
+# always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
+SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape in a series
+SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as likely as the one of half its number
+LINE_NOISE_LIMIT = 0.1  # rms of row and of column offsets over the read noise
+OUTPUT_STEP_LIMIT = 0.0005 / math.sqrt(
+    8.0
+)  # rms of an output with 1/f noise of 0.05 % over 16 octaves: two octaves of it
+DUST_LIMIT = 0.01  # of the light: a pixel that differs less from its neighbours is no bad one (ASTM E2597)
+FEW_BAD_PIXELS, FEW_BAD_SHARE = 2, 2e-4  # pixels that turn bad in a session: two, or that share of a large panel's
 # of level and gradient where frames were divided by an open field of another time: output, kV, filters and heel may differ
 DIVIDED_LEVEL_SD, DIVIDED_TILT_SD = 0.3, 0.1
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
@@ -142,7 +152,7 @@ UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one
 CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
 PATTERN_WAVES = 8  # cosine waves along each side of a gain map's smooth change, the long ones the larger
 PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
-DARK_SD_DN = 0.05  # of the dark between series
+DARK_SD_DN = 0.25  # of the dark between series: half of the limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -312,35 +322,33 @@ def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
     """Standard deviations (parameter,) that spectral parameters are taken to have before a session is seen.
 
     They are those that calibration started from, not its posterior's: the calibrating series are among the probes and say again
-    what they know. Departures from tables and models are as large as calibration has found them to be (`departures_found`).
+    what they know.
     """
-    grown = departures_found(posterior)
     result = []
     for name in posterior.names:
-        sd = PRIORS.get(name, ATTENUATION_SCALE).sd
+        sd = PRIORS.get(name, ATTENUATION_SCALE).spread
         if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
             sd = UNDECLARED_SCINTILLATOR.sd
         if name in ("log_output", "log_DN_per_keV"):
             # fixed by the level within percents; a wide prior would only leave the linear range
             sd = 0.03
-        result.append(grown * sd if name.startswith(DEPARTURES) else sd)
+        result.append(sd)
     return np.array(result)
 
 
 def departures_found(posterior: SpectralPosterior | None) -> float:
-    """How many times larger than usual a line's departures from tables and models are by its calibration; 1 at the least.
+    """How many prior standard deviations a line's largest departure from tables and models is by its calibration; 1 at the least.
 
-    Calibration learns one factor for all of them; the one of which flats tell least keeps nearly all of it. In 38 sessions of the
-    lab it was 0.4 to 1, in twelve of fourteen with other programs' spectra, responses and cross sections 1.2 to 4.2.
+    What lies that far out by one parameter is likely to have more beside it that no parameter describes.
     """
     if posterior is None:
         return 1.0
-    spread = posterior.samples.std(axis=0)
-    found = [
-        float(sd) / PRIORS.get(name, ATTENUATION_SCALE).sd
-        for name, sd in zip(posterior.names, spread, strict=True)
-        if name.startswith(DEPARTURES)
-    ]
+    means = posterior.samples.mean(axis=0)
+    found = []
+    for name, mean in zip(posterior.names, means, strict=True):
+        if name.startswith(DEPARTURES):
+            prior = PRIORS.get(name, ATTENUATION_SCALE)
+            found.append(abs(float(mean) - prior.centre) / prior.sd)
     return max([1.0, *found])
 
 
@@ -402,6 +410,15 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             step_sd=1.0,
         )
     )
+    return result
+
+
+def tails_always_there(*, side: int = 1) -> list[Variant]:
+    """Tails of the spread that are no effect, at one prior standard deviation: short and long ones, always there."""
+    result = []
+    for variant in variants_of(EFFECTS["mtf_tail"], side=side):
+        name = f"tail of the spread, {variant.name}"
+        result.append(replace(variant, name=name, since="always", strengths=(TAIL_SD_PERCENT,)))
     return result
 
 

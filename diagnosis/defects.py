@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..generator.series import ExpectedSeries
 from .calibrated_maps import CalibratedMaps
+from .changes import DUST_LIMIT
 from .even_maps import full_size, signal_map
 from .fixed_pattern import smooth_part
 from .session import SessionSeries
@@ -19,13 +21,21 @@ _LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their ser
 _MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandingOut:
+    """Pixels (row, column) in use that stand out: `bad` ones, and `any`, with those that dust would explain (1 % of the light)."""
+
+    bad: NDArray[np.bool_]
+    any: NDArray[np.bool_]
+
+
 def new_outliers(
     kept: Sequence[SessionSeries],
     expected: Mapping[str, ExpectedSeries],
     looks: Mapping[str, FirstLook],
     maps: CalibratedMaps,
-) -> NDArray[np.bool_]:
-    """Pixels in use (row, column) that stand out in any dark or flat, or in all objects where no later dark or flat shows them.
+) -> StandingOut:
+    """Pixels in use that stand out in any dark or flat, or in all objects where no later dark or flat shows them.
 
     Args:
         kept: series that can be compared.
@@ -34,7 +44,7 @@ def new_outliers(
         maps: dark and gain map of the calibrating series.
     """
     good, shape = maps.good, maps.good.shape
-    outlying = np.zeros(shape, dtype=bool)
+    outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     for item in kept:
         if item.series.kind not in ("dark", "flat"):
             continue
@@ -46,7 +56,12 @@ def new_outliers(
         residual = residual - smooth_part(residual, good)
         centre = float(np.median(residual[good]))
         spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
-        outlying |= np.abs(residual - centre) > _OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
+        departs = np.abs(residual - centre)
+        out = departs > _OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
+        if item.series.kind == "flat":
+            dusty |= out
+            out &= departs > DUST_LIMIT * signal_map(expected[item.name], shape)
+        outlying |= out
         if look.frames > 9:
             ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), LEAST_NOISE_DN2)
             limit = max(_largest_ratio(look.frames), 2.5)
@@ -54,9 +69,12 @@ def new_outliers(
                 outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good
     if not any(item.series.kind in ("dark", "flat") and not item.calibrates for item in kept):
         outlying |= _out_in_every_object(kept, expected, looks, maps)
-    outlying &= good
     # a detector full of outliers is a pattern, not a set of defects
-    return outlying if outlying.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
+    bad, all_of_them = (
+        found if found.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
+        for found in (outlying & good, (outlying | dusty) & good)
+    )
+    return StandingOut(bad=bad, any=all_of_them | bad)
 
 
 def _out_in_every_object(

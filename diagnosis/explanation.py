@@ -64,7 +64,7 @@ def _family_text(axis: str, kind: str, scene: str) -> str:
 
 def _signature_text(diagnosis: Diagnosis) -> str:
     """Where an effect outside the catalogue is seen most, and its largest departures, one a kind of series and axis."""
-    series = {view.session.name: view.session.series for view in diagnosis.problem.views}
+    series = {view.session.name: view.session.series for view in diagnosis.compared.views}
     largest: dict[str, float] = {}
     for place in diagnosis.where:
         # objects of all scenes together: a signature is not one product's
@@ -93,7 +93,7 @@ def _where_text(places: Sequence[Place]) -> str:
 def compared_text(diagnosis: Diagnosis) -> str:
     """What was compared, what was left out, and what these series could not show."""
     kinds: dict[str, int] = {}
-    for view in diagnosis.problem.views:
+    for view in diagnosis.compared.views:
         kinds[view.session.series.kind] = kinds.get(view.session.series.kind, 0) + 1
     told = ", ".join(f"{number} of kind {kind}" for kind, number in kinds.items())
     text = f"{sum(kinds.values())} series were compared ({told})"

@@ -62,7 +62,7 @@ def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.
 
 def plot_gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, count: int = 4) -> bytes:
     """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after, the series with most gap."""
-    views = diagnosis.problem.views
+    views = diagnosis.compared.views
     chosen = _worst_views(diagnosis, count)
     figure, axes = _figure(3.1 * len(chosen) + 0.8, 6.0, 2, len(chosen))
     image = None
@@ -85,7 +85,7 @@ def plot_gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *
 
 
 def _worst_views(diagnosis: Diagnosis, count: int) -> list[int]:
-    problem = diagnosis.problem
+    problem = diagnosis.compared
     power = np.zeros(len(problem.views))
     is_map = np.array([name.statistic == "mean frame" for name in problem.names])
     for index in range(len(problem.views)):
@@ -110,7 +110,7 @@ def plot_transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.fl
     figure, grid = _figure(9.0, 3.6, 1, 2, sharey=True)
     axes = grid[0]
     colours: dict[str, str] = {}  # of a sort of scene
-    for index, view in enumerate(diagnosis.problem.views):
+    for index, view in enumerate(diagnosis.compared.views):
         if view.session.series.kind != "object":
             continue
         open_DN = float(view.signal_DN.max())
@@ -169,7 +169,7 @@ def plot_places(diagnosis: Diagnosis) -> bytes:
     """Every probe's z over the series in time order, coloured by axis, with the threshold of chance."""
     from .local_nuisances import LocalNuisances
 
-    problem = diagnosis.problem
+    problem = diagnosis.compared
     z = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)
     figure, grid = _figure(9.0, 4.4)
     axis = grid[0, 0]

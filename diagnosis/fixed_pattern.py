@@ -169,14 +169,18 @@ def count_outliers(
     *,
     clean: NDArray[np.bool_],
     good: NDArray[np.bool_],
+    least_DN: NDArray[np.float64] | None = None,
 ) -> int:
     """Good pixels of a residual map (row, column) that stand out of noise (variance, DN^2), pattern and the clean ones around.
 
-    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much.
+    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much. least_DN (row,
+    column): departures below it make no bad pixel, such as dust on a flat.
     """
     level = residual - smooth_part(residual, clean)
     limit = OUTLIER_SD * np.sqrt(variance)
     limit = limit * max(1.0, math.sqrt(pixel_DN2 / max(float(np.mean(variance[clean])), 1e-30)))
+    if least_DN is not None:
+        limit = np.maximum(limit, least_DN)
     out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
     if not out.any():
         return 0

@@ -170,7 +170,7 @@ class ForwardModel:
 
     @property
     def beams_differ(self) -> float:
-        """How many times more than usual beams may differ from the spectral model: 1 unless calibration found departures."""
+        """How many times more than usual beams may differ from the spectral model: 1 unless calibration found large departures."""
         return 1.0 + OF_BEAMS_GROWS * (departures_found(self.base.spectral) - 1.0)
 
     def change(self, variant: Variant, strength: float) -> Change:

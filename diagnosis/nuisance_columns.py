@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from . import changes as scales
 from .even_maps import Map
-from .noise_correlation import correlation_sum
+from .noise_correlation import autocovariance, correlation_sum
 from .point_maps import blurred_between_points, sampled_at_points
+from .probes import OUTLIERS, OUTLIERS_ANYWHERE
 from .registration import CELL_SD_PX, gradient
 from .responses import Moved, SessionModel
 from .series_probes import SeriesProbes
@@ -51,8 +52,10 @@ def local_nuisances(
     if item.request.beam_on:
         columns |= _of_beam(probes, beams_differ)
         images |= _of_field(item, signal, beams_differ)
-    else:
+    if item.series.kind != "flat":  # against a flat's light it is nothing
         images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
+    if not item.calibrates:
+        columns["few new bad pixels"] = _few_bad_pixels(probes)
     if item.series.kind == "object":
         dy, dx = gradient(signal)
         columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
@@ -92,6 +95,9 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
         f"gain of {_beam(item)}": probes.of_scalars(
             lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
         ),
+        "output from frame to frame": probes.of_scalars(
+            lambda probe: _of_steps(probes, probe.name) if probe.name == "frame_factor" else 0.0
+        ),
         # by their electronics (noise as the gain's square) or by the light that they catch (as the gain)
         "noise of bright pixels": probes.of_scalars(
             lambda probe: (
@@ -99,12 +105,31 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
             )
         ),
     }
+    columns["widths of the spread"] = _two_widths(probes)
     for lag in LAGS:
         # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
         texture = _texture(probes, lag)
         columns[f"texture {lag}"] = texture
         columns[f"texture {lag} at {_voltage(item)}"] = scales.TEXTURE_OF_BEAM_SHARE * texture
     return columns
+
+
+def _two_widths(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Correlations under a spread that is wider along one axis by TWO_WIDTHS_SD, and as much narrower along the other.
+
+    Of a Gaussian rho = exp(-d^2 / 4 s^2), so d rho / d ln s = -2 rho ln rho at each lag.
+    """
+    expected = probes.series.expected
+    change: dict[str, float] = {}
+    for down, across in LAGS:
+        by_row, by_column = (max(autocovariance(expected, *lag), 1e-6) for lag in ((down, 0), (0, across)))
+        wider = -2.0 * by_row * by_column * (math.log(by_row) - math.log(by_column))
+        change[f"({down},{across})"] = 0.5 * scales.TWO_WIDTHS_SD * wider
+
+    def of(name: str) -> float:
+        return change[name.rsplit(" ", 1)[-1]] if name.startswith("correlation") else 0.0
+
+    return probes.of_scalars(lambda probe: of(probe.name))
 
 
 def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
@@ -122,14 +147,46 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
         level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
-        f"tilt x of {item.name}": scales.TILT_SD * x * signal,
-        f"tilt y of {item.name}": scales.TILT_SD * y * signal,
     }
+    for number, shape in enumerate(_shapes(signal.shape)):
+        images[f"shape {number} of {item.name}"] = shape * signal
     if item.divided:
         images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
         images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal
         images[f"open field of {item.name}, y"] = scales.DIVIDED_TILT_SD * y * signal
     return images
+
+
+@lru_cache(maxsize=2)
+def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
+    """Smooth changes (row, column) of the open field, relative: products of Legendre polynomials, SHAPE_SD rms in all.
+
+    Standard deviations fall as one over the order.
+    """
+    from numpy.polynomial.legendre import legval
+
+    y, x = (np.linspace(-1.0, 1.0, length) for length in size)
+    numbers = [(i, k) for i in range(scales.SHAPE_ORDER + 1) for k in range(scales.SHAPE_ORDER + 1 - i) if i or k]
+    total = math.sqrt(sum(1.0 / (i + k) ** 2 for i, k in numbers))
+    result = []
+    for i, k in numbers:
+        shape = np.outer(legval(y, np.eye(i + 1)[i]), legval(x, np.eye(k + 1)[k]))
+        result.append(scales.SHAPE_SD / (i + k) / total / float(np.sqrt(np.mean(shape**2))) * shape)
+    return tuple(result)
+
+
+def _of_steps(probes: SeriesProbes, name: str) -> float:
+    """What the largest output noise that is no effect adds to the logarithm of the variance of steps from frame to frame."""
+    own = math.exp(probes.series.scalars[name])
+    jitter = (scales.OUTPUT_STEP_LIMIT * probes.series.context.reference_signal_DN) ** 2
+    return math.log1p(jitter / own)
+
+
+def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Half of the few pixels that may turn bad without that being an effect, as counts of outliers show them."""
+    few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
+    more = math.sqrt(few + 0.375) - math.sqrt(0.375)
+    return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
 
 
 def level_of(item: SessionSeries) -> str:

@@ -25,8 +25,8 @@ FLOORS: Mapping[str, float] = {
     "temporal_correlation": 0.002,
     "kurtosis": 0.02,
     "frame_factor": 0.15,
-    "trend": 0.0001,
-    "dark_trend_DN": 0.02,
+    "trend": 0.0002,  # two of the 16 octaves of an output with 1/f noise of 0.05 %
+    "dark_trend_DN": 0.09,  # two of the 16 octaves of a dark with 1/f noise of 0.25 DN
     "afterglow": 2e-5,
     "codes": 0.03,
     "fixed_pattern": 0.025,  # of the value, as for its blocks

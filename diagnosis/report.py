@@ -25,7 +25,7 @@ _VERDICTS = {
 
 def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
     """Residual maps of each series with the leading hypothesis' effects added, DN."""
-    problem = diagnosis.problem
+    problem = diagnosis.compared
     if not diagnosis.added:
         return [view.residual_DN for view in problem.views]
     changes = map_changes(problem, diagnosis.added)
@@ -88,9 +88,9 @@ def write_report(diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *,
         notes=diagnosis.notes,
         strained=strained_text(diagnosis),
         skipped=diagnosis.warnings[len(diagnosis.mislabelled) :],
-        probes=len(diagnosis.problem.residual),
-        nuisances=len(diagnosis.problem.factor_names),
-        series=len(diagnosis.problem.views),
+        probes=len(diagnosis.compared.residual),
+        nuisances=len(diagnosis.compared.factor_names),
+        series=len(diagnosis.compared.views),
         next_measurement=diagnosis.next_measurement,
         inputs=answer["inputs"],
         figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},

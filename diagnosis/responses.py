@@ -90,13 +90,23 @@ class SessionModel:
     """A session's series under changes of the forward model.
 
     Fields: model; maps: dark and gain map of the calibrating series; series, in order of time; signals_DN: mean expected signal over
-    pixels that do not stand out, by name.
+    pixels that do not stand out, by name; lines_DN2: variance of rows and of columns from exposure to exposure, DN^2, that is no
+    effect.
     """
 
     model: ForwardModel
     maps: CalibratedMaps
     series: tuple[SeriesModel, ...]
     signals_DN: Mapping[str, float]
+    lines_DN2: tuple[float, float] = (0.0, 0.0)
+
+    def usual_lines(self, item: SessionSeries) -> tuple[float, float]:
+        """Variance of rows and columns, DN^2, that a series' corrected mean frame has from noise of lines which is no effect."""
+        shares = 1.0 / (item.request.frames * item.request.exposures_per_frame)
+        if not item.calibrates:
+            weights = self.maps.darks.weights_under(item)
+            shares += sum(weight**2 / self.maps.darks.frames[name] for name, weight in weights.items())
+        return self.lines_DN2[0] * shares, self.lines_DN2[1] * shares
 
     def ask(self, change: Change, *, refused: str = "") -> Asked:
         """A change with what it does to the calibrating series; refused: why it is not to be asked."""
@@ -209,6 +219,8 @@ def session_model(
     seen: SeenSeries,
     summaries: Mapping[str, SeriesSummary],
     clean: NDArray[np.bool_],
+    *,
+    lines_DN2: tuple[float, float] = (0.0, 0.0),
 ) -> SessionModel:
     """The session's series as the base twin expects them, with what their scalar probes refer to.
 
@@ -219,6 +231,7 @@ def session_model(
         seen: noise labels.
         summaries: what the frames' noise says, by name of series.
         clean: pixels in use that do not stand out (row, column).
+        lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
     """
     signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
     lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
@@ -254,7 +267,7 @@ def session_model(
         )
         if item.request.beam_on:
             before = signals_DN[item.name]
-    return SessionModel(model=model, maps=maps, series=tuple(series), signals_DN=signals_DN)
+    return SessionModel(model=model, maps=maps, series=tuple(series), signals_DN=signals_DN, lines_DN2=lines_DN2)
 
 
 def _context(

@@ -1,6 +1,5 @@
 """How one series is turned into standardised numbers: what its mean frame is projected on, and its scalar probes."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -218,7 +217,10 @@ def series_probes(
         lit = frame.signal_DN if kind == "flat" else None
         pattern = pattern_statistics(frame.residual_DN, lit, clean=clean, good=good)
         noise = frame.quantum_DN2 + frame.white_DN2
-        outliers = count_outliers(frame.residual_DN, noise, pattern.pixel_DN2, clean=clean, good=good)
+        least_DN = scales.DUST_LIMIT * frame.signal_DN if kind == "flat" else None
+        outliers = count_outliers(
+            frame.residual_DN, noise, pattern.pixel_DN2, clean=clean, good=good, least_DN=least_DN
+        )
     scalars = measured_scalars(
         summary,
         one.expected,
@@ -232,15 +234,17 @@ def series_probes(
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:
         scalars += displacement_probes(one.placement)
-    floored = 1.0 / math.hypot(1.0, scales.SHARPNESS_FLOOR)
+    # noise of lines that is no effect stands in the mean frame as well
+    beyond = np.asarray(session.usual_lines(one.session)) @ projection.line_noise()
     at_edges = [
         kind == "object" and name.axis == "sharpness" and name.statistic == "mean frame" for name in projection.names()
     ]
+    floors = scales.SHARPNESS_FLOOR * np.array(at_edges, dtype=np.float64)
     return SeriesProbes(
         series=one,
         projection=projection,
         scalars=tuple(scalars),
-        shrink=np.array([floored if edge else 1.0 for edge in at_edges] + [1.0] * len(scalars)),
+        shrink=np.concatenate([1.0 / np.sqrt(1.0 + floors**2 + beyond), np.ones(len(scalars))]),
     )
 
 

@@ -6,7 +6,7 @@ kept beside it. Noise is judged from differences of successive frames, so that s
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,23 @@ class SeriesSummary:
     code_range: int
     highest_DN: float
     saturated_share: float
+
+    def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
+        """What the frames would say without offsets of rows and columns of these variances (DN^2), new in every frame.
+
+        The variance of pixels keeps them: calibration counts them as read noise.
+        """
+        covariance = self.label_autocovariance_DN2.copy()
+        for index, (down, across) in enumerate(LAGS):
+            covariance[:, index] -= (rows_DN2 if down == 0 else 0.0) + (columns_DN2 if across == 0 else 0.0)
+        rows, columns = self.mean_DN.shape
+        return replace(
+            self,
+            label_autocovariance_DN2=covariance,
+            row_variance_DN2=max(self.row_variance_DN2 - rows_DN2 * (1.0 - 1.0 / columns), 0.0),
+            column_variance_DN2=max(self.column_variance_DN2 - columns_DN2 * (1.0 - 1.0 / rows), 0.0),
+            block_variance_DN2=max(self.block_variance_DN2 - (rows_DN2 + columns_DN2) / BLOCK_PX, 0.0),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,8 +269,9 @@ def summarise_series(
                 product = np.einsum("nrc,nrc->rc", d[(slice(None), *first)], d[(slice(None), *second)])
                 for label, mask in enumerate(selected):
                     label_covariance[label, index] += float(product[mask].sum()) / 2.0
-            row_sum += float(np.mean((d.sum(axis=2) / row_count) ** 2)) / 2.0 * len(d)
-            column_sum += float(np.mean((d.sum(axis=1) / column_count) ** 2)) / 2.0 * len(d)
+            # each line counts as it has pixels: of a dead one few are left, whose mean is as noisy as a pixel
+            row_sum += float(np.mean(d.sum(axis=2) ** 2 / row_count)) / shape[1] / 2.0 * len(d)
+            column_sum += float(np.mean(d.sum(axis=1) ** 2 / column_count)) / shape[0] / 2.0 * len(d)
             block = _block_means(d, good, blocks)
             block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
         if len(x) > 3:

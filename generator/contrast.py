@@ -33,12 +33,13 @@ from ..spectra import (
     tube_fluence_interpolated,
 )
 from .binning import refuse_binning
-from .predict import predict_flatfield
+from .predict import predict_flatfield, spectrum_outside
 from .present_line import present_line
 from .psf import PSF_MODELS, Spread
 from .spectral_signal import OpenBeam
+from .tube_twin import TubeTwin
 from .twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
-from .twin_spectrum import spectral_model_of, white_gain_DN
+from .twin_spectrum import model_of_posterior, spectral_model_of, white_gain_DN
 
 FloatArray = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class UncalibratedLine:
     Fields: anode, anode_angle_deg, model (SpekPy's); inherent (layers of the tube); scintillator, cover, counting;
     swank (Swank factor of the light, 0 to 1]; output_scale (tube output over SpekPy's); source_detector_mm, pixel_mm;
     psf_model, psf_sigma_px (optical spread); read_noise_keV (electronic noise of one frame as energy absorbed, keV;
-    counts where the detector counts).
+    counts where the detector counts); tube: a calibrated one, in place of anode, angle, model, inherent and output_scale.
     """
 
     anode: str = DEFAULT_ANODE
@@ -74,6 +75,7 @@ class UncalibratedLine:
     psf_model: str = "aperture"
     psf_sigma_px: float = 0.5
     read_noise_keV: float = 0.0
+    tube: TubeTwin | None = None
 
     def __post_init__(self) -> None:
         for name, unit in (("output_scale", ""), ("source_detector_mm", " mm"), ("pixel_mm", " mm")):
@@ -92,6 +94,12 @@ class UncalibratedLine:
             raise InputError("swank", received=self.swank, expected="a Swank factor above 0, at most 1")
         if self.psf_model not in PSF_MODELS:
             raise InputError("psf model", received=self.psf_model, expected="one of " + ", ".join(PSF_MODELS))
+        if self.tube is not None and not self.tube.output_known:
+            raise InputError(
+                "tube",
+                received="a calibrated tube whose output was not measured",
+                expected="one with air kermas in its dose table: noise needs photon numbers",
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,25 +237,17 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
     )
 
 
-def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | None) -> _Beam:
+def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | None, intervals: bool = False) -> _Beam:
     load = setting.tube_load_mAs
     if load is None:
         raise InputError(
             "setting", received=str(setting), expected="a tube load", remedy="give power_w=... or current_ma=..."
         )
-    checked_kV(setting.kV, anode=line.anode)
-    energies = energy_grid_keV(setting.kV)
-    fluence = tube_fluence_interpolated(
-        setting.kV,
-        energies_keV=energies,
-        anode=line.anode,
-        anode_angle_deg=line.anode_angle_deg,
-        model=line.model,
-        for_sums=True,
-    )
-    layers = (*line.inherent, *setting.filters)
-    passed = transmission(layers, energies, library=library, bin_width_keV=BIN_WIDTH_KEV)
-    photons = line.output_scale * fluence * passed * (BIN_WIDTH_KEV / 100.0)
+    if line.tube is None:
+        energies, bare, photons = _photons_of_line(line, setting, library)
+        warnings: tuple[str, ...] = ()
+    else:
+        energies, bare, photons, warnings = _photons_of_tube(line.tube, setting, intervals)
     response = detector_response(
         scintillator=line.scintillator,
         cover=line.cover,
@@ -258,14 +258,14 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
     first, second = photons * response.mean_deposited_keV, photons * response.mean_square_deposited_keV2
 
     def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = np.array([np.sum(first * through)])
+        rate = np.sum(first * through, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return rate, np.array([np.sum(second * through)]) / rate / line.swank
+            return rate, np.sum(second * through, axis=1) / rate / line.swank
 
     rate, gain = signal(np.ones_like(energies))
-    bare = line.output_scale * float(np.sum(fluence * response.mean_deposited_keV)) * (BIN_WIDTH_KEV / 100.0)
     # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
-    if not rate[0] > 1e-30 * bare:
+    if not rate[0] > 1e-30 * float(bare @ response.mean_deposited_keV):
+        layers = setting.filters if line.tube is not None else (*line.inherent, *setting.filters)
         raise InputError("filter", received=text_from_filters(layers), expected="layers that let some photons through")
     distance = setting.source_detector_mm or line.source_detector_mm
     return _Beam(
@@ -274,8 +274,47 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         open_signal_DN=float(rate[0]) * load * (1000.0 / distance) ** 2 * line.pixel_mm**2,
         open_gain_DN=float(gain[0]),
         secondary_DN=0.0,
-        warnings=(),
+        warnings=warnings,
     )
+
+
+def _photons_of_line(
+    line: UncalibratedLine, setting: Setting, library: Library | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Energies, photons without any layer (energy,) and behind all of them (1, energy), a mAs and mm2 at 1 m."""
+    checked_kV(setting.kV, anode=line.anode)
+    energies = energy_grid_keV(setting.kV)
+    fluence = tube_fluence_interpolated(
+        setting.kV,
+        energies_keV=energies,
+        anode=line.anode,
+        anode_angle_deg=line.anode_angle_deg,
+        model=line.model,
+        for_sums=True,
+    )
+    bare = line.output_scale * fluence * (BIN_WIDTH_KEV / 100.0)
+    layers = (*line.inherent, *setting.filters)
+    return (
+        energies,
+        bare,
+        (bare * transmission(layers, energies, library=library, bin_width_keV=BIN_WIDTH_KEV))[None, :],
+    )
+
+
+def _photons_of_tube(
+    tube: TubeTwin, setting: Setting, intervals: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[str, ...]]:
+    """The same of a calibrated tube: row 0 its most probable spectrum, then, for intervals, the posterior's draws."""
+    posterior = tube.spectral
+    checked_kV(setting.kV, anode=posterior.anode)
+    model = model_of_posterior(posterior, highest_kV=setting.kV)
+    best = posterior.best[None, :]
+    samples = np.concatenate([best, posterior.samples]) if intervals else best
+    photons = model.weights(samples, OpenBeam(kV=setting.kV, filters=setting.filters))
+    bare = model.weights(best, OpenBeam(kV=setting.kV, filters=()))[0]
+    outside = spectrum_outside(posterior, kV=setting.kV, filters=setting.filters)
+    told = (f"outside the calibrated range of {', '.join(outside)}: the interval rests on the spectral model",)
+    return model.energies_keV[: bare.size], bare, photons, told if outside else ()
 
 
 def _detector_of(line: Twin | UncalibratedLine) -> _Detector:
@@ -607,7 +646,7 @@ def _contrasts(
         refuse_binning(setting)
         if setting not in beams:
             if isinstance(line, UncalibratedLine):
-                beams[setting] = _beam_of_line(line, setting, library)
+                beams[setting] = _beam_of_line(line, setting, library, intervals)
             else:
                 beams[setting] = _beam_of_twin(line, setting, intervals)
         key = (setting, table)

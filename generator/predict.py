@@ -3,13 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting, filters_from_text, text_from_filters
+from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
 from ..errors import InputError
+from ..results import Result, Table, interval_text
 from ..spectra import checked_kV
 from .binning import binned_pixel
 from .line_limits import check_count_rate, check_limits
@@ -17,6 +18,11 @@ from .present_line import PresentLine, present_line
 from .spectral_signal import OpenBeam
 from .twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_sd
 from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
+
+if TYPE_CHECKING:
+    import pandas
+
+    from .dual_layer import BackLayer
 
 __all__ = [
     "Prediction",
@@ -28,19 +34,28 @@ __all__ = [
     "spectral_model_of",
 ]
 
+# what a prediction holds, and in which unit
+UNITS = {
+    "mean_DN": "DN above dark",
+    "sd_DN": "DN",
+    "gain_DN": "DN",
+    "photons_absorbed": "photons a pixel and frame",
+    "air_kerma_uGy": "uGy a frame",
+}
 _MEASURED_REPRODUCIBILITY = 0.002  # of a level measured at this kV and filter: what a repeat would show
 _FAR_ABOVE = 3.0  # times the brightest flat: beyond, nobody has seen whether the detector is linear
 _FAR_BELOW = 10.0  # below the dimmest flat over this, offsets matter that no flat has shown
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Prediction(Result):
     """A flatfield, detector median, of the mean of `setting.averaged` frames.
 
     Fields: mean_DN (above dark), sd_DN (temporal, one pixel), gain_DN (single frame), photons_absorbed (a pixel and
     frame), air_kerma_uGy (a frame, at the object or, where its distance is unknown, at the detector); intervals are of
     the quantity itself, without the sampling noise of a later measurement. None where the twin cannot say;
-    extrapolated: outside the calibrated range; warnings say why and what else to know.
+    extrapolated: outside the calibrated range; warnings say why and what else to know; frames_per_s (averaging done) and
+    back_layer (of a dual-layer panel): where they were asked for.
     """
 
     setting: Setting
@@ -52,9 +67,11 @@ class Prediction:
     extrapolated: bool
     measured_level: bool
     warnings: tuple[str, ...]
+    frames_per_s: float | None = None
+    back_layer: "BackLayer | None" = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """The answer of `raytwin predict --json`."""
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin predict --json` prints."""
 
         def plain(estimate: Estimate | None) -> dict[str, float] | None:
             return None if estimate is None else estimate.as_dict()
@@ -69,7 +86,22 @@ class Prediction:
             "extrapolated": self.extrapolated,
             "measured_level": self.measured_level,
             "warnings": list(self.warnings),
+            **({} if self.frames_per_s is None else {"frames_per_s": self.frames_per_s}),
+            **({} if self.back_layer is None else {"back_layer": self.back_layer.as_dict()}),
         }
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """One row: the words of the setting, then every quantity with the ends of its interval."""
+        from .predict_settings import Predictions
+
+        return Predictions(predictions=(self,)).to_dataframe()
+
+    def _table(self) -> Table:
+        answer = self.to_dict()
+        rows = [(name, *interval_text(answer[name], 5), unit) for name, unit in UNITS.items()]
+        notes = [f"warning: {text}" for text in self.warnings]
+        title = f"{self.setting}{' (extrapolated)' if self.extrapolated else ''}"
+        return Table(title=title, header=("", "value", "95 % interval", "unit"), rows=tuple(rows), notes=tuple(notes))
 
 
 def binned_over_single(twin: Twin, binning: int) -> float:
@@ -99,14 +131,9 @@ def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) 
 
 def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
     """In how many ways a setting lies outside what was calibrated, in words: kV, filters, level."""
-    posterior = twin.spectral
-    found = []
-    if posterior is not None:
-        lowest, highest = posterior.calibrated_kV
-        if not 0.98 * lowest <= setting.kV <= 1.02 * highest:
-            found.append(f"kV ({lowest:g} to {highest:g} calibrated)")
-        if _filters_outside(posterior, setting):
-            found.append("filters")
+    found: list[str] = []
+    if twin.spectral is not None:
+        found += spectrum_outside(twin.spectral, kV=setting.kV, filters=setting.filters)
     points = [
         float(point["signal_DN"])
         for point in twin.evidence.get("photon_transfer", ())
@@ -117,7 +144,18 @@ def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
+def spectrum_outside(posterior: SpectralPosterior, *, kV: float, filters: Sequence[Filter]) -> tuple[str, ...]:
+    """In how many ways a beam lies outside what was calibrated, in words: kV, filters."""
+    found = []
+    lowest, highest = posterior.calibrated_kV
+    if not 0.98 * lowest <= kV <= 1.02 * highest:
+        found.append(f"kV ({lowest:g} to {highest:g} calibrated)")
+    if _filters_outside(posterior, filters):
+        found.append("filters")
+    return tuple(found)
+
+
+def _filters_outside(posterior: SpectralPosterior, filters: Sequence[Filter]) -> bool:
     stacks: list[dict[str, float]] = []
     for text in posterior.calibrated_filters:
         stack: dict[str, float] = {}
@@ -125,7 +163,7 @@ def _filters_outside(posterior: SpectralPosterior, setting: Setting) -> bool:
             stack[layer.material] = stack.get(layer.material, 0.0) + layer.thickness_mm
         stacks.append(stack)
     wanted: dict[str, float] = {}
-    for layer in setting.filters:
+    for layer in filters:
         wanted[layer.material] = wanted.get(layer.material, 0.0) + layer.thickness_mm
     for material in {*wanted, *(name for stack in stacks for name in stack)}:
         thicknesses = [stack.get(material, 0.0) for stack in stacks]
@@ -285,7 +323,10 @@ def _by_model(
         quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
         quantum_sd=math.hypot(level_sd, gain_sd),
         photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, level_sd),
-        kerma_uGy=_estimate_from_draws(signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2, level_sd),
+        kerma_uGy=_estimate_from_draws(
+            signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2,
+            level_sd if posterior.kerma_discrepancy is None else widen * posterior.kerma_discrepancy,
+        ),
         outside=outside,
     )
 

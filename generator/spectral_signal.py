@@ -3,16 +3,24 @@
 Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting
 fraction D(E)):
 
-    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^h (Phi' / Phi)^s exp(-sum mu t) (1000 / d)^2 a^2
-    signal  = gamma sum N m1            gain = (gamma / A_S) sum N m2 / sum N m1            absorbed = sum N D
+    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (Phi' / Phi)^s exp(-sum mu t) (1000 / d)^2 a^2
+    signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1    absorbed = sum N c D
 
-for energy-integrating detectors; a counting detector has m1 = m2 = D. gamma is in DN per keV absorbed, Phi' the other of
-SpekPy's models, e = kV_error + kV_tilt ln(kV / 60), and mu that of xraylib moved by shares of its differences to two other
-tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)).
+for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, Phi' the
+other of SpekPy's models, e = kV_error + kV_tilt ln(kV / 60), and mu that of xraylib moved by shares of its differences to two
+other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)). The layers t are those in the beam, the inherent
+filtration, and micrometres of the anode's own metal (a rough or worn anode). A tube voltage that varies during an exposure, by
+a relative variance v about its mean, adds v / 2 kV^2 d2 Phi / d kV2.
+
+c(E) is what covers, glue and dead layers let through, l(E) the light for each keV that stays, over that at 50 keV: the
+scintillator's own (`spectra.light_per_keV`), a power of energy, and the depth at which photons of each energy are stopped
+(light made nearer to the diodes is less dimmed). w is how the Swank factor goes with energy. K photons that leave take
+(1 + escape_scale) of what `spectra.detector_response` says: none at -1.
 """
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -30,6 +38,7 @@ from ..spectra import (
     MODELS,
     detector_response,
     energy_grid_keV,
+    light_per_keV,
     tube_fluence_interpolated,
 )
 
@@ -48,11 +57,35 @@ FIXED_PARAMETERS = (
     "spectrum_model",
     "escape_scale",
     "scintillator_table",
+    "anode_roughness_um",
+    "kV_variance",
+    "hardness_tilt",
 )
+# what a detector does to photons of each energy beside absorbing them: the powers of exp(parameter x row) in the first and
+# second moment of the deposit and in the absorbed share
+RESPONSE_PARAMETERS: dict[str, tuple[float, float, float]] = {
+    "cover_mm_C": (1.0, 1.0, 1.0),
+    "dead_layer_um": (1.0, 1.0, 1.0),
+    "light_nonproportionality": (1.0, 2.0, 0.0),
+    "light_exponent": (1.0, 2.0, 0.0),
+    "light_depth_slope": (1.0, 2.0, 0.0),
+    "swank_exponent": (0.0, -1.0, 0.0),
+}
+_RESPONSE_OF_COUNTERS = ("cover_mm_C", "dead_layer_um")
 ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
+# of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
+KERMA_OUTPUT = "log_kerma_over_flats"
 OTHER_TABLES = ("chantler", "penelope")
-_KV_ERRORS = np.linspace(-0.06, 0.06, 25)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
+# parameters that say nothing of the tube: a dosimeter does not notice them
+_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
+_ABSORBER = "absorber_mm:"
+_KV_ERRORS = np.linspace(-0.09, 0.06, 31)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
 _ALL_NODES = slice(None)
+_LOWEST_KEV = (
+    5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
+)
+_KV_STEP = 0.02  # relative, of the second difference that a varying voltage takes
+_TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of a node
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
 _LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
@@ -68,12 +101,29 @@ def table_share_name(table: str, material: str) -> str:
     return f"{table}_{material}"
 
 
+def absorber_thickness_name(absorber: str, material: str) -> str:
+    """Name of the parameter that holds how much (mm) of a material an absorber of unknown composition amounts to."""
+    return f"{_ABSORBER}{absorber}:{material}"
+
+
+def absorber_of_parameter(name: str) -> tuple[str, str] | None:
+    """The absorber and the material whose thickness a parameter is (`absorber_thickness_name`), or None."""
+    if not name.startswith(_ABSORBER):
+        return None
+    absorber, _, material = name.removeprefix(_ABSORBER).rpartition(":")
+    return absorber, material
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenBeam:
-    """One open-beam setting as the spectrum sees it: kV and filters; rates are per mAs at 1 m and 1 mm2 of pixel."""
+    """One open-beam setting as the spectrum sees it: kV and filters; rates are per mAs at 1 m and 1 mm2 of pixel.
+
+    absorber: name of an absorber of unknown composition behind the filters, whose thicknesses are parameters; empty: none.
+    """
 
     kV: float
     filters: tuple[Filter, ...]
+    absorber: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,12 +197,12 @@ class SpectralModel:
         self.counting = counting
         self.filter_materials = tuple(filter_materials)
         self.correction = correction
-        every = [*FIXED_PARAMETERS, *((ALTERNATIVE_SCINTILLATOR,) if self.alternative else ())]
+        every = [*FIXED_PARAMETERS, *(_RESPONSE_OF_COUNTERS if counting else RESPONSE_PARAMETERS)]
+        every += [ALTERNATIVE_SCINTILLATOR] if self.alternative else []
         for material in self.filter_materials:
             every.append(attenuation_scale_name(material))
             every += [table_share_name(table, material) for table in OTHER_TABLES]
-        self.names = tuple(every) if names is None else tuple(names)
-        self._index = {name: position for position, name in enumerate(self.names)}
+        self._named(every if names is None else names)
         self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
         self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
@@ -161,6 +211,12 @@ class SpectralModel:
         self._other_model: dict[float, NDArray[np.float64]] = {}
         self._responses = [
             _response_tables(layers, self.cover, self.counting, self.energies_keV.size)
+            for layers in (self.scintillator, self.alternative)
+            if layers
+        ]
+        self._response_names = tuple(name for name in RESPONSE_PARAMETERS if name in self._index)
+        self._response_rows = [
+            _response_rows(layers[0], self.energies_keV.size)
             for layers in (self.scintillator, self.alternative)
             if layers
         ]
@@ -179,6 +235,26 @@ class SpectralModel:
         if key not in self._departures:
             self._departures[key] = _table_departure(material, table, self.energies_keV)
         return self._departures[key]
+
+    def with_parameters(self, names: Sequence[str]) -> "SpectralModel":
+        """The same model with more parameters, behind its own; the tables are shared."""
+        result = copy(self)
+        result._named((*self.names, *(name for name in names if name not in self._index)))
+        return result
+
+    def _named(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self._index = {name: position for position, name in enumerate(self.names)}
+        self._absorbers: dict[str, dict[str, str]] = {}
+        for name in self.names:
+            found = absorber_of_parameter(name)
+            if found is not None:
+                self._absorbers.setdefault(found[0], {})[name] = found[1]
+
+    @property
+    def kerma_weights(self) -> NDArray[np.float64]:
+        """Air kerma of a photon per cm2 (energy,), uGy cm2."""
+        return self._kerma
 
     def mu(self, material: str) -> NDArray[np.float64]:
         """Linear attenuation (energy,), 1/mm."""
@@ -254,9 +330,32 @@ class SpectralModel:
 
     def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
+        behind = self._behind_the_anode(samples, beam)
         kV_error = self._kV_error(samples, beam.kV)
-        below, _ = _brackets(_KV_ERRORS, kV_error)
-        nodes = self.fluence(beam.kV, slice(int(below.min()), int(below.max()) + 2))
+        variance = self._column(samples, "kV_variance")
+        shares = _node_shares(_KV_ERRORS, kV_error)
+        if np.any(variance):
+            # spectra at the voltage and a step to both sides are shares of the same nodes
+            shares += variance[:, None] * _second_difference_shares(kV_error)
+        behind *= self._fluence_of_nodes(beam.kV, shares, behind.shape[1])
+        return np.maximum(behind, 0.0, out=behind)
+
+    def _fluence_of_nodes(self, kV: float, shares: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy) as shares (draw, node) of the nodes of the voltage error, on the first `top` energies."""
+        used = np.flatnonzero(np.any(shares != 0.0, axis=0))
+        span = slice(int(used[0]), int(used[-1]) + 1)
+        return np.asarray(shares[:, span] @ self.fluence(kV, span)[span, :top])
+
+    def _fluence_at(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy) at errors (draw,) of the tube voltage, on the first `top` energies."""
+        return self._fluence_of_nodes(kV, _node_shares(_KV_ERRORS, kV_error), top)
+
+    def _second_difference(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Half of kV^2 d2 Phi / d kV2 (draw, energy), over a step on both sides."""
+        return self._fluence_of_nodes(kV, _second_difference_shares(kV_error), top)
+
+    def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
+        """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
         top = min(int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1, self.energies_keV.size)
         energies = self.energies_keV[:top]
         factors, rows = [], []
@@ -277,11 +376,14 @@ class SpectralModel:
                 if name in self._index:
                     factors.append(amount * self._column(samples, name))
                     rows.append(-depth * self._departure(material, table)[:top])
-        factors.append(self._column(samples, "hardness_exponent"))
-        rows.append(np.log(energies / REFERENCE_KEV))
-        if "spectrum_model" in self._index:
-            factors.append(self._column(samples, "spectrum_model"))
-            rows.append(self._towards_other_model(beam.kV)[:top])
+        for name in ("hardness_exponent", "hardness_tilt", "spectrum_model", "anode_roughness_um"):
+            row = self._row_of(name, beam, top) if name in self._index else None
+            if row is not None:
+                factors.append(self._column(samples, name))
+                rows.append(row)
+        for name, material in self._absorbers.get(beam.absorber, {}).items():
+            factors.append(self._column(samples, name))
+            rows.append(-self.mu(material)[:top])
         width = energies[1] - energies[0]
         factors.append(
             self._column(samples, "log_output")
@@ -290,7 +392,6 @@ class SpectralModel:
         )
         rows.append(np.ones(top))
         photons = np.exp(np.stack(factors, axis=1) @ np.stack(rows))
-        photons *= _interpolate(_KV_ERRORS, nodes[:, :top], kV_error)
         photons *= self._inherent[:top]
         if self.correction is not None:
             photons *= np.exp(self.correction.at(beam.kV, top))
@@ -359,6 +460,9 @@ class SpectralModel:
         other = bool(self._column(samples, ALTERNATIVE_SCINTILLATOR)[0] > 0.5)
         log_thickness = self._column(samples, "log_scintillator_thickness")
         share = _interpolate(_LOG_THICKNESS, self._responses[int(other)][2, :, : len(photons)], log_thickness)[0]
+        powers = self._response_powers(samples, len(photons))
+        if powers is not None:
+            share = share * powers[2][0]
         log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
         log_swank = float(self._column(samples, "log_swank")[0])
         return np.stack(
@@ -380,19 +484,58 @@ class SpectralModel:
         by_table, by_escape = (self._column(samples, name)[:, None] for name in ("scintillator_table", "escape_scale"))
         found[0] += by_table * found[2] + by_escape * found[4]
         found[1] += by_table * found[3] + by_escape * found[5]
+        powers = self._response_powers(samples, self.energies_keV.size)
+        if powers is not None:
+            found[::2] *= powers[0]
+            found[1::2] *= powers[1]
         return found
+
+    def _response_powers(
+        self, samples: NDArray[np.float64], top: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:
+        """What covers and light do to first and second moment and to the absorbed share (draw, energy) each; None: nothing."""
+        names = [name for name in self._response_names if np.any(self._column(samples, name))]
+        if not names:
+            return None
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        factors: list[NDArray[np.float64] | None] = []  # of each kind of parameter, as its powers have it
+        for kind in ((1.0, 1.0, 1.0), (1.0, 2.0, 0.0), (0.0, -1.0, 0.0)):
+            own = [name for name in names if RESPONSE_PARAMETERS[name] == kind]
+            if not own:
+                factors.append(None)
+                continue
+            columns = np.stack([self._column(samples, name) for name in own], axis=1)
+            logarithm = columns @ np.stack([self._response_rows[0][name][:top] for name in own])
+            if np.any(other):
+                rows = np.stack([self._response_rows[1][name][:top] for name in own])
+                logarithm[other] = columns[other] @ rows
+            factors.append(np.exp(logarithm, out=logarithm))
+        passed, light, swank = factors
+        share = np.ones((len(samples), top)) if passed is None else passed
+        first = share if light is None else share * light
+        second = first if light is None else first * light
+        return first, second if swank is None else second / swank, share
 
     def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
         top = photons.shape[1]
         log_thickness = self._column(samples, "log_scintillator_thickness")
         other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        powers = self._response_powers(samples, top)
         sums = np.empty((3, len(samples)))
         for chosen, tables in zip((~other, other), self._responses, strict=False):
             if not chosen.any():
                 continue
-            part = photons if chosen.all() else photons[chosen]
-            every = _sums_interpolated(_LOG_THICKNESS, tables[:, :, :top], log_thickness[chosen], part)
+            part, thickness = photons if chosen.all() else photons[chosen], log_thickness[chosen]
+            if powers is None:
+                every = _sums_interpolated(_LOG_THICKNESS, tables[:, :, :top], thickness, part)
+            else:
+                every = np.empty((7, len(part)))
+                for rows, power in (((0, 3, 5), powers[0]), ((1, 4, 6), powers[1]), ((2,), powers[2])):
+                    weight = part * (power if chosen.all() else power[chosen])
+                    every[list(rows)] = _sums_interpolated(
+                        _LOG_THICKNESS, tables[list(rows), :, :top], thickness, weight
+                    )
             by_table = self._column(samples, "scintillator_table")[chosen]
             by_escape = self._column(samples, "escape_scale")[chosen]
             sums[:2, chosen] = every[:2] + by_table * every[3:5] + by_escape * every[5:7]
@@ -411,8 +554,30 @@ class SpectralModel:
             gain_DN=excess * second / first,
             absorbed_per_mAs=absorbed,
             # photons are per mm2, kerma counts per cm2
-            kerma_uGy_per_mAs=100.0 * photons @ self._kerma[:top],
+            kerma_uGy_per_mAs=100.0 * (photons @ self._kerma[:top]) * np.exp(self._column(samples, KERMA_OUTPUT)),
         )
+
+    def log_kerma_derivatives(
+        self, samples: NDArray[np.float64], beam: OpenBeam, names: Sequence[str]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithm of the air kerma of a beam (draw,), uGy per mAs at 1 m, and how each of `names` moves it (draw, name).
+
+        The third is the mean of ln(E / 50 keV) over the kerma (draw,): the derivative by the exponent of a dosimeter whose
+        response goes as a power of the energy. Arguments as in `log_derivatives`.
+        """
+        weight = np.zeros((6, self.energies_keV.size))
+        weight[:2] = 100.0 * self._kerma
+        deposits = np.broadcast_to(weight[:, None, :], (6, len(samples), self.energies_keV.size))
+        asked = list(dict.fromkeys([*names, "hardness_exponent"]))
+        logs, found, _ = self.log_derivatives(samples, beam, asked, deposits=deposits)
+        hardness, slope = found[:, asked.index("hardness_exponent")].copy(), found[:, : len(names)].copy()
+        for column, name in enumerate(names):
+            if name in _OF_DETECTOR:
+                slope[:, column] = 0.0
+            elif name == KERMA_OUTPUT:
+                slope[:, column] = 1.0
+        value = logs[0] - self._column(samples, "log_DN_per_keV") + self._column(samples, KERMA_OUTPUT)
+        return value, slope, hardness
 
     def log_derivatives(
         self,
@@ -435,8 +600,14 @@ class SpectralModel:
         Returns:
             (rate and gain) (2, draw), derivatives of the rate (draw, name), derivatives of the gain (draw, name).
         """
-        photons = self.weights(samples, beam)
-        top = photons.shape[1]
+        behind = self._behind_the_anode(samples, beam)
+        top = behind.shape[1]
+        kV_error, variance = self._kV_error(samples, beam.kV), self._column(samples, "kV_variance")[:, None]
+        photons = behind * self._fluence_at(beam.kV, kV_error, top)
+        varied = np.zeros_like(photons)
+        if "kV_variance" in names or np.any(variance):
+            varied = behind * self._second_difference(beam.kV, kV_error, top)
+            photons = np.maximum(photons + variance * varied, 0.0)
         tables = (self.deposit_tables(samples) if deposits is None else deposits)[:, :, :top]
         first, second = tables[:2]
         by_first, by_second = photons * first, photons * second
@@ -475,22 +646,43 @@ class SpectralModel:
                 mean = np.einsum("de,de->d", photons, moved[0]) / sums[0]
                 rate[:, column] = mean
                 gain[:, column] = np.einsum("de,de->d", photons, moved[1]) / sums[1] - mean
-            elif name == "kV_tilt":
-                step = np.zeros(len(self.names))
-                step[self.names.index("kV_error")] = 0.002
-                harder = self.weights(samples + step, beam) - self.weights(samples - step, beam)
-                scale = math.log(beam.kV / REFERENCE_KV) / 0.004
-                mean = np.einsum("de,de->d", harder, first) / sums[0] * scale
+            elif name in {"kV_tilt", "kV_variance"}:
+                if name == "kV_tilt":
+                    above, below = (
+                        self._fluence_at(beam.kV, kV_error + step, top) for step in (_TILT_STEP, -_TILT_STEP)
+                    )
+                    moved_photons = behind * (above - below)
+                    scale = math.log(beam.kV / REFERENCE_KV) / (2.0 * _TILT_STEP)
+                else:
+                    moved_photons, scale = varied, 1.0
+                mean = np.einsum("de,de->d", moved_photons, first) / sums[0] * scale
                 rate[:, column] = mean
-                gain[:, column] = np.einsum("de,de->d", harder, second) / sums[1] * scale - mean
+                gain[:, column] = np.einsum("de,de->d", moved_photons, second) / sums[1] * scale - mean
+            elif name in self._response_names:
+                powers = RESPONSE_PARAMETERS[name]
+                mean = powers[0] * self._mean_of_row(name, by_first, samples) / sums[0] if powers[0] else 0.0
+                rate[:, column] = mean
+                gain[:, column] = powers[1] * self._mean_of_row(name, by_second, samples) / sums[1] - mean
         return logs, rate, gain
+
+    def _mean_of_row(self, name: str, weight: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum over energy of a response parameter's row times weights (draw, energy), each draw's own scintillator (draw,)."""
+        rows = np.stack([found[name][: weight.shape[1]] for found in self._response_rows], axis=1)
+        sums = weight @ rows
+        if rows.shape[1] == 1:
+            return np.asarray(sums[:, 0])
+        return np.where(self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5, sums[:, 1], sums[:, 0])
 
     def _row_of(self, name: str, beam: OpenBeam, top: int) -> NDArray[np.float64] | None:
         """What a unit of a parameter adds to the logarithm of the photons at each energy (energy,)."""
         if name == "hardness_exponent":
             return np.log(self.energies_keV[:top] / REFERENCE_KEV)
+        if name == "hardness_tilt":
+            return math.log(beam.kV / REFERENCE_KV) * np.log(self.energies_keV[:top] / REFERENCE_KEV)
         if name == "spectrum_model":
             return self._towards_other_model(beam.kV)[:top]
+        if name == "anode_roughness_um":
+            return -1e-3 * _levelled(self.mu(self.anode), self.energies_keV)[:top]
         row = None
         for layer in beam.filters:
             if name == attenuation_scale_name(layer.material):
@@ -513,6 +705,36 @@ def _table_departure(material: str, table: str, energies_keV: NDArray[np.float64
     ratio = mu_per_mm(known, energies_keV, table=table) / mu_per_mm(known, energies_keV)
     # the tables' edges lie a few eV apart: a bin between them says nothing of the tables
     return np.clip(ratio - 1.0, -_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
+
+
+def _levelled(values: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (energy,) with those below the lowest energy that matters replaced by the value there."""
+    first = min(int(np.searchsorted(energies_keV, _LOWEST_KEV)), len(values) - 1)
+    return np.concatenate([np.full(first, values[first]), values[first:]])
+
+
+@lru_cache(maxsize=16)
+def _response_rows(layer: Filter, bins: int) -> dict[str, NDArray[np.float64]]:
+    """What a unit of each response parameter adds to the logarithms at each energy (energy,), for a scintillator's first layer.
+
+    The depth slope is the loss of light from the diode's side of the layer to the other, as a share: row <z> / L - 1 / 2,
+    with z the depth at which photons of an energy are stopped.
+    """
+    energies = energy_grid_keV(500.0)[:bins]
+    absorber = mu_per_mm(material_from_name(layer.material), energies)
+    depth = np.maximum(absorber * layer.thickness_mm, 1e-6)
+    logarithm = np.log(energies / REFERENCE_KEV)
+    rows = {
+        "cover_mm_C": -_levelled(mu_per_mm(material_from_name("C"), energies), energies),
+        "dead_layer_um": -1e-3 * _levelled(absorber, energies),
+        "light_nonproportionality": light_per_keV(layer.material, energies),
+        "light_exponent": logarithm,
+        "light_depth_slope": 1.0 / depth - 1.0 / np.expm1(np.minimum(depth, 500.0)) - 0.5,
+        "swank_exponent": logarithm,
+    }
+    for row in rows.values():
+        row.setflags(write=False)
+    return rows
 
 
 @lru_cache(maxsize=16)
@@ -553,6 +775,23 @@ def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDAr
     below = np.clip(np.searchsorted(nodes, clipped, side="right") - 1, 0, len(nodes) - 2)
     share = (clipped - nodes[below]) / (nodes[below + 1] - nodes[below])
     return below, share
+
+
+def _node_shares(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the nodes in a linear interpolation at positions `at` (draw,)."""
+    below, share = _brackets(nodes, at)
+    shares = np.zeros((len(at), len(nodes)))
+    rows = np.arange(len(at))
+    shares[rows, below] = 1.0 - share
+    shares[rows, below + 1] = share
+    return shares
+
+
+def _second_difference_shares(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the fluence's nodes in half of its second derivative by the logarithm of the voltage."""
+    inside = np.clip(kV_error, _KV_ERRORS[0] + _KV_STEP, _KV_ERRORS[-1] - _KV_STEP)
+    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-_KV_STEP, 0.0, _KV_STEP))
+    return np.asarray((above + below - 2.0 * middle) / (2.0 * _KV_STEP**2))
 
 
 def _interpolate(

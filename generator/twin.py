@@ -1,9 +1,10 @@
 """The twin: what calibration knows of one line, and all that prediction and generation need."""
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,16 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
+from ..results import ByValue, Result, Table, plain
 from .effects.effect import AppliedEffect
 from .psf import Spread
 from .spectral_signal import SpectrumCorrection
+
+if TYPE_CHECKING:
+    import pandas
+
+    from .predict import Prediction
+    from .predict_settings import Predictions
 
 # reason codes of bad pixels; a pixel carries the first that applies
 BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
@@ -50,8 +58,8 @@ def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf) -> E
     return Estimate(value=value, low=min(max(value - half, lowest), value), high=value + half)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Level:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Level(ByValue):
     """One tube voltage and filter that was measured.
 
     Fields: kV (None where unknown), filters; gain_DN (variance per signal, the spread's share restored);
@@ -135,8 +143,8 @@ class NoiseModel:
         return self.read_noise_DN.value**2 + (1.0 / 12.0 if self.quantised else 0.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DetectorMaps:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetectorMaps(ByValue):
     """Maps (row, column): dark at `dark_exposure_ms`, its growth a ms, relative gain, read variance, bad pixels.
 
     gain_relative is the pixel's gain over the detector median, shrunk towards 1 as far as the data are thin.
@@ -161,15 +169,16 @@ class DetectorMaps:
         return np.asarray(self.dark_DN + self.dark_DN_per_ms * np.float32(exposure_ms - self.dark_exposure_ms))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpectralPosterior:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpectralPosterior(ByValue):
     """What the flats say of tube and scintillator: equally likely parameter sets.
 
     Fields: names (parameters, units in the names); samples (draw, parameter); best (parameter,): the most probable set;
     prior: name -> text; undetermined: directions that the data leave as wide as the prior, in words; anode,
     anode_angle_deg, model, inherent (vendor's layers), scintillator, cover, counting: the frame of the model; alternative:
     the scintillator of draws that have another one (where nobody declared it); level_discrepancy, gain_discrepancy: relative
-    sd of a single level and gain beyond the parameters; correction: of the tube model by measured spectra, if there were any.
+    sd of a single level and gain beyond the parameters; kerma_discrepancy: of a single setting's air kerma (None: no dosimeter
+    was read); correction: of the tube model by measured spectra, if there were any.
     """
 
     names: tuple[str, ...]
@@ -190,6 +199,7 @@ class SpectralPosterior:
     calibrated_filters: tuple[str, ...]
     alternative: tuple[Filter, ...] = ()
     correction: SpectrumCorrection | None = None
+    kerma_discrepancy: float | None = None
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Draws of one parameter (draw,)."""
@@ -201,8 +211,8 @@ class SpectralPosterior:
         return Estimate(value=float(middle), low=float(low), high=float(high))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Twin:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Twin(Result):
     """A calibrated line; `effects` are those beyond the base model that it is known to have."""
 
     instrument: Instrument
@@ -240,3 +250,71 @@ class Twin:
                 len(wanted ^ {str(layer) for layer in item.filters}),
             ),
         )
+
+    @overload
+    def predict(self, settings: Setting, /) -> "Prediction": ...
+    @overload
+    def predict(self, settings: str, /) -> "Prediction": ...  # type: ignore[overload-overlap]
+    @overload
+    def predict(self, settings: Sequence[Setting | str], /) -> "Predictions": ...
+    @overload
+    def predict(self, /, **words: Any) -> "Any": ...
+    def predict(self, settings: Setting | str | Sequence[Setting | str] | None = None, /, **words: Any) -> Any:
+        """Flatfield at one setting or at many, measured or not, with 95 % intervals.
+
+        Args:
+            settings: a `Setting`, its text form (`"kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1"`), or a sequence of them.
+            **words: in place of `settings`: kV, exposure_ms, power_W or current_mA, filter (`"Cu:0.1+Al:1"`), averaged,
+                source_detector_mm, binning, frame_interval_ms, belt_speed_mm_s. A word given as a list makes a table; words
+                given as lists go together, entry by entry.
+
+        Returns:
+            A `Prediction`, or `Predictions` where many were asked for.
+
+        Raises:
+            InputError: an unknown word or material, no tube load, or a setting that the line cannot have.
+
+        Example:
+            >>> found = twin.predict(kV=60, power_W=30, exposure_ms=20, filter="Cu:0.1")
+            >>> found.mean_DN.low < found.mean_DN.value < found.mean_DN.high
+            True
+            >>> list(twin.predict(kV=[50, 60], power_W=30, exposure_ms=20).to_dataframe()["kV"])
+            [50.0, 60.0]
+        """
+        from .predict_settings import predict_words
+
+        return predict_words(self, settings, words)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the twin to a file (HDF5), whole or not at all; `raytwin.read_twin` reads it.
+
+        Raises:
+            InputError: a place where nothing can be written.
+        """
+        from .twin_io import write_twin
+
+        write_twin(path, self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin calibrate --json` prints."""
+        from .twin_answer import calibration_answer
+
+        found: dict[str, Any] = plain(calibration_answer(self))
+        return found
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each measured level: kV, filter, gain, photon-transfer slope, rate, saturation."""
+        from ..results import frame
+
+        return frame(self.to_dict()["levels"])
+
+    def plot(self, ax: Any = None, *, what: str = "gain_DN") -> Any:
+        """Gain (`gain_DN`) or rate (`rate_DN_per_mAs`) of the measured levels against kV, with 95 % intervals; returns the axes."""
+        from .twin_plot import plot_levels
+
+        return plot_levels(self, ax=ax, what=what)
+
+    def _table(self) -> Table:
+        from .twin_answer import twin_table
+
+        return twin_table(self)

@@ -1,4 +1,7 @@
-"""Twin files: HDF5, `format = "raytwin-twin"`, version 1. Numbers and text only; nothing is ever unpickled."""
+"""Twin files: HDF5, `format = "raytwin-twin"`, version 1. Numbers and text only; nothing is ever unpickled.
+
+The twin of a tube alone has `part = "tube"` among its root attributes and no groups of a detector.
+"""
 
 import json
 import os
@@ -15,6 +18,7 @@ from ..files import whole_file
 from .effects import AppliedEffect, in_order
 from .psf import Spread
 from .spectral_signal import SpectrumCorrection
+from .tube_twin import TubeTwin
 from .twin import (
     DetectorMaps,
     Estimate,
@@ -28,6 +32,7 @@ from .twin import (
 
 FORMAT = "raytwin-twin"
 VERSION = 1
+TUBE = "tube"
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels")
 
 
@@ -53,8 +58,8 @@ def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
-def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
-    """Write a twin; the file appears whole or not at all."""
+def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
+    """Write a twin, whole or of a tube alone; the file appears whole or not at all."""
     import h5py
 
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
@@ -63,6 +68,12 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
         file.attrs["provenance"] = json.dumps(dict(twin.provenance))
         file.attrs["evidence"] = json.dumps(dict(twin.evidence))
         file.attrs["warnings"] = json.dumps(list(twin.warnings))
+        _put_instrument(file, twin.instrument)
+        if isinstance(twin, TubeTwin):
+            file.attrs["part"] = TUBE
+            file.attrs["output_known"] = twin.output_known
+            _put_spectral(file, twin.spectral)
+            return
         if twin.effects:
             in_order(twin.effects)  # refuses what could not be read back
             file.attrs["effects"] = json.dumps(
@@ -76,11 +87,6 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
                     for item in twin.effects
                 ]
             )
-        instrument = file.create_group("instrument")
-        for entry in fields(Instrument):
-            value = getattr(twin.instrument, entry.name)
-            if value is not None:
-                instrument.attrs[entry.name] = text_from_filters(value) if entry.name in LAYER_FIELDS else value
         maps = file.create_group("maps")
         for name in _MAPS:
             maps.create_dataset(name, data=getattr(twin.maps, name), compression="gzip", shuffle=True)
@@ -115,23 +121,36 @@ def write_twin(path: str | os.PathLike[str], twin: Twin) -> None:
                     group.attrs[name] = getattr(level, name)
             group.create_dataset("flat_shape", data=level.flat_shape, compression="gzip", shuffle=True)
         if twin.spectral is not None:
-            spectral = file.create_group("spectral")
-            posterior = twin.spectral
-            spectral.create_dataset("samples", data=posterior.samples, compression="gzip", shuffle=True)
-            spectral.create_dataset("best", data=posterior.best)
-            spectral.attrs["names"] = json.dumps(list(posterior.names))
-            spectral.attrs["prior"] = json.dumps(dict(posterior.prior))
-            spectral.attrs["undetermined"] = json.dumps(list(posterior.undetermined))
-            for name in ("anode", "anode_angle_deg", "model", "counting", "level_discrepancy", "gain_discrepancy"):
-                spectral.attrs[name] = getattr(posterior, name)
-            for name in ("inherent", "scintillator", "alternative", "cover"):
-                spectral.attrs[name] = text_from_filters(getattr(posterior, name))
-            if posterior.correction is not None:
-                corrected = spectral.create_dataset("log_correction", data=posterior.correction.log_ratio)
-                corrected.attrs["kV"] = np.array(posterior.correction.kV)
-                corrected.attrs["relative"] = posterior.correction.relative
-            spectral.attrs["calibrated_kV"] = np.array(posterior.calibrated_kV)
-            spectral.attrs["calibrated_filters"] = json.dumps(list(posterior.calibrated_filters))
+            _put_spectral(file, twin.spectral)
+
+
+def _put_instrument(file: Any, instrument: Instrument) -> None:
+    group = file.create_group("instrument")
+    for entry in fields(Instrument):
+        value = getattr(instrument, entry.name)
+        if value is not None:
+            group.attrs[entry.name] = text_from_filters(value) if entry.name in LAYER_FIELDS else value
+
+
+def _put_spectral(file: Any, posterior: SpectralPosterior) -> None:
+    spectral = file.create_group("spectral")
+    spectral.create_dataset("samples", data=posterior.samples, compression="gzip", shuffle=True)
+    spectral.create_dataset("best", data=posterior.best)
+    spectral.attrs["names"] = json.dumps(list(posterior.names))
+    spectral.attrs["prior"] = json.dumps(dict(posterior.prior))
+    spectral.attrs["undetermined"] = json.dumps(list(posterior.undetermined))
+    for name in ("anode", "anode_angle_deg", "model", "counting", "level_discrepancy", "gain_discrepancy"):
+        spectral.attrs[name] = getattr(posterior, name)
+    for name in ("inherent", "scintillator", "alternative", "cover"):
+        spectral.attrs[name] = text_from_filters(getattr(posterior, name))
+    if posterior.kerma_discrepancy is not None:
+        spectral.attrs["kerma_discrepancy"] = posterior.kerma_discrepancy
+    if posterior.correction is not None:
+        corrected = spectral.create_dataset("log_correction", data=posterior.correction.log_ratio)
+        corrected.attrs["kV"] = np.array(posterior.correction.kV)
+        corrected.attrs["relative"] = posterior.correction.relative
+    spectral.attrs["calibrated_kV"] = np.array(posterior.calibrated_kV)
+    spectral.attrs["calibrated_filters"] = json.dumps(list(posterior.calibrated_filters))
 
 
 def _array(group: Any, name: str, dtype: type[Any]) -> NDArray[Any]:
@@ -139,54 +158,73 @@ def _array(group: Any, name: str, dtype: type[Any]) -> NDArray[Any]:
 
 
 def read_twin(path: str | os.PathLike[str]) -> Twin:
-    """Read a twin file.
+    """Read the file of a whole twin: tube and detector.
+
+    Raises:
+        FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing; the twin of a tube
+            alone (`read_any_twin`).
+    """
+    twin = read_any_twin(path)
+    if isinstance(twin, TubeTwin):
+        raise FileFormatError(
+            f"twin {path}",
+            received="the twin of a tube alone",
+            expected="a twin with a detector",
+            remedy="calibrate from flats too; spectrum, mu, contrast and predict take this one",
+        )
+    return twin
+
+
+def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
+    """Read a twin file, of a whole line or of a tube alone.
 
     Raises:
         FileFormatError: no such file, not HDF5, truncated, another format or version, or parts missing.
     """
-    import h5py
+    from ..acquisition._hdf5 import HDF5_ERRORS, open_hdf5
 
     if not os.path.isfile(path):
         raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
-    try:
-        file = h5py.File(path, "r")
-    except OSError:
-        raise FileFormatError(
-            f"twin {path}",
-            received="a file that is not HDF5 or is cut off",
-            expected="a file that `raytwin calibrate` wrote",
-        ) from None
-    with file:
-        found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
-        if found != (FORMAT, VERSION):
-            raise FileFormatError(
-                f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
-            )
+    with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file:
         try:
+            found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
+            if found != (FORMAT, VERSION):
+                raise FileFormatError(
+                    f"twin {path}", received=f"{found[0]} version {found[1]}", expected=f"{FORMAT} version {VERSION}"
+                )
+            if _text(file.attrs.get("part", "")) == TUBE:
+                return _tube_from_file(file, path)
             return _twin_from_file(file, path)
         except InputError:
             raise
-        except (KeyError, OSError, TypeError, ValueError, IndexError) as error:
+        except HDF5_ERRORS as error:
             raise FileFormatError(
                 f"twin {path}",
-                received=f"a damaged file ({error})",
+                received=f"a damaged file ({' '.join(str(error).split()) or type(error).__name__})",
                 expected="a complete twin file",
                 remedy="calibrate again",
             ) from None
 
 
+def _instrument_from_file(file: Any, path: object) -> Instrument:
+    from ..acquisition.acquisition_io import read_instrument
+
+    return read_instrument(file["instrument"], path=f"twin {path}")
+
+
+def _tube_from_file(file: Any, path: object) -> TubeTwin:
+    return TubeTwin(
+        instrument=_instrument_from_file(file, path),
+        spectral=_spectral_from_group(file["spectral"], path),
+        output_known=bool(file.attrs["output_known"]),
+        evidence=json.loads(_text(file.attrs["evidence"])),
+        warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
+        provenance=json.loads(_text(file.attrs["provenance"])),
+    )
+
+
 def _twin_from_file(file: Any, path: object) -> Twin:
-    values: dict[str, Any] = {}
-    names = {entry.name for entry in fields(Instrument)}
-    for name, value in file["instrument"].attrs.items():
-        if name not in names:
-            continue
-        if name in LAYER_FIELDS:
-            values[name] = filters_from_text(_text(value))
-        elif isinstance(value, str | bytes):
-            values[name] = _text(value)
-        else:
-            values[name] = value.item() if isinstance(value, np.generic) else value
+    instrument = _instrument_from_file(file, path)
     maps = file["maps"]
     noise = file["noise"]
     levels = []
@@ -213,32 +251,9 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         raise FileFormatError(
             f"twin {path}", received=f"maps of shapes {sorted(shapes)}", expected="maps (row, column) of one shape"
         )
-    spectral = None
-    if "spectral" in file:
-        group = file["spectral"]
-        attributes = group.attrs
-        spectral = SpectralPosterior(
-            names=tuple(json.loads(_text(attributes["names"]))),
-            samples=_array(group, "samples", np.float64),
-            best=_array(group, "best", np.float64),
-            prior=json.loads(_text(attributes["prior"])),
-            undetermined=tuple(json.loads(_text(attributes["undetermined"]))),
-            anode=_text(attributes["anode"]),
-            anode_angle_deg=float(attributes["anode_angle_deg"]),
-            model=_text(attributes["model"]),
-            inherent=filters_from_text(_text(attributes["inherent"])),
-            scintillator=filters_from_text(_text(attributes["scintillator"])),
-            alternative=filters_from_text(_text(attributes.get("alternative", ""))),
-            correction=_correction(group),
-            cover=filters_from_text(_text(attributes["cover"])),
-            counting=bool(attributes["counting"]),
-            level_discrepancy=float(attributes["level_discrepancy"]),
-            gain_discrepancy=float(attributes["gain_discrepancy"]),
-            calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
-            calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
-        )
+    spectral = _spectral_from_group(file["spectral"], path) if "spectral" in file else None
     return Twin(
-        instrument=Instrument(**values),
+        instrument=instrument,
         maps=DetectorMaps(
             dark_DN=_array(maps, "dark_DN", np.float32),
             dark_exposure_ms=_optional_float(maps, "dark_exposure_ms"),
@@ -276,6 +291,42 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
         family=_text(noise.attrs["spread_family"]),
         intervals={"sigma_px": sigma} | {name: known for name, known in found.items() if known is not None},
     )
+
+
+def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
+    attributes = group.attrs
+    spectral = SpectralPosterior(
+        names=tuple(json.loads(_text(attributes["names"]))),
+        samples=_array(group, "samples", np.float64),
+        best=_array(group, "best", np.float64),
+        prior=json.loads(_text(attributes["prior"])),
+        undetermined=tuple(json.loads(_text(attributes["undetermined"]))),
+        anode=_text(attributes["anode"]),
+        anode_angle_deg=float(attributes["anode_angle_deg"]),
+        model=_text(attributes["model"]),
+        inherent=filters_from_text(_text(attributes["inherent"])),
+        scintillator=filters_from_text(_text(attributes["scintillator"])),
+        alternative=filters_from_text(_text(attributes.get("alternative", ""))),
+        correction=_correction(group),
+        cover=filters_from_text(_text(attributes["cover"])),
+        counting=bool(attributes["counting"]),
+        level_discrepancy=float(attributes["level_discrepancy"]),
+        gain_discrepancy=float(attributes["gain_discrepancy"]),
+        kerma_discrepancy=_optional_float(group, "kerma_discrepancy"),
+        calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
+        calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
+    )
+    wide = len(spectral.names)
+    samples, best = spectral.samples, spectral.best
+    whole = samples.ndim == 2 and len(samples) > 0 and samples.shape[1] == wide and best.shape == (wide,)
+    if not (whole and bool(np.isfinite(samples).all()) and bool(np.isfinite(best).all())):
+        raise FileFormatError(
+            f"twin {path}, spectral",
+            received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
+            expected=f"finite draws (n, {wide}) and best ({wide},)",
+            remedy="calibrate again",
+        )
+    return spectral
 
 
 def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:

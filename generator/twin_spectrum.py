@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from .spectral_signal import SpectralModel, attenuation_scale_name
-from .twin import Level, NoiseModel, Twin
+from .twin import Level, NoiseModel, SpectralPosterior, Twin
 
 _LARGEST_SECONDARY = 0.06  # of the gain
 
@@ -50,6 +50,11 @@ def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel
             expected="a twin calibrated from flats that state kV and tube load",
             remedy="calibrate from series with kV, current_mA or power_W, and exposure_ms",
         )
+    return model_of_posterior(posterior, highest_kV=highest_kV)
+
+
+def model_of_posterior(posterior: SpectralPosterior, *, highest_kV: float = 160.0) -> SpectralModel:
+    """The spectral model that a posterior's parameters belong to; its tables are kept for the next call."""
     key = (
         posterior.anode,
         posterior.anode_angle_deg,

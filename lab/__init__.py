@@ -9,6 +9,8 @@ _PLACES = {
     "Case": "cases",
     "EFFECTS": "effects",
     "EffectRequest": "effect",
+    "FAMILIES": "families",
+    "Family": "families",
     "Fillet": "objects",
     "GEOMETRIES": "session",
     "GROUPS": "session",
@@ -18,6 +20,7 @@ _PLACES = {
     "RenderedScene": "bench",
     "SESSIONS": "session",
     "Slab": "objects",
+    "Unkindness": "unkindness",
     "aperture_share": "response",
     "compute_incidence": "response",
     "compute_level": "response",
@@ -27,11 +30,13 @@ _PLACES = {
     "request_from_text": "effects",
     "run_protocol": "protocols",
     "sample_system": "system",
+    "sample_unkindness": "unkindness",
     "system_of_seed": "protocols",
 }
 
 __all__ = [
     "EFFECTS",
+    "FAMILIES",
     "GEOMETRIES",
     "GROUPS",
     "PROTOCOLS",
@@ -40,11 +45,13 @@ __all__ = [
     "Bone",
     "Case",
     "EffectRequest",
+    "Family",
     "Fillet",
     "LabSystem",
     "Product",
     "RenderedScene",
     "Slab",
+    "Unkindness",
     "aperture_share",
     "compute_incidence",
     "compute_level",
@@ -54,6 +61,7 @@ __all__ = [
     "request_from_text",
     "run_protocol",
     "sample_system",
+    "sample_unkindness",
     "system_of_seed",
 ]
 

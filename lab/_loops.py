@@ -216,27 +216,27 @@ def light_of_photons(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def spread_light(light, taps, sub, out):  # type: ignore[no-untyped-def]
+def spread_light(light, row_taps, column_taps, sub, out):  # type: ignore[no-untyped-def]
     """Collect fine light in square pixels behind a separable spread.
 
-    `taps` are the shares that a pixel takes of the sub-pixels in a line across it; they reach over the margin that
-    `light` has on every side, so that pixel 0 begins with sub-pixel 0 of `light`.
+    The taps are the shares that a pixel takes of the sub-pixels in a line across it, from row to row and from column to
+    column; they reach over the margin that `light` has on every side, so that pixel 0 begins with sub-pixel 0 of `light`.
     """
     rows, columns = out.shape
-    n_taps = taps.size
+    n_taps = row_taps.size
     fine_columns = light.shape[1]
     for row in prange(rows):
         line = np.zeros(fine_columns, dtype=np.float32)
         start = row * sub
         for t in range(n_taps):
-            w = taps[t]
+            w = row_taps[t]
             for column in range(fine_columns):
                 line[column] += w * light[start + t, column]
         for column in range(columns):
             total = np.float32(0.0)
             begin = column * sub
             for t in range(n_taps):
-                total += taps[t] * line[begin + t]
+                total += column_taps[t] * line[begin + t]
             out[row, column] = total
 
 

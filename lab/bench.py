@@ -13,6 +13,7 @@ from .chain import BASE_STAGES, Arrivals, FrameContext, Stage, run_chain
 from .objects import Scene, fine_shape, thickness_on_fine_grid
 from .response import Incidence, compute_incidence, tube_load_mAs
 from .system import LabSystem, detector_maps
+from .unkindness import USUAL_SERIES, course_of, with_bad_pixels
 
 Frame = NDArray[np.uint16] | NDArray[np.float32]
 
@@ -43,17 +44,32 @@ class Bench:
     The same system, seed and order of exposures give the same bytes, on any number of threads.
     """
 
-    def __init__(self, system: LabSystem, *, rng: np.random.Generator, stages: tuple[Stage, ...] = BASE_STAGES) -> None:
+    def __init__(
+        self,
+        system: LabSystem,
+        *,
+        rng: np.random.Generator,
+        stages: tuple[Stage, ...] = BASE_STAGES,
+        series_count: int = USUAL_SERIES,
+    ) -> None:
         self.system = system
-        self.maps = detector_maps(system)
+        self.base_maps = self.maps = detector_maps(system)
         self.stages = stages
         self.clock_s = 0.0
         self._key = np.uint64(rng.integers(0, 2**64, dtype=np.uint64))
         self._next_frame = 0
+        self.series = 0
+        self.course = course_of(system, self._key, series_count)
         self._memory: dict[str, Any] = {}
         # Rates behind the scene now in the beam, by kV and filters: other exposures of it need no new sum.
         self._in_beam: RenderedScene | None = None
         self._rates: dict[tuple[float, tuple[Filter, ...]], NDArray[np.float32]] = {}
+
+    def begin_series(self, number: int) -> None:
+        """What changes from series to series is from now on as in the series of this number."""
+        self.series = number
+        if self.course is not None:
+            self.maps = with_bad_pixels(self.base_maps, self.course.turned_bad(number))
 
     def arrivals(self, setting: Setting, *, scene: Scene | RenderedScene | None = None) -> Arrivals:
         """Photons that one exposure brings to every sub-pixel, behind a scene or the open field."""
@@ -97,6 +113,9 @@ class Bench:
     def _frame(self, arrivals: Arrivals | None, exposure_ms: float, averaged: int) -> tuple[Frame, float]:
         began_s = self.clock_s
         self.clock_s += averaged * self.frame_interval_ms(exposure_ms) / 1000.0
+        if arrivals is not None and self.course is not None:
+            factor = self.course.output(began_s) * self.course.level(self.series)
+            arrivals = replace(arrivals, load_mAs=arrivals.load_mAs * factor)
         context = FrameContext(
             system=self.system,
             maps=self.maps,
@@ -105,6 +124,9 @@ class Bench:
             key=self._key,
             frame=self._next_frame,
             memory=self._memory,
+            began_s=began_s,
+            series=self.series,
+            course=self.course,
         )
         self._next_frame += averaged
         if averaged > 1 and all(stage.additive for stage in self.stages):

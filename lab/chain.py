@@ -6,12 +6,14 @@ An effect that a real line has and the base lab has not is one more stage, put i
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .system import DetectorMaps, LabSystem
+from .unkindness import SessionCourse
 
 SUBPIXELS = 3
 
@@ -36,7 +38,8 @@ class FrameContext:
 
     Fields: system, maps; exposure_ms; summed: how many exposures are simulated as one and averaged (1: a single frame);
     key: of the random streams; frame: number within the session; memory: what stateful stages keep between frames;
-    began_s: the session's clock when the exposure began.
+    began_s: the session's clock when the exposure began; series: number within the session; course: of what the line does
+    a little all the time (None: nothing).
     """
 
     system: LabSystem
@@ -47,6 +50,8 @@ class FrameContext:
     frame: int
     memory: dict[str, Any] = field(default_factory=dict)
     began_s: float = 0.0
+    series: int = 0
+    course: SessionCourse | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +72,49 @@ def margin_px(psf_sigma_px: float) -> int:
     return 0 if psf_sigma_px == 0 else math.ceil(4.0 * psf_sigma_px + 0.5)
 
 
-def spread_taps(psf_sigma_px: float) -> NDArray[np.float32]:
+TAIL_REACH_PX = 12
+
+
+@lru_cache(maxsize=64)
+def _tail_kernel(law: str, length_px: float) -> NDArray[np.float64]:
+    steps = np.arange(-TAIL_REACH_PX, TAIL_REACH_PX + 1)
+    distance = np.hypot(steps[:, None], steps[None, :]) / length_px
+    weights = np.exp(-distance) if law == "exponential" else (1.0 + distance**2) ** -1.5
+    return np.asarray(weights / weights.sum())
+
+
+def tail_kernel(law: str, length_px: float) -> NDArray[np.float64]:
+    """Shares (row, column) of the tail's light that pixels around take, from -12 to 12 px; they add up to 1."""
+    return _tail_kernel(law, length_px).copy()
+
+
+@lru_cache(maxsize=16)
+def _tail_spectrum(law: str, length_px: float, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    from scipy import fft
+
+    kernel = _tail_kernel(law, length_px).astype(np.float32)
+    placed = np.zeros(shape, dtype=np.float32)
+    placed[: kernel.shape[0], : kernel.shape[1]] = kernel
+    placed = np.roll(placed, (-TAIL_REACH_PX, -TAIL_REACH_PX), axis=(0, 1))
+    return np.asarray(fft.rfft2(placed, workers=1))
+
+
+def with_tail(light: NDArray[np.float32], system: LabSystem) -> NDArray[np.float32]:
+    """Light in pixels (row, column) of which a share has gone farther; beyond the borders it goes on as in a mirror."""
+    from scipy import fft
+
+    share = np.float32(system.tail_share)
+    wide = np.pad(light, TAIL_REACH_PX, mode="symmetric")
+    shape = tuple(fft.next_fast_len(length, real=True) for length in wide.shape)
+    spectrum = _tail_spectrum(system.tail_law, system.tail_length_px, (shape[0], shape[1]))
+    far = fft.irfft2(fft.rfft2(wide, s=shape, workers=1) * spectrum, s=shape, workers=1)
+    rows, columns = light.shape
+    inside = slice(TAIL_REACH_PX, TAIL_REACH_PX + rows), slice(TAIL_REACH_PX, TAIL_REACH_PX + columns)
+    mixed = (np.float32(1.0) - share) * light + share * far[inside]
+    return np.asarray(np.maximum(mixed, 0.0), dtype=np.float32)
+
+
+def spread_taps(psf_sigma_px: float, *, margin: int | None = None) -> NDArray[np.float32]:
     """Shares that a pixel takes of a line of sub-pixels across it and its margins; shape ((2 margin + 1) SUBPIXELS,).
 
     w(x) = Phi((x + 1/2) / sigma) - Phi((x - 1/2) / sigma), x from the pixel's centre to the sub-pixel's, rescaled so
@@ -75,10 +122,10 @@ def spread_taps(psf_sigma_px: float) -> NDArray[np.float32]:
     """
     from scipy.special import ndtr
 
-    margin = margin_px(psf_sigma_px)
+    margin = margin_px(psf_sigma_px) if margin is None else margin
     x = (np.arange((2 * margin + 1) * SUBPIXELS) + 0.5) / SUBPIXELS - margin - 0.5
     if psf_sigma_px == 0:
-        return np.ones(SUBPIXELS, dtype=np.float32)
+        return (np.abs(x) < 0.5).astype(np.float32)
     taps = ndtr((x + 0.5) / psf_sigma_px) - ndtr((x - 0.5) / psf_sigma_px)
     phases = taps.reshape(-1, SUBPIXELS)
     shares: NDArray[np.float32] = (phases / phases.sum(axis=0)).ravel().astype(np.float32)
@@ -116,9 +163,32 @@ def _spread(light: NDArray[np.float32], context: FrameContext) -> NDArray[np.flo
     """Light spread and collected in square pixels (keV per pixel)."""
     from ._loops import spread_light
 
-    collected = _dark_light(context)
-    spread_light(light, spread_taps(context.system.psf_sigma_px), SUBPIXELS, collected)
-    return collected
+    collected, system = _dark_light(context), context.system
+    margin = margin_px(max(system.core_px))
+    by_row, by_column = (spread_taps(sigma, margin=margin) for sigma in system.core_px)
+    spread_light(light, by_row, by_column, SUBPIXELS, collected)
+    return with_tail(collected, system) if system.tail_share else collected
+
+
+def _shading(light: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
+    """Light as the open field's shape and dust are in this series."""
+    if context.course is None:
+        return light
+    shaded: NDArray[np.float32] = light * context.course.shading(context.series)
+    return shaded
+
+
+def _lines(level_DN: NDArray[np.float32], context: FrameContext) -> NDArray[np.float32]:
+    """The level with the dark's drift and the offsets of rows and columns in this frame."""
+    if context.course is None:
+        return level_DN
+    sigma_DN = context.system.read_noise_DN
+    rows, columns = context.course.line_noise(context.frame, context.summed)
+    offset_DN = context.course.dark_DN(context.began_s)
+    moved: NDArray[np.float32] = level_DN + (sigma_DN * rows[:, None] + sigma_DN * columns + offset_DN).astype(
+        np.float32
+    )
+    return moved
 
 
 def electrons_drawn(
@@ -181,8 +251,10 @@ def _digitise(level_DN: NDArray[np.float32], context: FrameContext) -> NDArray[n
 BASE_STAGES: tuple[Stage, ...] = (
     Stage(name="photons", apply=_photons),
     Stage(name="spread", apply=_spread),
+    Stage(name="shading", apply=_shading),
     Stage(name="electrons", apply=_electrons),
     Stage(name="readout", apply=_readout),
+    Stage(name="lines", apply=_lines),
     Stage(name="digitise", apply=_digitise),
 )
 

@@ -134,7 +134,7 @@ def _heel(request: EffectRequest, site: Site) -> Planted:
 
 def _field_coordinates(system: LabSystem) -> tuple[Array, Array]:
     """-1/2 to 1/2 from the middle of the first pixel to that of the last, on the fine grid and its margins."""
-    margin = margin_px(system.psf_sigma_px)
+    margin = margin_px(max(system.core_px))
     result = []
     for length, fine in zip((system.rows, system.columns), fine_shape(system), strict=True):
         pixel = (np.arange(fine) + 0.5) / SUBPIXELS - margin - 0.5
@@ -271,7 +271,7 @@ WATER_MM = 20.0
 
 def _object_scatter(request: EffectRequest, site: Site) -> Planted:
     system, seed = site.system, int(site.rng.integers(2**62))
-    margin = margin_px(system.psf_sigma_px) * SUBPIXELS
+    margin = margin_px(max(system.core_px)) * SUBPIXELS
 
     def field_of(fine: FineMap) -> FineMap:
         return fine[margin : fine.shape[0] - margin, margin : fine.shape[1] - margin]

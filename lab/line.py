@@ -19,6 +19,7 @@ from .objects import fine_shape
 from .phantoms import Posed
 from .response import Incidence, compute_incidence, tube_load_mAs
 from .system import DetectorMaps, LabSystem, detector_maps
+from .unkindness import USUAL_SERIES, course_of, with_bad_pixels
 
 FineMap = NDArray[np.float32]
 
@@ -150,13 +151,13 @@ def _readout(electrons: NDArray[np.float32], context: FrameContext) -> NDArray[n
     return level_read_out(electrons, context, loop=read_out_fast)
 
 
-# Photons, spread, electrons, readout, digitise: spread and ADC as in every chain.
+# Photons, spread, shading, electrons, readout, lines, digitise; all but the loops of bright frames as in every chain.
 SESSION_STAGES: tuple[Stage, ...] = (
     Stage(name="photons", apply=light_of_arrivals),
-    BASE_STAGES[1],
+    *BASE_STAGES[1:3],
     Stage(name="electrons", apply=_electrons),
     Stage(name="readout", apply=_readout),
-    BASE_STAGES[4],
+    *BASE_STAGES[5:],
 )
 
 
@@ -181,12 +182,21 @@ def stages_with(planted: tuple[Planted, ...]) -> tuple[Stage, ...]:
 class Line:
     """A system with its effects, switched on; the same system, effects, seed and order give the same bytes."""
 
-    def __init__(self, system: LabSystem, *, rng: np.random.Generator, planted: tuple[Planted, ...] = ()) -> None:
+    def __init__(
+        self,
+        system: LabSystem,
+        *,
+        rng: np.random.Generator,
+        planted: tuple[Planted, ...] = (),
+        series_count: int = USUAL_SERIES,
+    ) -> None:
         self.base = system
         self._planted = planted
         self.clock_s = 0.0
         self._key = np.uint64(rng.integers(0, 2**64, dtype=np.uint64))
         self._next_frame = 0
+        self.series = 0
+        self.course = course_of(system, self._key, series_count)
         self._memory: dict[str, Any] = {}
         self.base_maps = detector_maps(system)
         self._kept: dict[tuple[Any, ...], FineRates] = {}
@@ -202,6 +212,8 @@ class Line:
                 self.system = effect.system(self.system)
             if effect.maps is not None:
                 self.maps = effect.maps(self.maps)
+        if self.course is not None:
+            self.maps = with_bad_pixels(self.maps, self.course.turned_bad(self.series))
         self._stages = stages_with(self.active)
         self._additive = all(stage.additive for stage in self._stages) and not any(e.load for e in self.active)
         self._kept.clear()
@@ -210,6 +222,12 @@ class Line:
         """Effects that came after the calibration act from now on."""
         if not self.calibrated:
             self._set_in(calibrated=True)
+
+    def begin_series(self, number: int) -> None:
+        """What changes from series to series is from now on as in the series of this number."""
+        before, self.series = self.series, number
+        if self.course is not None and self.course.turned_bad(before) != self.course.turned_bad(number):
+            self._set_in(calibrated=self.calibrated)
 
     def pause(self, seconds: float) -> None:
         """Let time pass with the beam off and no frame read."""
@@ -303,8 +321,13 @@ class Line:
             frame=self._next_frame,
             memory=self._memory,
             began_s=self.clock_s,
+            series=self.series,
+            course=self.course,
         )
         if arrivals is not None:
+            if self.course is not None:
+                factor = self.course.output(self.clock_s) * self.course.level(self.series)
+                arrivals = replace(arrivals, load_mAs=arrivals.load_mAs * factor)
             for effect in self.active:
                 if effect.load is not None:
                     arrivals = replace(arrivals, load_mAs=arrivals.load_mAs * effect.load(self.clock_s))

@@ -198,7 +198,7 @@ def clear_field_mm(system: LabSystem) -> tuple[float, float]:
 
 def fine_shape(system: LabSystem) -> tuple[int, int]:
     """Rows and columns of the grid of sub-pixels, margins of the light's spread included."""
-    margin = margin_px(system.psf_sigma_px)
+    margin = margin_px(max(system.core_px))
     return (system.rows + 2 * margin) * SUBPIXELS, (system.columns + 2 * margin) * SUBPIXELS
 
 
@@ -226,7 +226,7 @@ def thickness_on_fine_grid(system: LabSystem, scene: Scene) -> dict[str, NDArray
 
 def pixel_means(system: LabSystem, fine: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mean over the sub-pixels of each pixel of the detector, margins cut off; shape (rows, columns)."""
-    margin = margin_px(system.psf_sigma_px) * SUBPIXELS
+    margin = margin_px(max(system.core_px)) * SUBPIXELS
     inner = fine[margin : fine.shape[0] - margin, margin : fine.shape[1] - margin]
     blocks = inner.reshape(system.rows, SUBPIXELS, system.columns, SUBPIXELS)
     means: NDArray[np.float32] = blocks.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)

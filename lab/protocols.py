@@ -32,6 +32,7 @@ from .objects import (
 from .session import GEOMETRIES, SESSIONS, make_session, measure_session, session_system
 from .system import LabSystem, sample_system
 from .truth import compute_truth, flat_truth
+from .unkindness import Unkindness
 
 if TYPE_CHECKING:
     from .effect import EffectRequest
@@ -127,6 +128,24 @@ def plan_calibration(*, frames: int) -> Plan:
         flat(kV, power_W, exposure_ms, filters, "evaluation")
     takes += [_dark(exposure_ms, frames=frames, label="after") for exposure_ms in exposures_ms]
     return Plan(takes=tuple(takes))
+
+
+def plan_averaged(*, frames: int, pairs: bool) -> Plan:
+    """The calibration's settings with flats and darks stored as means of `frames` exposures, as many lines do.
+
+    One mean a setting; or two in different series, the second after all settings were visited once (`pairs`).
+    """
+    single = plan_calibration(frames=1)
+
+    def stored(take: Take, name: str) -> Take:
+        return replace(take, name=name, setting=replace(take.setting, averaged=frames))
+
+    calibrating = [take for take in single.takes if take.kind == "dark" or take.role == "calibration"]
+    held_back = [stored(take, take.name) for take in single.takes if take.role == "evaluation"]
+    takes = [stored(take, take.name) for take in calibrating]
+    if pairs:
+        takes += [stored(take, f"{take.name}_again") for take in calibrating if take.kind == "flat"]
+    return Plan(takes=(*takes, *held_back))
 
 
 def _object_takes(scene: str, exposures: tuple[tuple[float, int], ...], *, frames: int) -> list[Take]:
@@ -266,8 +285,12 @@ PROTOCOLS: dict[str, str] = {
     "calibration": "darks and flats at several powers and exposures, 40 and 90 kV, some settings held back",
     "set1": "fillets with and without rib bones of 1.5-11 mm, at 1 s",
     "set2": "two fillets with bones of 2 and 3 mm in many places, at 1 s, 100, 50 and 20 ms",
+    "averaged": "as calibration, each flat and dark stored once as the mean of its frames",
+    "averaged_pairs": "as averaged, every flat stored in two series",
 }
-DEFAULT_FRAMES = {"calibration": 20, "set1": 1, "set2": 1}
+DEFAULT_FRAMES = {"calibration": 20, "averaged": 50, "averaged_pairs": 50, "set1": 1, "set2": 1}
+# of random numbers: what a seed gives does not hang on the order of a table
+_PLACES = {"calibration": 0, "set1": 1, "set2": 2, "averaged": 3, "averaged_pairs": 4}
 DEFAULT_PRODUCTS = {"set1": SET_1_PRODUCTS, "set2": SET_2_PRODUCTS}
 
 
@@ -278,11 +301,15 @@ def system_of_seed(
     columns: int = 160,
     pixel_mm: float = 0.45,
     source_detector_mm: float | None = None,
+    families: Sequence[str] | None = None,
 ) -> LabSystem:
-    """The hidden system of a seed, with a detector of the given size: the same in every protocol and session."""
+    """The hidden system of a seed, with a detector of the given size: the same in every protocol and session.
+
+    families: of departures to draw from, of `families.FAMILIES`; None: all of them.
+    """
     if not (math.isfinite(pixel_mm) and 0.01 <= pixel_mm <= 10.0):
         raise InputError("pixel_mm", received=f"{pixel_mm:g} mm", expected="0.01 to 10 mm")
-    return sample_system(np.random.default_rng([seed, 0])).at_size(
+    return sample_system(np.random.default_rng([seed, 0]), families=families).at_size(
         rows=rows, columns=columns, pixel_mm=pixel_mm, source_detector_mm=source_detector_mm
     )
 
@@ -308,10 +335,12 @@ def make_plan(
     frames = DEFAULT_FRAMES[protocol] if frames is None else frames
     if frames < 1:
         raise InputError("frames", received=frames, expected="1 or more")
-    if protocol == "calibration":
+    if protocol not in DEFAULT_PRODUCTS:
         if frames < 2:
             raise InputError("frames", received=frames, expected="2 or more in a calibration")
-        return plan_calibration(frames=frames)
+        if protocol == "calibration":
+            return plan_calibration(frames=frames)
+        return plan_averaged(frames=frames, pairs=protocol == "averaged_pairs")
     products = DEFAULT_PRODUCTS[protocol] if products is None else products
     if products < 2:
         raise InputError("products", received=products, expected="2 or more")
@@ -344,6 +373,8 @@ def run_protocol(
     bones_mm: tuple[float, ...] | None = None,
     session: int = 0,
     system: LabSystem | None = None,
+    families: Sequence[str] | None = None,
+    unkindness: Unkindness | None = None,
     geometry: str | None = None,
     effects: Sequence["EffectRequest"] = (),
     leave_out: Sequence[str] = (),
@@ -356,7 +387,7 @@ def run_protocol(
 
     Args:
         path: the acquisition file to write; the truth goes to `truth_path(path)`.
-        protocol: `calibration`, `set1` or `set2`; or `full`, `short` or `products`, see `session`.
+        protocol: `calibration`, `averaged`, `averaged_pairs`, `set1` or `set2`; or `full`, `short` or `products`, see `session`.
         seed: draws the hidden system, the products and the noise; the same seed is the same system in all protocols.
         rows, columns, pixel_mm: the detector, 128 x 160 pixels of 0.45 mm by default; distances scale with the pixel,
             see `LabSystem.at_size`. Long sessions are 128 x 128 and have the pixel of their geometry.
@@ -367,6 +398,8 @@ def run_protocol(
         bones_mm: lengths of the bones, instead of the set's own.
         session: another number is another day: other noise and other products on the same system.
         system: a system to measure with, instead of the seed's.
+        families: of departures that the seed's system is drawn from, of `families.FAMILIES`; None: all of them.
+        unkindness: what the line does a little all the time, instead of the system's own; `unkindness.NONE`: nothing.
         geometry: `fine` or `coarse` (the default), for the long sessions.
         effects: to be planted, in the long sessions; their inner parameters are the seed's in every protocol and session.
         leave_out, only: groups of series that are not taken, or taken alone with the darks, in the long sessions; see
@@ -401,6 +434,8 @@ def run_protocol(
             bones_mm=bones_mm,
             session=session,
             system=system,
+            families=families,
+            unkindness=unkindness,
             effects=tuple(effects),
             leave_out=leave_out,
             only=only,
@@ -422,8 +457,11 @@ def run_protocol(
             columns=160 if columns is None else columns,
             pixel_mm=0.45 if pixel_mm is None else pixel_mm,
             source_detector_mm=source_detector_mm,
+            families=families,
         )
-    place = list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else 0
+    if unkindness is not None:
+        system = replace(system, unkindness=unkindness)
+    place = _PLACES.get(protocol, 0)
     plan_rng, noise_rng = (np.random.default_rng([seed, 1 + place, session, part]) for part in (0, 1))
     plan = make_plan(
         protocol,
@@ -434,12 +472,13 @@ def run_protocol(
         product_mm=product_mm,
         bones_mm=bones_mm,
     )
-    bench = Bench(system, rng=noise_rng)
+    bench = Bench(system, rng=noise_rng, series_count=len(plan.takes))
     begin(plan.frames)
     series: dict[str, dict[str, Any]] = {}
     with write_acquisition(path, system.instrument()) as writer:
         in_beam, rendered = "", None
-        for take in plan.takes:
+        for number, take in enumerate(plan.takes):
+            bench.begin_series(number)
             if take.scene and take.scene != in_beam:
                 in_beam, product = take.scene, plan.scenes[take.scene]
                 rendered = render(system, product)
@@ -459,6 +498,7 @@ def run_protocol(
             settings=[take.setting for take in plan.takes if take.kind != "dark"],
             exposures_ms=[take.setting.exposure_ms for take in plan.takes],
         ),
+        "unkindness": None if bench.course is None else bench.course.told(),
         "series": series,
     }
     with whole_file(truth_path(path) if truth_file is None else truth_file) as temporary:
@@ -485,6 +525,8 @@ def _run_session(
     bones_mm: tuple[float, ...] | None,
     session: int,
     system: LabSystem | None,
+    families: Sequence[str] | None,
+    unkindness: Unkindness | None,
     effects: tuple["EffectRequest", ...],
     leave_out: Sequence[str],
     only: Sequence[str] | None,
@@ -499,7 +541,9 @@ def _run_session(
         raise InputError("geometry", received=repr(geometry), expected="one of " + ", ".join(GEOMETRIES))
     bench = GEOMETRIES[geometry]
     if system is None:
-        system = session_system(seed, rows=rows, columns=columns, geometry=bench)
+        system = session_system(seed, rows=rows, columns=columns, geometry=bench, families=families)
+    if unkindness is not None:
+        system = replace(system, unkindness=unkindness)
     place = 100 + list(SESSIONS).index(protocol)
     plan_rng, noise_rng = (np.random.default_rng([seed, place, session, part]) for part in (0, 1))
     effect_rng = np.random.default_rng([seed, 99])
@@ -554,7 +598,9 @@ def _measure(
         advance()
     expected: dict[str, Any] = {"kind": take.kind}
     if take.kind == "flat":
-        expected |= flat_truth(system, bench.maps, setting)
+        if bench.course is not None:
+            expected["level"] = bench.course.level(bench.series)
+        expected |= flat_truth(system, bench.base_maps, setting)
     return expected
 
 

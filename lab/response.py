@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from .attenuation import composition, mu_per_mm
+from .chain import tail_kernel
+from .light import relative_yield
 from .system import LabSystem
 from .tube import Beam, beam
 
 Array = NDArray[np.float64]
 
-SCINTILLATOR = "CsI"
+OUTPUT_KV = 60.0  # where `output_exponent` changes nothing
 ENERGY_GROUPS = 40
 DEPOSIT_CLASSES = 10
 # A class of object thickness in the middle of what is inspected: groups are merged so that they are best there.
@@ -27,7 +30,7 @@ _TYPICAL_MM = 12.0
 class Deposits:
     """What photons of each energy leave in the scintillator.
 
-    Fields: energy_index (n,) which energy of the beam; deposit_keV (n,); probability (n,) per photon that arrives, so
+    Fields: energy_index (n,) which energy of the beam; deposit_keV (n,), as light; probability (n,) per photon that arrives, so
     that the sum over one energy is the fraction absorbed.
     """
 
@@ -50,66 +53,113 @@ def _k_lines(element: str) -> list[tuple[float, float]]:
     return [(energy, share / total) for energy, share in result]
 
 
-def _escape_probability(mu_in: Array, mu_line_per_mm: float, thickness_mm: float) -> Array:
+def _escape_probability(
+    mu_in: Array, mu_line_per_mm: float, thickness_mm: float, *, layer_mm: tuple[float, float] | None = None
+) -> Array:
     """Chance that a fluorescence photon leaves a slab through either face, for photons absorbed with `mu_in` (per mm).
 
-    Mean over the depth z, of density mu exp(-mu z) / (1 - exp(-mu L)), of [E2(mu_k z) + E2(mu_k (L - z))] / 2.
+    Mean over the depth z, of density mu exp(-mu z) / (1 - exp(-mu L)), of [E2(mu_k z) + E2(mu_k (L - z))] / 2; of photons
+    absorbed in a layer (from, to) of the depth alone where one is given.
     """
     from scipy.special import expn
 
+    begin_mm, end_mm = layer_mm or (0.0, thickness_mm)
     nodes, weights = np.polynomial.legendre.leggauss(96)
     # A square maps the nodes towards the entrance face, where nearly all photons stop when the slab is thick.
     u = 0.5 * (nodes + 1.0)
-    depth_mm = thickness_mm * u**2
-    measure_mm = 0.5 * weights * 2.0 * thickness_mm * u
+    depth_mm = begin_mm + (end_mm - begin_mm) * u**2
+    measure_mm = 0.5 * weights * 2.0 * (end_mm - begin_mm) * u
     leave = 0.5 * (expn(2, mu_line_per_mm * depth_mm) + expn(2, mu_line_per_mm * (thickness_mm - depth_mm)))
     density = mu_in[:, None] * np.exp(-mu_in[:, None] * depth_mm[None, :])
     result: Array = (density * leave * measure_mm).sum(axis=1) / (density * measure_mm).sum(axis=1)
     return result
 
 
-def compute_deposits(energy_keV: Array, *, scintillator_mm: float) -> Deposits:
-    """Energies left in a caesium iodide slab and their probabilities per arriving photon.
+DEPTH_LAYERS = 4
+_LOWEST_EDGE_KEV = 10.0  # K photons of lighter elements never get out
+
+
+def compute_deposits(
+    energy_keV: Array,
+    *,
+    scintillator_mm: float,
+    scintillator: str = "CsI",
+    k_escape_share: float = 1.0,
+    light_curve: float = 0.0,
+    depth_light: float = 0.0,
+) -> Deposits:
+    """Energies left in a scintillator, as light in keV, and their probabilities per arriving photon.
 
     A photon is absorbed with D = 1 - exp(-mu L). Above a K edge, the share tau_i / mu (1 - 1/J) omega of the absorbed
     ones makes a K photon, which leaves through a face with the probability of `_escape_probability` and takes its
-    energy along; everything else deposits all of E. Scattered photons that leave are not followed.
+    energy along; everything else deposits all of E. Scattered photons that leave are not followed. Light is in proportion
+    to the deposit unless `light_curve` or `depth_light` say otherwise.
 
     Args:
         energy_keV: (n,) energies of the beam, 3 to 300 keV.
-        scintillator_mm: thickness L.
+        scintillator_mm: solid-density thickness L.
+        scintillator: material.
+        k_escape_share: of the K photons that would leave a bare slab, how many do (columns and covers catch some).
+        light_curve: how far the light goes with `light.relative_yield` (0: in proportion to the deposit).
+        depth_light: light of the exit face over that of the entrance, less 1; linear in the depth, 1 in the middle.
 
     Source: edge jumps, yields and lines from xraydb (Elam, Ravel and Sieber 2002), attenuation from Chantler.
     """
     import xraydb
 
-    mu = mu_per_mm(SCINTILLATOR, energy_keV)
-    absorbed = -np.expm1(-mu * scintillator_mm)
-    fractions, density_g_cm3 = composition(SCINTILLATOR)
-    full = absorbed.copy()
+    mu = mu_per_mm(scintillator, energy_keV)
+    fractions, density_g_cm3 = composition(scintillator)
     index, deposit, probability = [], [], []
     everywhere = np.arange(energy_keV.size)
-    for element, fraction in fractions.items():
-        edge = xraydb.xray_edge(element, "K")
-        above = np.flatnonzero(energy_keV > edge.energy / 1000.0)
-        if above.size == 0:
-            continue
-        photo = np.asarray(xraydb.mu_chantler(element, energy_keV[above] * 1000.0, photo=True))
-        share = fraction * photo * density_g_cm3 / 10.0 / mu[above] * (1.0 - 1.0 / edge.jump_ratio) * edge.fyield
-        for line_keV, line_share in _k_lines(element):
-            mu_line = float(mu_per_mm(SCINTILLATOR, np.array([line_keV]))[0])
-            leaves = absorbed[above] * share * line_share * _escape_probability(mu[above], mu_line, scintillator_mm)
-            # Chantler's edge may lie a few eV off the line table's: no deposit may be negative.
-            left_keV = energy_keV[above] - line_keV
-            leaves = np.where(left_keV > 0, leaves, 0.0)
-            full[above] -= leaves
-            index.append(above)
-            deposit.append(np.maximum(left_keV, 0.0))
-            probability.append(leaves)
+
+    def light_keV(left_keV: Array, *, of_photon: bool) -> Array:
+        if light_curve == 0.0:
+            return left_keV
+        return left_keV * (1.0 + light_curve * (relative_yield(scintillator, left_keV, of_photon=of_photon) - 1.0))
+
+    bounds_mm = np.linspace(0.0, scintillator_mm, (DEPTH_LAYERS if depth_light else 1) + 1)
+    for begin_mm, end_mm in pairwise(bounds_mm):
+        bright = 1.0 + depth_light * (0.5 * (begin_mm + end_mm) / scintillator_mm - 0.5)
+        absorbed = np.exp(-mu * begin_mm) * -np.expm1(-mu * (end_mm - begin_mm))
+        full = absorbed.copy()
+        # what leaves it all first, the array filled below
+        index.append(everywhere)
+        deposit.append(bright * light_keV(energy_keV, of_photon=True))
+        probability.append(full)
+        for element, fraction in fractions.items():
+            edge = xraydb.xray_edge(element, "K")
+            above = np.flatnonzero(energy_keV > edge.energy / 1000.0)
+            if above.size == 0 or edge.energy / 1000.0 < _LOWEST_EDGE_KEV or k_escape_share == 0.0:
+                continue
+            photo = np.asarray(xraydb.mu_chantler(element, energy_keV[above] * 1000.0, photo=True))
+            share = fraction * photo * density_g_cm3 / 10.0 / mu[above] * (1.0 - 1.0 / edge.jump_ratio) * edge.fyield
+            for line_keV, line_share in _k_lines(element):
+                mu_line = float(mu_per_mm(scintillator, np.array([line_keV]))[0])
+                out = _escape_probability(mu[above], mu_line, scintillator_mm, layer_mm=(begin_mm, end_mm))
+                leaves = absorbed[above] * share * line_share * k_escape_share * out
+                # Chantler's edge may lie a few eV off the line table's: no deposit may be negative.
+                left_keV = energy_keV[above] - line_keV
+                leaves = np.where(left_keV > 0, leaves, 0.0)
+                full[above] -= leaves
+                index.append(above)
+                deposit.append(bright * light_keV(np.maximum(left_keV, 0.0), of_photon=False))
+                probability.append(leaves)
     return Deposits(
-        energy_index=np.concatenate([everywhere, *index]),
-        deposit_keV=np.concatenate([energy_keV, *deposit]),
-        probability=np.concatenate([full, *probability]),
+        energy_index=np.concatenate(index),
+        deposit_keV=np.concatenate(deposit),
+        probability=np.concatenate(probability),
+    )
+
+
+def deposits_of(system: LabSystem, energy_keV: Array) -> Deposits:
+    """Deposits in a system's scintillator, as `compute_deposits`."""
+    return compute_deposits(
+        energy_keV,
+        scintillator_mm=system.scintillator_mm,
+        scintillator=system.scintillator,
+        k_escape_share=system.k_escape_share,
+        light_curve=system.light_curve,
+        depth_light=system.depth_light,
     )
 
 
@@ -154,12 +204,19 @@ def photons_per_pixel_mAs(system: LabSystem, light: Beam) -> Array:
 
 
 def beam_of(system: LabSystem, *, kV: float, filters: tuple[Filter, ...]) -> Beam:
-    """The beam of a system at a voltage that was set: true voltage, inherent filtration and filters applied."""
-    return beam(
+    """The beam of a system at a voltage that was set, as it falls on the scintillator: anode, filters and covers applied."""
+    rough = (Filter(material="W", thickness_mm=system.anode_rough_um / 1000.0),) if system.anode_rough_um else ()
+    light = beam(
         kV=kV * (1.0 + system.kV_offset_percent / 100.0),
         anode_angle_deg=system.anode_angle_deg,
-        filters=(*system.inherent_filtration, *filters),
+        filters=(*rough, *system.inherent_filtration, *filters, *system.cover),
+        model=system.tube_model,
+        ripple_percent=system.kV_ripple_percent,
     )
+    if system.output_exponent == 0.0:
+        return light
+    factor = (kV / OUTPUT_KV) ** system.output_exponent
+    return Beam(energy_keV=light.energy_keV, photons_per_mAs_mm2=light.photons_per_mAs_mm2 * factor)
 
 
 def _edges_of_equal_share(weights: Array, count: int) -> NDArray[np.intp]:
@@ -212,7 +269,7 @@ def _incidence(
         )
     light = Beam(energy_keV=light.energy_keV[heard], photons_per_mAs_mm2=light.photons_per_mAs_mm2[heard])
     photons = photons[heard]
-    deposits = compute_deposits(light.energy_keV, scintillator_mm=system.scintillator_mm)
+    deposits = deposits_of(system, light.energy_keV)
     # A trace of the open beam, so that energies of which the typical object leaves nothing still have a mean.
     typical = photons * (np.exp(-mu_per_mm("chicken_breast", light.energy_keV) * _TYPICAL_MM) + 1e-9)
     energy_signal = np.bincount(deposits.energy_index, deposits.deposit_keV * deposits.probability)
@@ -278,7 +335,7 @@ def compute_level(
     photons = photons_per_pixel_mAs(system, light)
     for material, length in (thickness_mm or {}).items():
         photons = photons * np.exp(-mu_per_mm(material, light.energy_keV) * length)
-    deposits = compute_deposits(light.energy_keV, scintillator_mm=system.scintillator_mm)
+    deposits = deposits_of(system, light.energy_keV)
     rate = photons[deposits.energy_index] * deposits.probability
     return Level(
         photons_absorbed_per_mAs=float(rate.sum()),
@@ -323,6 +380,36 @@ def aperture_share(psf_sigma_px: float, lag_px: int = 0) -> float:
         )
 
     return primitive(lag_px + 1.0) - 2.0 * primitive(float(lag_px)) + primitive(lag_px - 1.0)
+
+
+def noise_shares(system: LabSystem, lag_rows: int = 0, lag_columns: int = 0) -> float:
+    """Autocovariance of white quanta seen through pixel, core and tail at a lag, per variance of the quanta.
+
+    The core's share of `aperture_share` along rows and columns, summed over the autocorrelation of the shares of light
+    that stay and that the tail takes elsewhere: exact far from the borders.
+    """
+    down, across = system.core_px
+    if system.tail_share == 0.0:
+        return aperture_share(down, lag_rows) * aperture_share(across, lag_columns)
+    kernel = system.tail_share * tail_kernel(system.tail_law, system.tail_length_px)
+    middle = kernel.shape[0] // 2
+    kernel[middle, middle] += 1.0 - system.tail_share
+    spectrum = np.abs(np.fft.rfft2(kernel, s=(4 * middle + 2, 4 * middle + 2))) ** 2
+    alike = np.fft.irfft2(spectrum, s=(4 * middle + 2, 4 * middle + 2))
+    lags = np.arange(-2 * middle, 2 * middle + 1)
+    by_row = np.array([aperture_share(down, int(lag_rows - lag)) for lag in lags])
+    by_column = np.array([aperture_share(across, int(lag_columns - lag)) for lag in lags])
+    return float(by_row @ alike[np.ix_(lags, lags)] @ by_column)
+
+
+def equivalent_sigma_px(system: LabSystem) -> float:
+    """Width of the Gaussian that would leave the same share of the quanta's variance in a pixel (px)."""
+    from scipy.optimize import brentq
+
+    wanted = math.sqrt(noise_shares(system))
+    if wanted >= aperture_share(0.0):
+        return 0.0
+    return float(brentq(lambda sigma: aperture_share(sigma) - wanted, 1e-6, 20.0))
 
 
 def tube_load_mAs(setting: Setting) -> float:

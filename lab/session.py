@@ -465,13 +465,15 @@ SESSION_FRAMES = 50
 SESSION_PRODUCTS = {"full": 4, "short": 8, "products": 12}
 
 
-def session_system(seed: int, *, rows: int, columns: int, geometry: Geometry) -> LabSystem:
+def session_system(
+    seed: int, *, rows: int, columns: int, geometry: Geometry, families: Sequence[str] | None = None
+) -> LabSystem:
     """The hidden system of a seed on one of the two benches for long sessions.
 
     Its powers are those of the bench, so an output and a conversion that are both high are limited: the brightest
-    flats stay below the ADC's end.
+    flats stay below the ADC's end. families: of departures to draw from; None: all of them.
     """
-    drawn = sample_system(np.random.default_rng([seed, 0]))
+    drawn = sample_system(np.random.default_rng([seed, 0]), families=families)
     usual = LabSystem()
     brightness = drawn.tube_output * drawn.electrons_per_keV * drawn.DN_per_electron
     brightness /= usual.electrons_per_keV * usual.DN_per_electron
@@ -559,7 +561,7 @@ def measure_session(
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Work off a plan on a line with its effects; write the acquisition and the truth; return the truth."""
-    line = Line(system, rng=rng, planted=planted)
+    line = Line(system, rng=rng, planted=planted, series_count=len(plan.takes))
     begin(plan.frames)
     with _threads_for(system):
         series = _work_off(path, line, plan, advance)
@@ -578,6 +580,7 @@ def measure_session(
             settings=[take.setting for take in plan.takes if take.kind in ("flat", "object")],
             exposures_ms=[take.setting.exposure_ms for take in plan.takes],
         ),
+        "unkindness": None if line.course is None else line.course.told(),
         "scenes": {
             name: _pose(scene.true) for name, scene in plan.scenes.items() if any(t.scene == name for t in plan.takes)
         },
@@ -611,9 +614,10 @@ def _work_off(
     in_beam = ""
     thickness_mm: dict[str, NDArray[np.float32]] = {}
     with write_acquisition(path, system.instrument()) as writer:
-        for take in plan.takes:
+        for number, take in enumerate(plan.takes):
             if take.role == "evaluation":
                 line.calibration_is_over()
+            line.begin_series(number)
             line.pause(take.pause_s)
             if take.scene and take.scene != in_beam:
                 in_beam = take.scene
@@ -683,6 +687,8 @@ def _measure(
     expected: dict[str, Any] = {"kind": take.kind}
     if take.kind in ("flat", "object"):
         expected["output"] = take.output
+        if line.course is not None:
+            expected["level"] = line.course.level(line.series)
     if take.kind == "flat":
         # Of the line as it was calibrated; effects are told apart from it.
         expected |= flat_truth(line.base, line.base_maps, setting)

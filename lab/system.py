@@ -1,6 +1,7 @@
 """The system that stands in the virtual lab: its true parameters, fixed or drawn, and its per-pixel maps."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -9,10 +10,13 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter
 from ..errors import InputError
+from .unkindness import NONE, Unkindness, sample_unkindness
 
 PAPER_PIXEL_MM = 0.15
 PAPER_SOURCE_OBJECT_MM = 990.0
 PAPER_SOURCE_DETECTOR_MM = 1059.0
+SCINTILLATORS = ("CsI", "Gd2O2S@7.32")
+TAIL_LAWS = ("exponential", "lorentzian")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,30 +25,44 @@ class LabSystem:
 
     The defaults give what the paper's line gives: 23 DN/ms at 40 kV 40 W and 174 DN/ms at 90 kV 45 W behind 50 um Cu, a
     photon-transfer slope near 1.95 DN at 40 kV (the gain with the blur's share restored is near 6 DN), a dark variance
-    of 165.63 DN2 and a dark level of 1250 DN.
+    of 165.63 DN2 and a dark level of 1250 DN. The defaults have no unkindness and no departure of any family.
 
     Fields:
         rows, columns: pixels of the detector.
         pixel_mm: pitch; the sensitive area fills it.
         source_object_mm, source_detector_mm: distances. `LabSystem.at_size` scales them with the pitch, so that every
             pitch gets the photons per pixel of the paper's line at the same power.
-        anode_angle_deg: of the tungsten anode.
+        anode_angle_deg: of the tungsten anode; labelled_angle_deg: what the sheet says.
         kV_offset_percent: how much the true voltage exceeds the set one.
         tube_output: photons emitted, relative to the tube model.
         inherent_filtration: layers between anode and filter wheel.
-        scintillator_mm: solid-density thickness of caesium iodide.
-        light_swank: Swank factor of the light of one photon of fixed deposit (1 = no spread).
+        tube_model: whose bremsstrahlung it is, of `tube.MODELS`.
+        kV_ripple_percent: by how much the voltage dips between its peaks.
+        anode_rough_um: tungsten that photons cross on their way out of a rough anode, beyond a smooth one's.
+        output_exponent: output over the tube model's goes as (kV / 60)^exponent.
+        cover: layers in front of the scintillator (housing, glue, dead layer).
+        scintillator: `CsI` or `Gd2O2S@7.32`.
+        scintillator_mm: solid-density thickness; labelled_scintillator_mm: what the sheet says.
+        k_escape_share: of the K photons that would leave a bare slab, how many do.
+        light_curve: how far the light goes with the published non-proportional curve (0 = proportional, 1 = as published).
+        depth_light: how much more light a photon gives at the exit face than at the entrance, relative to the mean.
+        light_swank: Swank factor of the light of one photon of fixed deposit and depth (1 = no spread).
         electrons_per_keV: electrons that one keV of deposit frees in the photodiodes, in all pixels together.
         DN_per_electron: conversion, detector median.
         gain_spread_percent: standard deviation of the per-pixel conversion.
-        psf_sigma_px: standard deviation of the Gaussian spread of light, without the pixel's own aperture.
+        psf_sigma_px: standard deviation of the Gaussian core of the spread of light, without the pixel's own aperture: the
+            geometric mean of that along rows and that along columns; psf_aspect: the former over the latter.
+        tail_share, tail_length_px, tail_law: light beyond the core, `exponential` exp(-r / length) or `lorentzian`
+            (1 + (r / length)^2)^-3/2 over the pixels around, cut off at 12 px.
         read_noise_DN: standard deviation of the electronic noise of a frame.
         dark_DN: median dark level at zero exposure; dark_spread_DN: its standard deviation over pixels.
         dark_current_DN_per_ms: growth of the dark level.
         bits: of the ADC.
-        dead_pixels, hot_pixels: how many of each.
+        dead_pixels, hot_pixels: how many of each; bad_clusters: clusters of 4 to 9 dead ones; dead_lines: stretches of a row or
+            column.
         maximum_power_W, readout_ms: as on the vendor's sheet.
         maps_seed: draws the per-pixel maps.
+        unkindness: what the line does a little all the time.
     """
 
     rows: int = 128
@@ -53,15 +71,30 @@ class LabSystem:
     source_object_mm: float = 3.0 * PAPER_SOURCE_OBJECT_MM
     source_detector_mm: float = 3.0 * PAPER_SOURCE_DETECTOR_MM
     anode_angle_deg: float = 12.0
+    labelled_angle_deg: float = 12.0
     kV_offset_percent: float = 0.0
     tube_output: float = 1.13
     inherent_filtration: tuple[Filter, ...] = (Filter(material="Al", thickness_mm=1.0),)
+    tube_model: str = "kqp"
+    kV_ripple_percent: float = 0.0
+    anode_rough_um: float = 0.0
+    output_exponent: float = 0.0
+    cover: tuple[Filter, ...] = ()
+    scintillator: str = "CsI"
     scintillator_mm: float = 0.5
+    labelled_scintillator_mm: float = 0.5
+    k_escape_share: float = 1.0
+    light_curve: float = 0.0
+    depth_light: float = 0.0
     light_swank: float = 0.94
     electrons_per_keV: float = 16.0
     DN_per_electron: float = 0.0129
     gain_spread_percent: float = 1.5
     psf_sigma_px: float = 0.42
+    psf_aspect: float = 1.0
+    tail_share: float = 0.0
+    tail_length_px: float = 1.0
+    tail_law: str = "exponential"
     read_noise_DN: float = 12.87
     dark_DN: float = 1250.0
     dark_spread_DN: float = 45.0
@@ -69,12 +102,22 @@ class LabSystem:
     bits: int = 16
     dead_pixels: int = 3
     hot_pixels: int = 3
+    bad_clusters: int = 0
+    dead_lines: int = 0
     maximum_power_W: float = 90.0
     readout_ms: float = 2.0
     maps_seed: int = 0
+    unkindness: Unkindness = NONE
 
     def __post_init__(self) -> None:
         zero_allowed = {
+            "kV_ripple_percent",
+            "anode_rough_um",
+            "k_escape_share",
+            "light_curve",
+            "tail_share",
+            "bad_clusters",
+            "dead_lines",
             "dead_pixels",
             "hot_pixels",
             "maps_seed",
@@ -87,11 +130,11 @@ class LabSystem:
         }
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "inherent_filtration":
+            if not isinstance(value, int | float):
                 continue
             lowest_fits = (
                 value > -50
-                if field.name == "kV_offset_percent"
+                if field.name in ("kV_offset_percent", "output_exponent", "depth_light")
                 else value >= 0
                 if field.name in zero_allowed
                 else value > 0
@@ -108,6 +151,18 @@ class LabSystem:
             raise InputError("lab system light_swank", received=self.light_swank, expected="0.2 to 1")
         if self.psf_sigma_px > 3.0:
             raise InputError("lab system psf_sigma_px", received=self.psf_sigma_px, expected="0 to 3 px")
+        for name, value, known in (
+            ("scintillator", self.scintillator, SCINTILLATORS),
+            ("tail_law", self.tail_law, TAIL_LAWS),
+        ):
+            if value not in known:
+                raise InputError(f"lab system {name}", received=repr(value), expected="one of " + ", ".join(known))
+        if not (self.tail_share < 1.0 and self.k_escape_share <= 1.0 and abs(self.depth_light) <= 1.0):
+            raise InputError(
+                "lab system tail_share, k_escape_share, depth_light",
+                received=f"{self.tail_share:g}, {self.k_escape_share:g}, {self.depth_light:g}",
+                expected="shares below 1, of 0 to 1, and -1 to 1",
+            )
         if not 1 <= self.bits <= 16:
             raise InputError("lab system bits", received=self.bits, expected="1 to 16")
         if min(self.rows, self.columns) < 8:
@@ -119,6 +174,12 @@ class LabSystem:
     def magnification(self) -> float:
         """Source-detector over source-object distance."""
         return self.source_detector_mm / self.source_object_mm
+
+    @property
+    def core_px(self) -> tuple[float, float]:
+        """Standard deviations of the spread's core: from row to row, and from column to column."""
+        root = math.sqrt(self.psf_aspect)
+        return self.psf_sigma_px * root, self.psf_sigma_px / root
 
     @property
     def saturation_DN(self) -> int:
@@ -150,33 +211,39 @@ class LabSystem:
         )
 
     def instrument(self) -> Instrument:
-        """What the vendor's sheet says about the line: nominal values, not the truth."""
+        """What the vendor's sheet says about the line: labels, not the truth; covers and tails are not on it."""
         return Instrument(
             anode="W",
-            anode_angle_deg=self.anode_angle_deg,
+            anode_angle_deg=self.labelled_angle_deg,
             source_object_mm=self.source_object_mm,
             source_detector_mm=self.source_detector_mm,
             pixel_mm=self.pixel_mm,
             detector="area",
             counting=False,
-            scintillator=(Filter(material="CsI", thickness_mm=0.5),),
+            scintillator=(Filter(material=self.scintillator, thickness_mm=self.labelled_scintillator_mm),),
             bits=self.bits,
             maximum_power_w=self.maximum_power_W,
             readout_ms=self.readout_ms,
         )
 
 
-def sample_system(rng: np.random.Generator) -> LabSystem:
-    """A hidden system: tube, scintillator, light, electronics and maps drawn around the paper's line.
+def sample_system(rng: np.random.Generator, *, families: Sequence[str] | None = None) -> LabSystem:
+    """A hidden system: tube, scintillator, light, electronics, maps and unkindness drawn around the paper's line.
+
+    Args:
+        rng: draws it. Every family has random numbers of its own, so that leaving one out changes nothing else.
+        families: of departures to draw from, of `families.FAMILIES`; None: all of them.
 
     Ranges: voltage +-1 % (standard deviation, cut at 2.5 %), inherent filtration 0.4-1.4 mm Al, tube output +-10 %,
     scintillator 0.40-0.60 mm, light Swank factor 0.88-0.98, light spread 0.35-1.0 px, 10-25 electrons per keV,
     conversion +-15 %, read noise +-15 %, dark level 1100-1400 DN, 0-6 dead and hot pixels.
     """
+    from .families import with_families
+
     base = LabSystem()
     electrons_per_keV = rng.uniform(10.0, 25.0)
     DN_per_keV = base.electrons_per_keV * base.DN_per_electron * math.exp(0.15 * rng.standard_normal())
-    return replace(
+    usual = replace(
         base,
         # In steps of a quarter per cent: spectra take a second each and are kept by voltage.
         kV_offset_percent=round(4.0 * float(np.clip(rng.standard_normal(), -2.5, 2.5))) / 4.0,
@@ -195,6 +262,9 @@ def sample_system(rng: np.random.Generator) -> LabSystem:
         hot_pixels=int(rng.integers(0, 7)),
         maps_seed=int(rng.integers(2**62)),
     )
+    seeds = rng.integers(2**62, size=2)
+    kind = replace(usual, unkindness=sample_unkindness(np.random.default_rng(int(seeds[0]))))
+    return with_families(kind, families, seed=int(seeds[1]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,6 +291,23 @@ def _smooth_pattern(rng: np.random.Generator, *, rows: int, columns: int) -> NDA
         pattern += rng.standard_normal() * np.cos(2 * np.pi * (wave_y * y + wave_x * x) + rng.uniform(0, 2 * np.pi))
     scaled: NDArray[np.float64] = (pattern - pattern.mean()) / max(float(pattern.std()), 1e-12)
     return scaled
+
+
+def _grouped_defects(rng: np.random.Generator, system: LabSystem) -> set[tuple[int, int]]:
+    """Pixels of clusters (4 to 9 within 3 x 3) and of stretches of a line (a quarter of it to all)."""
+    found: set[tuple[int, int]] = set()
+    for _ in range(system.bad_clusters):
+        row, column = int(rng.integers(system.rows - 2)), int(rng.integers(system.columns - 2))
+        for place in rng.permutation(9)[: int(rng.integers(4, 10))]:
+            found.add((row + int(place) // 3, column + int(place) % 3))
+    for _ in range(system.dead_lines):
+        along_rows = bool(rng.random() < 0.5)
+        length, lines = (system.columns, system.rows) if along_rows else (system.rows, system.columns)
+        line, share = int(rng.integers(lines)), rng.uniform(0.25, 1.0)
+        start = int(rng.uniform(0.0, 1.0 - share) * length)
+        for step in range(start, min(start + round(share * length), length)):
+            found.add((line, step) if along_rows else (step, line))
+    return found
 
 
 def detector_maps(system: LabSystem) -> DetectorMaps:
@@ -254,6 +341,9 @@ def detector_maps(system: LabSystem) -> DetectorMaps:
             current[row, column] = max(200.0 * system.dark_current_DN_per_ms, 1.0)
             read_noise_DN[row, column] *= 10.0
             bad.append((row, column, "hot"))
+    for row, column in sorted(_grouped_defects(rng, system) - {(row, column) for row, column, _ in bad}):
+        conversion[row, column] = 0.0
+        bad.append((row, column, "dead"))
     return DetectorMaps(
         DN_per_electron=np.maximum(conversion, 0.0).astype(np.float32),
         dark_DN=dark_DN.astype(np.float32),

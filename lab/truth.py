@@ -10,11 +10,12 @@ from ..acquisition.setting import Setting, text_from_filters
 from .attenuation import mu_per_mm
 from .response import (
     Level,
-    aperture_share,
     compute_incidence,
     compute_level,
+    equivalent_sigma_px,
     gain_DN,
     level_of_groups,
+    noise_shares,
     tube_load_mAs,
 )
 from .system import DetectorMaps, LabSystem, detector_maps
@@ -25,9 +26,14 @@ def _level(system: LabSystem, setting: Setting) -> Level:
 
 
 def aluminium_equivalent_mm(system: LabSystem) -> float:
-    """Inherent filtration as mm of aluminium: exact for aluminium, else matched in attenuation at 30 keV."""
+    """Inherent filtration, rough anode and covers as mm of aluminium: exact for aluminium, else matched at 30 keV.
+
+    Flats cannot tell on which side of the object a layer lies.
+    """
     energy_keV = np.array([30.0])
-    total = sum(mu_per_mm(layer.material, energy_keV)[0] * layer.thickness_mm for layer in system.inherent_filtration)
+    layers = (*system.inherent_filtration, *system.cover)
+    total = sum(mu_per_mm(layer.material, energy_keV)[0] * layer.thickness_mm for layer in layers)
+    total += mu_per_mm("W", energy_keV)[0] * system.anode_rough_um / 1000.0
     return float(total / mu_per_mm("Al", energy_keV)[0])
 
 
@@ -51,7 +57,7 @@ def flat_truth(system: LabSystem, maps: DetectorMaps, setting: Setting) -> dict[
     conversion = float(np.median(maps.DN_per_electron[maps.DN_per_electron > 0]))
     mean_DN = level.energy_keV_per_mAs * load_mAs * system.electrons_per_keV * conversion
     gain = gain_DN(system, level, DN_per_electron=conversion)
-    slope = (gain - conversion) * aperture_share(system.psf_sigma_px) ** 2 + conversion
+    slope = (gain - conversion) * noise_shares(system) + conversion
     dark_variance_DN2 = (
         float(np.median(maps.read_noise_DN)) ** 2
         + conversion * float(np.median(maps.dark_current_DN_per_ms)) * setting.exposure_ms
@@ -113,12 +119,34 @@ def compute_truth(system: LabSystem, *, settings: Iterable[Setting], exposures_m
         "flux_scale": system.tube_output,
         "inherent_filtration": text_from_filters(system.inherent_filtration),
         "inherent_filtration_mm_Al": aluminium_equivalent_mm(system),
-        "scintillator": f"CsI:{system.scintillator_mm:g}",
+        "tube_model": system.tube_model,
+        "kV_ripple_percent": system.kV_ripple_percent,
+        "anode_rough_um": system.anode_rough_um,
+        "output_exponent": system.output_exponent,
+        "cover": text_from_filters(system.cover),
+        "scintillator": f"{system.scintillator}:{system.scintillator_mm:g}",
+        "labelled_scintillator_mm": system.labelled_scintillator_mm,
+        "k_escape_share": system.k_escape_share,
+        "light_curve": system.light_curve,
+        "depth_light": system.depth_light,
         "scintillator_mm": system.scintillator_mm,
         "light_swank": system.light_swank,
         "electrons_per_keV": system.electrons_per_keV,
         "DN_per_electron": float(np.median(maps.DN_per_electron[good])),
+        # Of the core; the spread as a whole below, with the Gaussian that leaves the same share of the quanta's noise.
         "psf_sigma_px": system.psf_sigma_px,
+        "spread": {
+            "equivalent_sigma_px": equivalent_sigma_px(system),
+            "core_row_px": system.core_px[0],
+            "core_column_px": system.core_px[1],
+            "tail_share": system.tail_share,
+            "tail_length_px": system.tail_length_px,
+            "tail_law": system.tail_law,
+        },
+        "noise_correlation": [
+            {"lag_row": row, "lag_column": column, "value": noise_shares(system, row, column) / noise_shares(system)}
+            for row, column in ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
+        ],
         "read_noise_DN": float(np.median(maps.read_noise_DN[good])),
         # What a dark series shows: electronic noise and the rounding of the ADC.
         "dark_sd_DN": math.sqrt(float(np.median(maps.read_noise_DN[good])) ** 2 + 1.0 / 12.0),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FitError, InputError
+from ..results import ByValue
 from .likelihood import Curve, size_bound
 from .links import Link, link_from_name
 from .modified import modified_bound
@@ -48,8 +49,8 @@ class Bounds:
 NO_BOUNDS = Bounds()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CrossedEffects:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CrossedEffects(ByValue):
     """Random effects on the scale of eta: standard deviations between networks and between images (None: not fitted).
 
     `a50_conditional` and `a90_conditional` are the sizes of an average network at an average image. covariance: of
@@ -65,8 +66,8 @@ class CrossedEffects:
     covariance: Array = field(repr=False)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PodFit:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PodFit(ByValue):
     """A fitted POD curve. Sizes in the unit of the data; None where the data cannot support a number (see `warnings`).
 
     a90_95: one-sided 95 % upper bound on a90. a90_95_two_sided: upper end of the two-sided 95 % interval;

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..results import ByValue
 from .links import Link
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Curve:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Curve(ByValue):
     """A curve's data and fit on the x it is linear in: distinct x, hits and misses (distinct,), link, coefficients.
 
     `supremum` is the largest attainable log-likelihood, `divisor` what the likelihood is divided by (repeats),

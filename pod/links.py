@@ -47,6 +47,10 @@ class Link:
     log_parts: Callable[[Array], LogParts]
     pod_curvature: Callable[[Array], Array]
 
+    def __reduce__(self) -> tuple[Callable[[str], "Link"], tuple[str]]:
+        """Pickled by name: functions are not."""
+        return link_from_name, (self.name,)
+
 
 def _hazard_parts(eta: Array) -> tuple[Array, Array, Array, Array]:
     """t = exp(eta), ln(1 - exp(-t)), r = t / (exp(t) - 1) and dr/d(eta), each without cancellation."""

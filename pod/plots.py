@@ -27,6 +27,12 @@ _BLUE, _ORANGE, _GREY, _RED = "#1f5fa8", "#d9822b", "#6b7280", "#b3261e"
 def plot_pod(fit: PodFit, table: Trials, *, size_label: str) -> "Figure":
     """POD curve with its 95 % band, the share of hits in groups of sizes, hits and misses as ticks, a90 and a90/95."""
     figure, axes = _figure(6.4, 4.4)
+    draw_pod(axes, fit, table, size_label=size_label)
+    return figure
+
+
+def draw_pod(axes: Any, fit: PodFit, table: Trials, *, size_label: str) -> None:
+    """`plot_pod` on the axes given."""
     _draw_hits(axes, table, log_size=fit.log_size)
     _draw_curve(axes, fit, color=_BLUE, label=f"POD ({fit.link}, {fit.repeats})")
     bound = fit.a90_95.modified if fit.a90_95.modified is not None else fit.a90_95.likelihood_ratio
@@ -51,7 +57,6 @@ def plot_pod(fit: PodFit, table: Trials, *, size_label: str) -> "Figure":
     _finish(axes, size_label, "probability of detection", log=fit.log_size)
     axes.set_ylim(-0.06, 1.06)
     axes.legend(loc="center right", frameon=False, fontsize=8)
-    return figure
 
 
 def plot_joint_region(fit: PodFit) -> "Figure":
@@ -111,6 +116,24 @@ def plot_response(
 ) -> "Figure":
     """Response against size with the fitted line, its 95 % scatter, the decision and censored responses marked."""
     figure, axes = _figure(6.4, 4.4)
+    draw_response(
+        axes, fit, size, response, size_label=size_label, response_label=response_label, left=left, right=right
+    )
+    return figure
+
+
+def draw_response(
+    axes: Any,
+    fit: ResponseFit,
+    size: Array,
+    response: Array,
+    *,
+    size_label: str,
+    response_label: str,
+    left: float | None = None,
+    right: float | None = None,
+) -> None:
+    """`plot_response` on the axes given."""
     size, response = np.asarray(size, dtype=float), np.asarray(response, dtype=float)
     cut = np.zeros(len(size), bool)
     if left is not None:
@@ -135,7 +158,6 @@ def plot_response(
     if abs(fit.box_cox) < 0.25:
         axes.set_yscale("log")
     axes.legend(frameon=False, fontsize=8)
-    return figure
 
 
 def plot_comparison(
@@ -146,6 +168,13 @@ def plot_comparison(
 
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[3, 1.3])
+    draw_both_curves(left, comparison, size_label=size_label, names=names)
+    draw_ratio(right, comparison)
+    return figure
+
+
+def draw_both_curves(left: Any, comparison: Comparison, *, size_label: str, names: tuple[str, str]) -> None:
+    """Both curves with their bands on the axes given."""
     for fit, color, name in zip((comparison.first, comparison.second), (_BLUE, _ORANGE), names, strict=True):
         if fit.curve is not None:
             _draw_curve(left, fit, color=color, label=name)
@@ -156,6 +185,10 @@ def plot_comparison(
     _finish(left, size_label, "probability of detection", log=comparison.first.log_size)
     if left.get_legend_handles_labels()[1]:
         left.legend(frameon=False, fontsize=8)
+
+
+def draw_ratio(right: Any, comparison: Comparison) -> None:
+    """The ratio of a90 with its 95 and 90 % intervals against the margin, on the axes given."""
     margin = comparison.margin
     right.axhspan(1 / (1 + margin), 1 + margin, color="#dfe7ef", zorder=0)
     right.axhline(1, color=_GREY, lw=0.7)
@@ -170,7 +203,6 @@ def plot_comparison(
     right.set_xlim(-1, 1)
     right.margins(y=0.3)
     _finish(right, comparison.verdict, "ratio of a90 (bars 95 and 90 %)", log=False)
-    return figure
 
 
 def plot_roc(roc: Roc) -> "Figure":

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FitError, InputError
+from ..results import ByValue
 from .hit_miss import NO_BOUNDS, Z_ONE_SIDED, Z_TWO_SIDED, Bounds, size_from_x, size_in_range
 from .links import LINKS
 from .robust import clustered_meat
@@ -28,8 +29,8 @@ Array = NDArray[np.float64]
 _PROBIT = LINKS["probit"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResponseFit:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResponseFit(ByValue):
     """A fitted line and its POD curve. Sizes in the data's unit, None where the data cannot support a number.
 
     intercept, slope, scatter: b0, b1, tau on the transformed scales. box_cox: lambda (1 = as it is, 0 = logarithm).

@@ -13,11 +13,16 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
+from ..results import ByValue
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 
@@ -36,8 +41,8 @@ _HIT_WORDS = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PodTable:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PodTable(ByValue):
     """Rows with a foreign object, and the count of those without. Labels are text, None where there is no such column.
 
     size (row,) in the column's own unit, or None; hits (row,), trials (row,) or None; response (row,) or None;
@@ -77,7 +82,7 @@ class PodTable:
 
 
 def read_pod_table(
-    path: str | os.PathLike[str],
+    source: "str | os.PathLike[str] | Mapping[str, Sequence[Any]] | pandas.DataFrame",
     *,
     size: str | None = None,
     hit: str | Sequence[str] | None = None,
@@ -91,7 +96,7 @@ def read_pod_table(
     """Read a table of trials; sizes in the unit of their column.
 
     Args:
-        path: the file, text with a header line.
+        source: the file, text with a header line; or a pandas data frame, or column -> values, with a row a trial.
         size: the size's column; None = the first of contrast, size, size_mm, ...
         hit: the column of hits; several (or comma-separated) = one inspection each; None = `hit` or the like, else all
             columns after the size that hold nothing but 0 and 1 (mh1823).
@@ -104,7 +109,7 @@ def read_pod_table(
         FileFormatError: no such file, not text, no header, a row with another number of columns.
         InputError: a column is missing or holds something that cannot be used; the message gives the line.
     """
-    header, rows, lines = _read_rows(Path(path))
+    header, rows, lines = _rows_of(source)
     if where:
         rows, lines = _filtered(header, rows, lines, where)
     notes: list[str] = []
@@ -195,6 +200,33 @@ def read_pod_table(
         noise_response=noise,
         notes=tuple(notes),
     )
+
+
+def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
+    """Header, rows as texts and their numbers, of a file or of columns in memory."""
+    if isinstance(source, str | os.PathLike):
+        return _read_rows(Path(source))
+    if not (isinstance(source, Mapping) or hasattr(source, "columns")):
+        raise InputError(
+            "table", received=type(source).__name__, expected="a path, a data frame or a mapping of columns"
+        )
+    names = list(source) if isinstance(source, Mapping) else list(source.columns)
+    columns = [[_cell_text(value) for value in source[name]] for name in names]
+    if not columns or len({len(column) for column in columns}) != 1 or not columns[0]:
+        raise InputError(
+            "table", received=f"columns of {[len(column) for column in columns]} rows", expected="columns of one length"
+        )
+    header = [str(name).strip() for name in names]
+    if len(set(header)) != len(header) or "" in header:
+        raise InputError("table", received=", ".join(header), expected="distinct, non-empty column names")
+    return header, [list(row) for row in zip(*columns, strict=True)], list(range(1, len(columns[0]) + 1))
+
+
+def _cell_text(value: Any) -> str:
+    """A value as the cell of a file would have it; what is missing is empty."""
+    if value is None or str(value) in ("nan", "NaT", "<NA>"):
+        return ""
+    return str(value)
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..results import ByValue
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trials:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trials(ByValue):
     """Hit/miss trials, one row each or grouped: size (row,) in the user's unit, hits and misses (row,) as counts.
 
     network, image and site are codes 0, 1, ... (row,) of who looked and at what, or None where that is not known.

@@ -3,6 +3,7 @@
 from .detector import DEFAULT_SCINTILLATOR, Response, detector_response, k_escape_fractions
 from .effective import effective_mu_per_mm, signal_weights
 from .grid import BIN_WIDTH_KEV, FIRST_CENTRE_KEV, MAXIMUM_KV, energy_grid_keV
+from .light_yield import electron_response, light_per_keV
 from .measured import spectrum_from_file
 from .spectrum import (
     Spectrum,
@@ -41,11 +42,13 @@ __all__ = [
     "checked_kV",
     "detector_response",
     "effective_mu_per_mm",
+    "electron_response",
     "energy_grid_keV",
     "filtered_spectrum",
     "fluence_per_cm2_mAs",
     "half_value_layer_mm",
     "k_escape_fractions",
+    "light_per_keV",
     "mean_energy_keV",
     "signal_weights",
     "spectrum_from_file",

@@ -241,10 +241,12 @@ def test_another_format_or_version_is_named(path):
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"exposure_ms": -20.0}, "series flat, attribute exposure_ms: got -20 ms; expected a finite number above 0 ms"),
+        (
+            {"exposure_ms": -20.0},
+            "series flat, attribute exposure_ms: got -20 ms; expected a finite number of 0 or more ms",
+        ),
         ({"exposure_ms": np.nan}, "series flat, attribute exposure_ms: got nan ms"),
-        ({"exposure_ms": 0.0}, "attribute exposure_ms: got 0 ms"),
-        ({"exposure_ms": "long"}, "attribute exposure_ms: got 'long'; expected a finite number above 0 ms"),
+        ({"exposure_ms": "long"}, "attribute exposure_ms: got 'long'; expected a finite number of 0 or more ms"),
         ({"kV": np.inf}, "attribute kV: got inf kV"),
         ({"kV": -40}, "attribute kV: got -40 kV"),
         ({"power_W": 0}, "attribute power_W: got 0 W"),

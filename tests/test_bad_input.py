@@ -1,6 +1,11 @@
 """Bad input through the command line: exit 2, one line on standard error, nothing on standard output, no file left."""
 
 import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -184,7 +189,7 @@ def test_a_session_with_a_wrong_value(files, tmp_path, capsys, case):
 PREDICTIONS = {
     "kV above the table": (["--kv", "500", *PREDICT], "kV"),
     "kV of nothing": (["--kv", "nan", *PREDICT], "kV"),
-    "negative exposure": (["--kv", "60", "--power-w", "40", "--exposure-ms", "-20"], "exposure_ms"),
+    "negative exposure": (["--kv", "60", "--power-w", "40", "--exposure-ms", "-20"], "--exposure-ms"),
     "no power": (["--kv", "60", "--power-w", "0", "--exposure-ms", "20"], "power_W"),
     "unknown filter": (["--kv", "60", "--filter", "unobtanium:1", *PREDICT], "unobtanium"),
     "filter without thickness": (["--kv", "60", "--filter", "Cu", *PREDICT], "MATERIAL:mm"),
@@ -296,7 +301,6 @@ def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
         ["predict", "twin.h5"],
         ["predict", "twin.h5", "--kv", "sixty", "--power-w", "1", "--exposure-ms", "1"],
         ["calibrate", "a.h5", "-o", "b.h5", "--unknown"],
-        ["nonsense"],
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
@@ -309,6 +313,85 @@ def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
     assert captured.err.startswith("raytwin")
 
 
+def test_an_unknown_command_is_one_line_and_exit_2(capsys):
+    assert main(["nonsense"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith("raytwin")
+
+
 def test_the_good_session_is_good(files):
     with open_acquisition(files["session"]) as acquisition:
         assert len(acquisition.series) == 7
+
+
+def test_damaged_files_end_in_an_answer_or_in_one_line(tmp_path):
+    """A hundred of the ten thousand cases of validation/damaged_files.py: those that need no twin."""
+    folder = Path(__file__).parents[1] / "validation"
+    sys.path.insert(0, str(folder))
+    try:
+        damaged_files = import_module("damaged_files")
+    finally:
+        sys.path.remove(str(folder))
+    damaged_files.make_files(tmp_path, twin=False)
+    commands = ("check", "pod", "import", "compare")
+    kinds = tuple(
+        replace(
+            kind,
+            commands=tuple(entry for entry in kind.commands if entry[1][0] in commands and "reference" not in entry[1]),
+        )
+        for kind in damaged_files.KINDS
+        if kind.name not in ("twin.h5", "dataset.h5")
+    )
+    results = [damaged_files.run_case(number, 2026, tmp_path, kinds) for number in range(100)]
+    assert [(item.number, item.wrong, item.damage, item.line) for item in results if item.wrong] == []
+    assert {item.code for item in results} == {"0", "2"}
+
+
+@pytest.mark.parametrize(
+    "error", [TypeError("Unknown string encoding"), KeyError("Unable to synchronously open object")]
+)
+def test_whatever_hdf5_raises_at_damaged_bytes_is_one_line(files, tmp_path, capsys, monkeypatch, error):
+    """Both came out of single bytes changed in a file, one as an attribute was read, the other as a group was listed."""
+
+    def fails(*_: object, **__: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.AttributeManager, "get", fails)
+        refused(capsys, tmp_path, ["calibrate", files["session"], "-o", tmp_path / "twin.h5"], mentions="session.h5")
+        refused(capsys, tmp_path, ["predict", files["twin"], "--kv", 60, *PREDICT], mentions="twin.h5")
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.Group, "__iter__", fails)
+        refused(capsys, tmp_path, ["calibrate", files["session"], "-o", tmp_path / "twin.h5"], mentions="session.h5")
+
+
+DYING = """
+import os, signal, sys
+import h5py
+def dies(*_, **__):
+    os.kill(os.getpid(), signal.SIGSEGV)
+h5py.File = dies
+from raytwin.cli import main
+sys.argv = ["raytwin", *sys.argv[1:]]
+sys.exit(main())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes cannot be copied there")
+def test_a_library_that_dies_at_a_file_is_one_line_too(files, tmp_path):
+    def run(*words):
+        command = [sys.executable, "-c", DYING, *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    (tmp_path / ".twin.h5.abc.part").write_text("half")
+    died = run("calibrate", files["session"], "-o", tmp_path / "twin.h5")
+    assert died.returncode == 2
+    assert died.stdout == ""
+    assert len(died.stderr.splitlines()) == 1
+    assert "session.h5" in died.stderr and "SIGSEGV" in died.stderr
+    assert list(tmp_path.iterdir()) == []
+    # and where nothing dies, the code of the copy is that of the command
+    assert run("check", tmp_path / "absent.h5").returncode == 2
+    assert run("check", "--help").returncode == 0

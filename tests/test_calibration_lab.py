@@ -63,7 +63,7 @@ def test_held_back_settings_are_predicted_within_their_intervals(session):
     assert all(row.role == "evaluation" and not row.used_in_calibration for row in rows)
     assert sum(row.inside_mean for row in rows) >= 7
     assert sum(row.inside_sd for row in rows) >= 7
-    answer = session["validation"].as_dict()
+    answer = session["validation"].to_dict()
     assert answer["median_abs_error_percent"]["mean"] < 2
     assert answer["median_abs_error_percent"]["sd"] < 2
     for row in rows:

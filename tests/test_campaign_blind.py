@@ -545,7 +545,7 @@ def test_the_frozen_code_is_the_package_and_is_what_runs(tmp_path):
     frozen = freeze_code(tmp_path / "code")
     assert code_digest(frozen / "raytwin") == code_digest()
     check_frozen_code(frozen)
-    changed = frozen / "raytwin" / "diagnosis" / "diagnose.py"
+    changed = frozen / "raytwin" / "diagnosis" / "diagnose_session.py"
     changed.write_text("import nothing_of_that_name\n" + changed.read_text(encoding="utf-8"), encoding="utf-8")
     assert code_digest(frozen / "raytwin") != code_digest()
     with pytest.raises(RaytwinError, match=r"cannot be imported: ModuleNotFoundError: .*nothing_of_that_name"):

@@ -26,10 +26,34 @@ LINE = ["--seed", "31", "--size", "64"]
 def line(tmp_path_factory):
     """A calibrated twin, and products of known path lengths measured on another day of the same line."""
     folder = tmp_path_factory.mktemp("task")
-    short = ["lab", "-o", str(folder / "short.h5"), "--protocol", "short", *LINE, "--frames", "12", "--products", "1"]
+    short = [
+        "lab",
+        "--family",
+        "none",
+        "-o",
+        str(folder / "short.h5"),
+        "--protocol",
+        "short",
+        *LINE,
+        "--frames",
+        "12",
+        "--products",
+        "1",
+    ]
     assert main(short) == 0
     assert main(["calibrate", str(folder / "short.h5"), "-o", str(folder / "twin.h5")]) == 0
-    products = ["lab", "-o", str(folder / "products.h5"), "--protocol", "products", *LINE, "--session", "1"]
+    products = [
+        "lab",
+        "--family",
+        "none",
+        "-o",
+        str(folder / "products.h5"),
+        "--protocol",
+        "products",
+        *LINE,
+        "--session",
+        "1",
+    ]
     assert main([*products, "--products", "16", "--frames", "20", "--bones-mm", "0.7,1.4,2.8"]) == 0
     return folder
 
@@ -316,10 +340,36 @@ def test_images_without_foreign_objects_are_refused(line, tmp_path):
 @pytest.mark.slow
 def test_a_noisier_line_is_followed_from_session_to_a90(line, tmp_path, capsys):
     session = tmp_path / "session.h5"
-    words = ["lab", "-o", str(session), "--protocol", "short", *LINE, "--frames", "16", "--products", "1"]
+    words = [
+        "lab",
+        "--family",
+        "none",
+        "-o",
+        str(session),
+        "--protocol",
+        "short",
+        *LINE,
+        "--frames",
+        "16",
+        "--products",
+        "1",
+    ]
     assert main([*words, "--effect", "excess_noise=60@calibration"]) == 0
     products = tmp_path / "products.h5"
-    words = ["lab", "-o", str(products), "--protocol", "products", *LINE, "--session", "1", "--products", "32"]
+    words = [
+        "lab",
+        "--family",
+        "none",
+        "-o",
+        str(products),
+        "--protocol",
+        "products",
+        *LINE,
+        "--session",
+        "1",
+        "--products",
+        "32",
+    ]
     assert main([*words, "--bones-mm", "1,1.5,2.5,4", "--effect", "excess_noise=60@always"]) == 0
     capsys.readouterr()
     words = ["diagnose", str(session), "-o", str(tmp_path / "found"), "--task", str(products), "--json"]

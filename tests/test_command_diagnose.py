@@ -14,8 +14,22 @@ def sessions(tmp_path_factory):
     """A short session with much excess noise since the calibration, and one without any effect."""
     folder = tmp_path_factory.mktemp("diagnose")
     common = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "16", "--products", "1"]
-    assert main(["lab", "-o", str(folder / "null.h5"), *common]) == 0
-    assert main(["lab", "-o", str(folder / "noisy.h5"), *common, "--effect", "excess_noise=60@calibration"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(folder / "null.h5"), *common]) == 0
+    assert (
+        main(
+            [
+                "lab",
+                "--family",
+                "none",
+                "-o",
+                str(folder / "noisy.h5"),
+                *common,
+                "--effect",
+                "excess_noise=60@calibration",
+            ]
+        )
+        == 0
+    )
     return folder
 
 

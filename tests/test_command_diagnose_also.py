@@ -1,15 +1,13 @@
 """`raytwin diagnose --also`: what was measured later joins the session behind it in time, and calibrates nothing."""
 
-import argparse
-
 import numpy as np
 import pytest
 
-from raytwin.acquisition import write_acquisition
+from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
+from raytwin.acquisition.sessions import continued_session
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.cli import main
-from raytwin.commands.diagnose import _opened
 from raytwin.diagnosis.session import calibrating_names
 
 
@@ -31,7 +29,7 @@ def write(path, *, kinds, role="calibration", pixel_mm=0.4):
 def test_later_measurements_come_last_in_time_and_calibrate_nothing(tmp_path):
     first = write(tmp_path / "first.h5", kinds=["dark", "flat"])
     more = write(tmp_path / "more.h5", kinds=["dark", "flat"])
-    with _opened(argparse.Namespace(acquisition=first, also=[more, more], layer=None)) as found:
+    with continued_session([open_acquisition(path) for path in (first, more, more)]) as found:
         starts = [float(item.time_s[0]) for item in found.series]
         assert starts == sorted(starts)
         assert starts[2] > 3000.0

@@ -147,14 +147,14 @@ def test_separated_data_say_so(capsys, tmp_path):
         ("size,hit\n1,1\n2,0,3,4,5\n", [], "got 5 columns; expected 2"),
         ("size,hit\n1,1\n2,3\n", [], "counts of hits need --trials"),
         ("size,hit\n1,1\n2,0\n", ["--where", "hit"], "expected COLUMN=VALUE"),
-        ("size,hit\n1,1\n2,0\n", ["--decision", "3"], "--decision: got without --response"),
+        ("size,hit\n1,1\n2,0\n", ["--decision", "3"], "--decision: got without a response"),
         ("size,r\n1,1\n2,0\n", ["--response", "r"], "for example --decision 200"),
         ("size,r\n1,1\n2,0\n", ["--response", "r", "--decision", "1", "--box-cox", "big"], "expected a number or auto"),
         ("size,hit\n1,1\n2,0\n", ["--bootstrap", "3"], "20 refits or more"),
         ("size,hit\n-1,1\n2,0\n", ["--log-size"], "sizes above 0"),
         ("size,hit\n1,1\n2,0\n", ["--repeats", "scaled"], "name its column with --site"),
         ("size,hit\n1,1\n2,0\n", ["--link", "log"], "invalid choice"),
-        ("size,hit\n1,1\n2,0\n", ["--covariate", "size=a"], "another property than the size"),
+        ("size,hit\n1,1\n2,0\n", ["--covariate", "size=1"], "another property than the size"),
     ],
 )
 def test_each_mistake_ends_with_2_and_one_line(capsys, tmp_path, text, options, words):

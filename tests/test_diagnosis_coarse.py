@@ -82,7 +82,7 @@ def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path
 
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "12", "--products", "1"]
-    assert main(["lab", "-o", str(session), *words, "--effect", "excess_noise=60@calibration"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(session), *words, "--effect", "excess_noise=60@calibration"]) == 0
     monkeypatch.setattr(coarse, "LARGEST_PIXELS", 48 * 48)
     capsys.readouterr()
     assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--json"]) == 0
@@ -104,7 +104,7 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
 
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "10", "--products", "1"]
-    assert main(["lab", "-o", str(session), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(session), *words]) == 0
 
     def reshaped(names, shape):
         with h5py.File(session, "r+") as file:
@@ -132,7 +132,7 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
 def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypatch):
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "6", "--products", "1"]
-    assert main(["lab", "-o", str(session), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(session), *words]) == 0
     found = {}
     for name, largest in (("fine", 96 * 96), ("squares", 48 * 48)):
         monkeypatch.setattr(coarse, "LARGEST_PIXELS", largest)

@@ -23,7 +23,7 @@ from raytwin.generator.twin_io import read_twin
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("line") / "session.h5"
     words = ["--protocol", "calibration", "--seed", "5", "--size", "130", "--frames", "24"]
-    assert main(["lab", "-o", str(path), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(path), *words]) == 0
     return path
 
 
@@ -121,12 +121,12 @@ def test_a_square_with_a_bad_pixel_is_bad(series_line):
 @pytest.mark.slow
 def test_another_day_of_a_large_panel_is_compared_in_squares_with_its_own_twin(tmp_path, capsys, monkeypatch):
     words = ["--protocol", "short", "--seed", "33", "--size", "96", "--frames", "12", "--products", "2"]
-    assert main(["lab", "-o", str(tmp_path / "first.h5"), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(tmp_path / "first.h5"), *words]) == 0
     assert main(["diagnose", str(tmp_path / "first.h5"), "-o", str(tmp_path / "first"), "--json"]) == 0
     monkeypatch.setattr(coarse, "LARGEST_PIXELS", 48 * 48)
     later, answer, twin = tmp_path / "later.h5", tmp_path / "later", tmp_path / "first" / "twin.h5"
     moving = ["--session", "1", "--effect", "motion_blur=6@always"]
-    assert main(["lab", "-o", str(later), *words, *moving]) == 0
+    assert main(["lab", "--family", "none", "-o", str(later), *words, *moving]) == 0
 
     def said(*more):
         capsys.readouterr()
@@ -143,7 +143,7 @@ def test_another_day_of_a_large_panel_is_compared_in_squares_with_its_own_twin(t
     # with what was found there is no gap, and without it the twin is said to have what is not there
     os.replace(answer / "twin.h5", tmp_path / "improved.h5")
     assert said("--twin", str(tmp_path / "improved.h5"))["verdict"] == "no_gap"
-    assert main(["lab", "-o", str(later), *words, "--session", "1"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(later), *words, "--session", "1"]) == 0
     found = said("--twin", str(tmp_path / "improved.h5"))
     assert found["verdict"] == "unknown_effect"
     assert any("the twin has motion_blur, and this session shows 0.0" in line for line in found["warnings"])

@@ -192,9 +192,9 @@ def test_pixels_that_stand_out_before_every_object_are_the_panels_own(divided):
         good=ALL,
         frames={},
     )
-    assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps))] == [dead, hot]
+    assert [tuple(place) for place in np.argwhere(new_outliers(kept, expected, looks, maps).bad)] == [dead, hot]
     # three products are too few to tell a defect from what they have in common
-    assert not new_outliers(kept[:6], expected, looks, maps).any()
+    assert not new_outliers(kept[:6], expected, looks, maps).any.any()
 
 
 def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
@@ -220,4 +220,4 @@ def test_noise_that_a_line_has_in_common_makes_no_pixel_of_it_stand_out():
         frames={},
     )
     assert np.median(pairs[44]) > 8.0 * np.median(pairs)
-    assert [tuple(place) for place in np.argwhere(new_outliers([item], {}, looks, maps))] == [noisy]
+    assert [tuple(place) for place in np.argwhere(new_outliers([item], {}, looks, maps).bad)] == [noisy]

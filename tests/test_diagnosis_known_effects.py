@@ -298,7 +298,19 @@ def test_effects_are_sought_anew_where_a_gap_is_left_that_is_not_their_strength(
 
 @pytest.mark.slow
 def test_a_session_with_the_scatter_that_its_twin_has_shows_no_gap_and_what_came_besides_is_named(tmp_path):
-    lab = ["lab", "--protocol", "full", "--size", "96", "--seed", "2941", "--effect", "object_scatter=12"]
+    lab = [
+        "lab",
+        "--family",
+        "none",
+        "--protocol",
+        "full",
+        "--size",
+        "96",
+        "--seed",
+        "2941",
+        "--effect",
+        "object_scatter=12",
+    ]
     first, other = tmp_path / "first.h5", tmp_path / "other.h5"
     assert main([*lab, "-o", str(first)]) == 0
     assert main([*lab, "-o", str(other), "--session", "1", "--effect", "motion_blur=3"]) == 0

@@ -7,7 +7,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.next_series import FRAMES, _separation, best_measurement, measurements_lacking, proposal_text
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")
@@ -28,7 +28,7 @@ def diagnosis(tmp_path_factory):
         "--effect",
         "focal_spot=0.6",
     ]
-    assert main(["lab", "-o", str(path), *words, "--size", "48", "--frames", "10"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(path), *words, "--size", "48", "--frames", "10"]) == 0
     with open_acquisition(path) as acquisition:
         return diagnose(acquisition, rng=np.random.default_rng(0))
 

@@ -27,7 +27,25 @@ def found_in(path):
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("plausibility") / "session.h5"
-    assert main(["lab", "-o", str(path), "--protocol", "short", "--seed", "31", "--products", "3", *SIZE]) == 0
+    assert (
+        main(
+            [
+                "lab",
+                "--family",
+                "none",
+                "-o",
+                str(path),
+                "--protocol",
+                "short",
+                "--seed",
+                "31",
+                "--products",
+                "3",
+                *SIZE,
+            ]
+        )
+        == 0
+    )
     return path
 
 
@@ -103,7 +121,21 @@ def test_right_labels_raise_no_doubt(session):
 def test_effects_at_the_end_of_their_range_are_not_taken_for_wrong_labels(tmp_path, effects):
     path = tmp_path / "session.h5"
     planted = [word for effect in effects for word in ("--effect", effect)]
-    words = ["lab", "-o", str(path), "--protocol", "short", "--seed", "44", "--products", "2", *SIZE, *planted]
+    words = [
+        "lab",
+        "--family",
+        "none",
+        "-o",
+        str(path),
+        "--protocol",
+        "short",
+        "--seed",
+        "44",
+        "--products",
+        "2",
+        *SIZE,
+        *planted,
+    ]
     assert main(words) == 0
     assert found_in(path).suspects == ()
 

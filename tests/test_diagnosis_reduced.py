@@ -13,7 +13,7 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.assemble import build_problem
 from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.diagnose import _clears
+from raytwin.diagnosis.diagnose_session import _clears
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.plausibility import check_plausibility
@@ -34,7 +34,7 @@ def line(tmp_path_factory):
     """A folder with a session without effects and the twin calibrated from it."""
     folder = tmp_path_factory.mktemp("reduced")
     words = ["--protocol", "short", "--seed", "31", "--size", "48", "--frames", "10", "--products", "1"]
-    assert main(["lab", "-o", str(folder / "session.h5"), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(folder / "session.h5"), *words]) == 0
     assert main(["calibrate", str(folder / "session.h5"), "-o", str(folder / "twin.h5")]) == 0
     return folder
 
@@ -270,7 +270,7 @@ def test_a_twin_knows_the_frames_it_was_made_of(line, tmp_path):
         "--session",
         "1",
     ]
-    assert main(["lab", "-o", str(tmp_path / "later.h5"), *words]) == 0
+    assert main(["lab", "--family", "none", "-o", str(tmp_path / "later.h5"), *words]) == 0
     with open_acquisition(line / "session.h5") as acquisition:
         for kind in ("dark", "flat"):
             assert made_of(twin, acquisition.of_kind(kind))
@@ -284,7 +284,7 @@ def test_a_twin_knows_the_frames_it_was_made_of(line, tmp_path):
 def test_a_fading_ghost_is_no_noise_that_another_days_darks_may_lie_within(tmp_path):
     words = ["--protocol", "full", "--seed", "2942", "--size", "48", "--frames", "4", "--effect", "image_lag=2"]
     for day in ("0", "1"):
-        assert main(["lab", "-o", str(tmp_path / f"{day}.h5"), *words, "--session", day]) == 0
+        assert main(["lab", "--family", "none", "-o", str(tmp_path / f"{day}.h5"), *words, "--session", day]) == 0
     assert main(["calibrate", str(tmp_path / "0.h5"), "-o", str(tmp_path / "twin.h5")]) == 0
     twin = read_twin(tmp_path / "twin.h5")
     with open_acquisition(tmp_path / "0.h5") as acquisition:
@@ -309,7 +309,7 @@ def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
         "--frames",
         "10",
     ]
-    assert main(["lab", "-o", str(session), *words, "--effect", "nonlinearity=3@always"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(session), *words, "--effect", "nonlinearity=3@always"]) == 0
     capsys.readouterr()
     words = ["--twin", str(line / "twin.h5"), "--json"]
     assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), *words]) == 0
@@ -577,7 +577,7 @@ def test_an_explanation_clears_a_label_that_its_effect_makes_look_wrong():
 def test_a_heel_that_was_always_there_is_named_with_a_twin_from_another_session(tmp_path, capsys):
     path, twin = tmp_path / "session.h5", tmp_path / "twin.h5"
     words = ["--protocol", "full", "--seed", "2074", "--size", "48", "--frames", "10", "--products", "1"]
-    assert main(["lab", "-o", str(path), *words, "--effect", "heel=12@always"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(path), *words, "--effect", "heel=12@always"]) == 0
     assert main(["calibrate", str(path), "-o", str(twin)]) == 0
     with h5py.File(path, "r+") as file:
         for name, node in list(file["series"].items()):
@@ -631,8 +631,8 @@ def test_a_change_of_the_beam_that_one_calibrated_voltage_cannot_tell_stays_a_ti
     words = ["--seed", "2951", "--size", "64", "--effect"]
     short = ["--protocol", "products", "--leave-out", "low_kV", "--frames", "12"]
     full = ["--protocol", "full", "--session", "1", "--only", "wedge", "--only", "filtered_flats", "--frames", "12"]
-    assert main(["lab", "-o", str(session), *short, *words, "kv_error=-1.2"]) == 0
-    assert main(["lab", "-o", str(more), *full, *words, "kv_error=-1.2@always"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(session), *short, *words, "kv_error=-1.2"]) == 0
+    assert main(["lab", "--family", "none", "-o", str(more), *full, *words, "kv_error=-1.2@always"]) == 0
     capsys.readouterr()
     assert main(["diagnose", str(session), "-o", str(tmp_path / "answer"), "--also", str(more), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.calibration.priors import PRIORS
 from raytwin.diagnosis import changes as scales
 from raytwin.diagnosis.calibrated_maps import calibrated_maps
-from raytwin.diagnosis.changes import catalogue_variants, departures_found, spectral_sds
+from raytwin.diagnosis.changes import catalogue_variants, departures_found
 from raytwin.diagnosis.even_maps import compact, full_size
 from raytwin.diagnosis.forward_model import Change, ForwardModel, strength_rows
 from raytwin.diagnosis.nuisance_columns import local_nuisances
@@ -260,17 +261,16 @@ def test_a_heel_that_was_always_there_is_asked_of_the_series_that_make_the_maps(
     assert across(turned) == pytest.approx(0.08 if own_maps else 0.16, abs=0.03)
 
 
-@pytest.mark.parametrize(("spread", "grown"), [(0.008, 1.0), (0.05, 2.5)])
-def test_departures_that_calibration_found_widen_what_beams_may_differ_by(make_model_twin, spread, grown):
+@pytest.mark.parametrize(("deviation_sd", "grown"), [(0.5, 1.0), (2.5, 2.5)])
+def test_departures_that_calibration_found_widen_what_beams_may_differ_by(make_model_twin, deviation_sd, grown):
     base = make_model_twin((24, 24))
     names = base.spectral.names
     samples = np.repeat(base.spectral.best[None], 2, axis=0)
-    samples[:, names.index("hardness_exponent")] = [-spread, spread]  # whose prior's standard deviation is 0.02
-    samples[:, names.index("kV_error")] = [-0.05, 0.05]  # no departure from tables and models
-    usual, found = spectral_sds(base.spectral), spectral_sds(replace(base.spectral, samples=samples))
-    assert departures_found(replace(base.spectral, samples=samples)) == pytest.approx(grown)
-    departs = [name.startswith(("hardness", "kV_tilt", "yield", "escape", "log_mu_")) for name in names]
-    np.testing.assert_allclose(found, usual * np.where(departs, grown, 1.0))
+    hardness = deviation_sd * PRIORS["hardness_exponent"].sd
+    samples[:, names.index("hardness_exponent")] = [hardness - 0.05, hardness + 0.05]
+    samples[:, names.index("kV_error")] = 0.05  # no departure from tables and models
+    found = departures_found(replace(base.spectral, samples=samples))
+    assert found == pytest.approx(grown)
     model = ForwardModel(base=replace(base, spectral=replace(base.spectral, samples=samples)), conditions={})
     assert model.beams_differ == pytest.approx(1.0 + scales.OF_BEAMS_GROWS * (grown - 1.0))
     assert departures_found(None) == 1.0
@@ -287,10 +287,16 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         request=SimpleNamespace(beam_on=True, source_object_mm=None),
         own_noise=False,
         divided=False,
+        calibrates=True,
     )
     thinner = -0.01 * signal * np.log(1000.0 / signal)  # of one material 1 % thicker
     probes = SimpleNamespace(
-        series=SimpleNamespace(session=item, scalars={}, context=SimpleNamespace(label_names=(), label_gain=())),
+        series=SimpleNamespace(
+            session=item,
+            scalars={},
+            context=SimpleNamespace(label_names=(), label_gain=()),
+            expected=SimpleNamespace(noise_autocovariance=np.ones((1, 1))),
+        ),
         scalars=(),
         projection=SimpleNamespace(apply=lambda image: np.asarray(image, dtype=float).ravel()),
         of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.lab.effects import request_from_text
 from raytwin.lab.protocols import run_protocol
 from raytwin.lab.session import GEOMETRIES, session_system
@@ -17,7 +17,7 @@ from raytwin.lab.session import GEOMETRIES, session_system
 def diagnosed(tmp_path_factory):
     """What is said of a short session of a silent detector with an effect; of each session once."""
     folder = tmp_path_factory.mktemp("silent")
-    drawn = session_system(2071, rows=48, columns=48, geometry=GEOMETRIES["coarse"])
+    drawn = session_system(2071, rows=48, columns=48, geometry=GEOMETRIES["coarse"], families=())
     silent = replace(
         drawn, read_noise_DN=0.0, dark_DN=0.1, dark_spread_DN=0.0, dark_current_DN_per_ms=0.0, hot_pixels=0
     )
@@ -55,7 +55,7 @@ def test_an_effect_is_named_where_darks_are_exact_zeros(diagnosed, effect, low, 
 @pytest.mark.slow
 def test_a_camera_that_subtracts_its_own_dark_cuts_noise_off_at_0(tmp_path):
     path = tmp_path / "session.h5"
-    drawn = session_system(2072, rows=48, columns=48, geometry=GEOMETRIES["coarse"])
+    drawn = session_system(2072, rows=48, columns=48, geometry=GEOMETRIES["coarse"], families=())
     noisy = replace(drawn, read_noise_DN=20.0, hot_pixels=0)
     run_protocol(path, protocol="full", seed=2072, system=noisy, geometry="coarse", frames=6, products=1)
     with h5py.File(path, "r+") as file:

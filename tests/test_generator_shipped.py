@@ -28,7 +28,7 @@ def test_the_shipped_twin_predicts_the_lab_s_own_expectation():
     from raytwin.lab.truth import flat_truth
 
     twin = read_twin(shipped_calibration("virtual_lab"))
-    system = system_of_seed(2024, rows=64, columns=64, pixel_mm=0.45)
+    system = system_of_seed(2024, rows=64, columns=64, pixel_mm=0.45, families=())
     for kV, power_W, filters in ((60.0, 40.0, "Cu:0.05"), (90.0, 20.0, "Al:1")):
         setting = Setting(kV=kV, power_W=power_W, exposure_ms=20.0, filters=filters_from_text(filters))
         truth = flat_truth(system, detector_maps(system), setting)

@@ -83,6 +83,56 @@ def test_a_tube_voltage_error_is_another_tube_voltage(model):
     assert signal.rate_DN_per_mAs[0] == pytest.approx(direct(60.0 * 1.013, "")[0], rel=1e-3)
 
 
+def test_without_escape_the_response_is_that_of_kept_k_photons(model):
+    beam = OpenBeam(kV=90.0, filters=filters_from_text("Cu:0.05"))
+    kept = model.signal(parameters(model, escape_scale=-1.0), beam)
+    bare = tube_spectrum(kV=90.0, filters=beam.filters)
+    response = detector_response(
+        scintillator=filters_from_text("CsI:0.5"), energies_keV=bare.energies_keV, escape=False
+    )
+    first, second = (
+        float(np.sum(bare.fluence * moment))
+        for moment in (response.mean_deposited_keV, response.mean_square_deposited_keV2)
+    )
+    assert kept.rate_DN_per_mAs[0] == pytest.approx(first * bare.bin_width_keV / 100.0, rel=2e-3)
+    assert kept.gain_DN[0] == pytest.approx(second / first, rel=2e-3)
+
+
+def test_a_cover_that_nobody_stated_is_a_cover(model):
+    beam = OpenBeam(kV=60.0, filters=())
+    declared = SpectralModel(cover=filters_from_text("C:0.8"), filter_materials=("Al", "Cu"), highest_kV=100.0)
+    # behind a window: below 5 keV the unstated layer is not steeper than there
+    moved = model.signal(parameters(model, cover_mm_C=0.8, inherent_filtration_mm_Al=0.5), beam)
+    known = declared.signal(parameters(declared, inherent_filtration_mm_Al=0.5), beam)
+    for name in ("rate_DN_per_mAs", "gain_DN", "absorbed_per_mAs", "kerma_uGy_per_mAs"):
+        assert getattr(moved, name)[0] == pytest.approx(getattr(known, name)[0], rel=1e-3), name
+    assert (
+        moved.kerma_uGy_per_mAs[0]
+        == model.signal(parameters(model, inherent_filtration_mm_Al=0.5), beam).kerma_uGy_per_mAs[0]
+    )
+
+
+def test_a_voltage_that_varies_is_the_mean_over_its_voltages(model):
+    beam = OpenBeam(kV=60.0, filters=filters_from_text("Al:2"))
+    spread = 0.02
+    varying = model.signal(parameters(model, kV_variance=spread**2), beam)
+    ends = [model.signal(parameters(model, kV_error=sign * spread), beam) for sign in (-1.0, 1.0)]
+    mean = np.mean([item.rate_DN_per_mAs[0] for item in ends])
+    assert varying.rate_DN_per_mAs[0] == pytest.approx(mean, rel=1e-6)
+    square = np.mean([item.rate_DN_per_mAs[0] * item.gain_DN[0] for item in ends])
+    assert varying.rate_DN_per_mAs[0] * varying.gain_DN[0] == pytest.approx(square, rel=1e-6)
+
+
+def test_light_counts_once_in_the_signal_and_twice_in_its_square(model):
+    beam = OpenBeam(kV=30.0, filters=filters_from_text("Al:2"))
+    plain, lighter = (model.signal(parameters(model, light_exponent=value), beam) for value in (0.0, 0.3))
+    rows = model.moment_weights(parameters(model)[0], beam)
+    power = (model.energies_keV[: rows.shape[1]] / 50.0) ** 0.3
+    assert lighter.rate_DN_per_mAs[0] == pytest.approx(float(rows[0] @ power), rel=1e-9)
+    assert lighter.rate_DN_per_mAs[0] * lighter.gain_DN[0] == pytest.approx(float(rows[1] @ power**2), rel=1e-9)
+    assert lighter.absorbed_per_mAs[0] == pytest.approx(plain.absorbed_per_mAs[0], rel=1e-12)
+
+
 def test_declared_layers_and_cover_lie_in_the_beam():
     declared = SpectralModel(
         inherent=filters_from_text("Be:0.8+Al:0.5"),

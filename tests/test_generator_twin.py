@@ -270,7 +270,7 @@ def test_without_a_spectrum_only_measured_levels_are_predicted():
     plain = make_twin(spectral=None)
     known = predict_flatfield(plain, setting_from_text("kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05"))
     assert known.photons_absorbed is None
-    assert known.as_dict()["air_kerma_uGy"] is None
+    assert known.to_dict()["air_kerma_uGy"] is None
     with pytest.raises(InputError, match="no spectral part"):
         predict_flatfields(plain, [setting_from_text("kv=60,power_w=40,exposure_ms=20,filter=Cu:0.05")])
     with pytest.raises(InputError, match="without spectral part"):

@@ -22,12 +22,13 @@ from raytwin.acquisition import (
     setting_from_text,
     write_acquisition,
 )
+from raytwin.acquisition._image_files import iter_images, read_image
 from raytwin.acquisition.images import import_images
 from raytwin.acquisition.nxtomo import import_nxtomo
 from raytwin.acquisition.reference import import_reference
 from raytwin.acquisition.zenodo import import_zenodo
 from raytwin.cli import main
-from raytwin.errors import InputError
+from raytwin.errors import FileFormatError, InputError
 
 SHAPE = (12, 17)
 
@@ -829,3 +830,100 @@ def test_the_sidecars_of_the_manual_are_read(folder, pairs, tmp_path):
     folders = corrected.replace("low/*.tif", "*/low.tif").replace("high/*.tif", "*/high.tif")
     (pairs / "raytwin.toml").write_text(folders.replace("bone/*.png", "*/bone.png").replace("product/*.", "*/product."))
     assert import_reference(pairs, tmp_path / "d.h5").frames == 3
+
+
+EMVA_LIST = """v 3.0
+n {bits} 40 32
+b 0.0 {first}
+i b0_1.png
+i b0_2.png
+{levels}
+d 0.0
+i d0_1.png
+i d0_2.png
+d 1000000.0
+i d1_1.png
+i d1_2.png
+"""
+
+
+@pytest.mark.parametrize(("bits", "gain_DN", "first_photons"), [(8, 0.05, 0.0), (12, 0.4, 50.0)])
+def test_emva_sets_with_an_exposure_of_0_import_and_calibrate(tmp_path, capsys, bits, gain_DN, first_photons):
+    """The dark end of a set with pulsed light, or a camera whose shortest exposure is not told, has 0 ns."""
+    rng = np.random.default_rng(bits)
+    root = tmp_path / "set"
+    root.mkdir()
+    full = 2**bits - 1
+    levels = [first_photons, *(full / gain_DN * share for share in (0.1, 0.2, 0.4, 0.6))]
+
+    def write(name, electrons):
+        values = 10.0 + gain_DN * rng.poisson(electrons, (32, 40)) + rng.normal(0.0, 1.5, (32, 40))
+        values = np.clip(np.rint(values), 0, full).astype(np.uint8 if bits == 8 else np.uint16)
+        imageio.imwrite(root / f"{name}.png", values)
+
+    lines = []
+    for number, electrons in enumerate(levels):
+        for frame in (1, 2):
+            write(f"b{number}_{frame}", electrons)
+        if number:
+            lines += [f"b 1000000.0 {electrons}", f"i b{number}_1.png", f"i b{number}_2.png"]
+    for number in (0, 1):
+        for frame in (1, 2):
+            write(f"d{number}_{frame}", 0.0)
+    text = EMVA_LIST.format(bits=bits, first=first_photons, levels="\n".join(lines))
+    (root / "EMVA1288_Data.txt").write_text(text)
+    assert main(["import", "emva1288", str(root), "-o", str(tmp_path / "o.h5"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 14
+    assert main(["calibrate", str(tmp_path / "o.h5"), "-o", str(tmp_path / "twin.h5"), "--json"]) == 0
+    (level,) = json.loads(capsys.readouterr().out)["levels"]
+    assert level["gain_DN_low"] < gain_DN < level["gain_DN_high"]
+
+
+def test_a_photon_counter_without_darks_has_a_dark_of_0_by_declaration(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    folder = tmp_path / "counter"
+    folder.mkdir()
+    sidecar = "[instrument]\ncounting = true\n"
+    for mean in (200, 400, 800):
+        for frame in range(4):
+            tifffile.imwrite(folder / f"flat{mean}_{frame}.tif", rng.poisson(mean, (48, 64)).astype(np.uint16))
+        sidecar += f'[[series]]\nkind = "flat"\nfiles = "flat{mean}_*.tif"\nexposure_ms = {mean}\n'
+    (folder / "raytwin.toml").write_text(sidecar)
+    assert main(["import", "images", str(folder), "-o", str(tmp_path / "o.h5")]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", str(tmp_path / "o.h5"), "-o", str(tmp_path / "twin.h5"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["dark_DN"]["value"] == 0.0
+    assert answer["levels"][0]["gain_DN"] == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_broken_tag_that_does_not_matter_is_not_told_and_one_that_does_is_an_error(tmp_path, caplog):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, image(1), metadata=None, description="x" * 40)
+    data = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        places = {tag.code: tag.offset for tag in file.pages[0].tags}
+    # tag 270, the description: its number of values leads beyond the file
+    data[places[270] + 8 : places[270] + 12] = (2**31).to_bytes(4, "little")
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_image(path), image(1))
+    assert not caplog.records
+    # tag 273, where the picture's numbers lie
+    data[places[273] + 2 : places[273] + 4] = (99).to_bytes(2, "little")
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match=r"a\.tif"):
+        read_image(path)
+    assert not caplog.records, "the error says it"
+
+
+def test_fits_images_come_in_as_they_are_stored_unsigned_and_in_stacks(tmp_path):
+    fits = pytest.importorskip("astropy.io.fits", reason="FITS files need the extra `fits`")
+    frames = np.stack([image(1), image(2)])
+    fits.PrimaryHDU(frames).writeto(tmp_path / "stack.fits")
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(frames[0])]).writeto(tmp_path / "extension.fit")
+    np.testing.assert_array_equal(list(iter_images(tmp_path / "stack.fits")), frames)
+    np.testing.assert_array_equal(read_image(tmp_path / "extension.fit"), frames[0])
+    whole = (tmp_path / "stack.fits").read_bytes()
+    (tmp_path / "cut.fits").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match=r"cut\.fits"):
+        list(iter_images(tmp_path / "cut.fits"))

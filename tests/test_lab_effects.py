@@ -17,13 +17,16 @@ from raytwin.lab.line import Line
 from raytwin.lab.objects import Slab, pixel_means, thickness_on_fine_grid
 from raytwin.lab.phantoms import Edge, Posed
 from raytwin.lab.session import COPPER, GEOMETRIES, make_session, session_system
+from raytwin.lab.unkindness import NONE
 
 SIZE = 64
 
 
 def system_on(geometry, *, size=SIZE, **more):
     quiet = {"gain_spread_percent": 0.0, "dark_spread_DN": 0.0, "dead_pixels": 0, "hot_pixels": 0}
-    system = session_system(0, rows=size, columns=size, geometry=GEOMETRIES[geometry])
+    # The laws are exact: nothing else may move.
+    system = session_system(0, rows=size, columns=size, geometry=GEOMETRIES[geometry], families=())
+    system = replace(system, unkindness=NONE)
     # Round voltage and angle: the spectra are kept from test to test.
     return replace(system, **{"kV_offset_percent": 0.0, "psf_sigma_px": 0.5, **quiet, **more})
 

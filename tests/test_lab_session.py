@@ -17,6 +17,7 @@ from raytwin.lab.line import Line
 from raytwin.lab.protocols import run_protocol, truth_path
 from raytwin.lab.session import COPPER, EXPOSURES_MS, session_system
 from raytwin.lab.truth import flat_truth
+from raytwin.lab.unkindness import NONE
 
 SIZE = 48
 
@@ -199,7 +200,11 @@ def test_bright_and_dim_flats_have_the_moments_of_the_closed_form(kV, share, ave
     geometry = GEOMETRIES["coarse"]
     quiet = {"gain_spread_percent": 0.0, "dark_spread_DN": 0.0, "dead_pixels": 0, "hot_pixels": 0}
     system = replace(
-        session_system(0, rows=64, columns=64, geometry=geometry), kV_offset_percent=0.0, psf_sigma_px=0.6, **quiet
+        session_system(0, rows=64, columns=64, geometry=geometry, families=()),
+        kV_offset_percent=0.0,
+        psf_sigma_px=0.6,
+        unkindness=NONE,
+        **quiet,
     )
     line = Line(system, rng=np.random.default_rng(2))
     setting = Setting(

@@ -50,6 +50,7 @@ from raytwin.lab.chain import margin_px
 from raytwin.lab.phantoms import Edge
 from raytwin.lab.protocols import CORRECTION_FRAMES, make_plan, run_protocol, system_of_seed
 from raytwin.lab.system import LabSystem
+from raytwin.lab.unkindness import NONE
 
 Array = NDArray[np.float64]
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)
@@ -183,7 +184,7 @@ def fine_lengths(system: LabSystem, scene: RenderedScene | None) -> dict[str, ND
 
 def without_margins(system: LabSystem, fine: NDArray[Any]) -> NDArray[Any]:
     """The lab's fine grid without what lies beside the detector."""
-    margin = 3 * margin_px(system.psf_sigma_px)
+    margin = 3 * margin_px(max(system.core_px))
     inner = slice(margin, -margin) if margin else slice(None)
     return fine[inner, inner]
 
@@ -416,15 +417,15 @@ def _pooled_auc(pairs: list[tuple[Array, Array]], chosen: NDArray[np.intp]) -> f
 
 def run(seed: int, size: Size, *, network: bool, output: Path | None) -> dict[str, Any]:
     """All rows of one system."""
-    system = system_of_seed(seed, rows=size.rows, columns=size.columns)
+    # the plain line: what is compared is the generation, not how well a line is calibrated
+    system = replace(system_of_seed(seed, rows=size.rows, columns=size.columns, families=()), unkindness=NONE)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.h5"
         run_protocol(
             path,
             protocol="calibration",
             seed=seed,
-            rows=size.rows,
-            columns=size.columns,
+            system=system,
             frames=size.calibration_frames,
         )
         with open_acquisition(path) as acquisition:

@@ -15,7 +15,8 @@ currents, exposures, distances, averages). The truth is the lab's own noise-free
 The limit of a system and setting is the standard deviation that a linear and Gaussian estimate reaches, knowing all
 derivatives: measured levels and noise with their sampling errors, priors of the unknowns as they are stated, nuisances
 for attenuation tables, spectrum models, escape, voltage and single levels' discrepancy. It is computed here from the
-lab's own sums over energy, without the twin's code; only the priors' widths are the twin's.
+lab's own sums over energy, without the twin's code; only the priors' widths, and the shape of light against energy, are the
+twin's. Lines whose physics is not the lab's either: validation/foreign_lines.py.
 
 With `--repeats N` the frames of each flat come in N series, all settings in turn, N times: what a session then shows of the
 line's steadiness is used. As many frames in all.
@@ -49,7 +50,6 @@ from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.calibration.next_measurement import rank_measurements
 from raytwin.calibration.priors import (
     ATTENUATION_SCALE,
-    DEPARTURE_FACTOR,
     GAIN_DISCREPANCY,
     LEVEL_DISCREPANCY,
     PRIORS,
@@ -63,6 +63,8 @@ from raytwin.lab.bench import Bench
 from raytwin.lab.response import Deposits, beam_of, compute_deposits
 from raytwin.lab.system import LabSystem, detector_maps, sample_system
 from raytwin.lab.truth import flat_truth
+from raytwin.lab.unkindness import NONE
+from raytwin.spectra import light_per_keV
 
 SIZE = 28
 FRAMES = 96
@@ -106,7 +108,8 @@ class Line:
 
     def __init__(self, seed: int, kind: str) -> None:
         rng = np.random.default_rng([seed, 77])
-        system = sample_system(rng).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
+        # the limit knows the plain line and the departures below alone
+        system = sample_system(rng, families=()).at_size(rows=SIZE, columns=SIZE, pixel_mm=0.45)
         aluminium = Filter(material="Al", thickness_mm=round(math.exp(rng.uniform(math.log(0.3), math.log(3.0))), 3))
         system = replace(
             system,
@@ -114,6 +117,7 @@ class Line:
             scintillator_mm=rng.uniform(0.36, 0.66),
             dead_pixels=0,
             hot_pixels=0,
+            unkindness=NONE,
         )
         # one DN is half to four times the read noise
         step = math.exp(rng.uniform(math.log(0.5), math.log(4.0)))
@@ -232,29 +236,35 @@ class Part:
 
 
 def prior_sd() -> dict[str, float]:
-    """Prior standard deviation of each unknown: the twin's widths, departures at their median size; this script's names."""
-    from scipy.stats import truncnorm
-
+    """Prior standard deviation of each unknown: the twin's widths; this script's names."""
     tables = {"scale": ATTENUATION_SCALE.sd, "first table": TABLE_SHARE.sd, "second table": TABLE_SHARE.sd}
-    filtration = PRIORS["inherent_filtration_mm_Al"]
-    found = {
-        # cut at 0, the prior is narrower than its sd says
-        "filtration": float(truncnorm(-filtration.centre / filtration.sd, math.inf, scale=filtration.sd).std()),
-        "thickness": PRIORS["log_scintillator_thickness"].sd,
-        "voltage": PRIORS["kV_error"].sd,
-        "voltage tilt": PRIORS["kV_tilt"].sd,
-        "output": PRIORS["log_output"].sd,
+    of_twin = {
+        "filtration": "inherent_filtration_mm_Al",
+        "thickness": "log_scintillator_thickness",
+        "voltage": "kV_error",
+        "voltage tilt": "kV_tilt",
+        "voltage variance": "kV_variance",
+        "output": "log_output",
+        "swank": "log_swank",
+        "swank exponent": "swank_exponent",
+        "yield": "yield_exponent",
+        "hardness": "hardness_exponent",
+        "hardness tilt": "hardness_tilt",
+        "roughness": "anode_roughness_um",
+        "model": "spectrum_model",
+        "escape": "escape_scale",
+        "scintillator table": "scintillator_table",
+        "cover": "cover_mm_C",
+        "dead layer": "dead_layer_um",
+        "light": "light_nonproportionality",
+        "light exponent": "light_exponent",
+        "light depth": "light_depth_slope",
+    }
+    return {
+        **{name: PRIORS[parameter].spread for name, parameter in of_twin.items()},
         "scale": 20.0,
-        "swank": PRIORS["log_swank"].sd,
-        "yield": PRIORS["yield_exponent"].sd,
-        "hardness": PRIORS["hardness_exponent"].sd,
-        "model": PRIORS["spectrum_model"].sd,
-        "escape": PRIORS["escape_scale"].sd,
-        "scintillator table": PRIORS["scintillator_table"].sd,
         **{f"{material} {what}": sd for material in ("Al", "Cu") for what, sd in tables.items()},
     }
-    departures = {"voltage tilt", "yield", "hardness", "escape", "Al scale", "Cu scale"}
-    return {name: sd * (DEPARTURE_FACTOR if name in departures else 1.0) for name, sd in found.items()}
 
 
 def prior_covariance(names: Sequence[str]) -> Array:
@@ -281,6 +291,11 @@ class Forward:
             up, down = (self._sums(kV, filters, **{name: sign * step}) for sign in (1.0, -1.0))
             rows[name] = (up - down) / (2 * step)
         rows["voltage tilt"] = rows["voltage"] * math.log(kV / 60.0)
+        beside = [self._sums(kV, filters, voltage=sign * 0.02) for sign in (1.0, 0.0, -1.0)]
+        levels = [math.exp(item[0] - beside[1][0]) for item in beside]
+        squares = [math.exp(item.sum() - beside[1].sum()) for item in beside]
+        bent = [(item[0] - 2.0 * item[1] + item[2]) / (2 * 0.02**2) for item in (levels, squares)]
+        rows["voltage variance"] = np.array([bent[0], bent[1] - bent[0]])
         rows["output"][0] = rows["scale"][0] = rows["scale"][1] = 1.0
         rows["swank"][1] = -1.0
         rows["yield"][0] = math.log(kV / 60.0)
@@ -294,6 +309,21 @@ class Forward:
             return np.array([mean, square - mean])
 
         rows["hardness"] = by(np.log(energy / 50.0))
+        rows["hardness tilt"] = rows["hardness"] * math.log(kV / 60.0)
+        rows["roughness"] = by(-1e-3 * _mu_per_mm("W", energy))
+        rows["cover"] = by(-_mu_per_mm("C@2.2", energy))
+        own = _mu_per_mm("CsI", energy)
+        rows["dead layer"] = by(-1e-3 * own)
+        depth = own * self.system.scintillator_mm
+        for name, row in (
+            ("light", light_per_keV("CsI", energy)),
+            ("light exponent", np.log(energy / 50.0)),
+            ("light depth", 1.0 / depth - 1.0 / np.expm1(np.minimum(depth, 500.0)) - 0.5),
+        ):
+            once = by(row)
+            # light counts twice in the square
+            rows[name] = np.array([once[0], once[0] + 2.0 * once[1]])
+        rows["swank exponent"] = np.array([0.0, -by(np.log(energy / 50.0)).sum()])
         rows["model"] = by(_other_spectrum_model(kV, self.system.anode_angle_deg, energy))
         for material in ("Al", "Cu"):
             thickness = sum(layer.thickness_mm for layer in filters if layer.material == material)
@@ -487,7 +517,7 @@ def take_next(seed: int, *, kind: str, folder: Path, protocol: str) -> dict[str,
     """Errors and widths of the levels' predictions before and after the measurement that calibration names is taken."""
     session, lab = prepare(seed, kind, folder)
     before = calibrated(session, PROTOCOLS[protocol], seed)
-    named = next(item for item in rank_measurements(before) if not item.layers)
+    named = next(item for item in rank_measurements(before) if item.kind == "flats")
     beam = (named.setting.kV, text_from_filters(named.setting.filters))
     again = folder / f"{kind}_{seed}_{protocol}_next.h5"
     measure(again, Line(seed, kind), seed, [*PROTOCOLS[protocol], beam], part=1)

@@ -1,6 +1,7 @@
 """Tungsten spectra measured at PTB against the tube model with one fitted parameter, and what they cannot tell apart.
 
     python validation/ptb_spectra.py FOLDER [--json FILE]
+    python validation/ptb_spectra.py --qualities [--json FILE]
 
 FOLDER holds W_20kV.dat ... W_45kV.dat (Ketelhut and Bueermann, PTB, CC BY 4.0: germanium detector, 4 mm Be, 30 degrees,
 1 m of air). The model is SpekPy's casim behind 4 mm Be and 1 m of air and one parameter more. It is fitted on two
@@ -10,12 +11,19 @@ photons); the other three say how well it does: total variation, half the sum of
 Two parameters fitted together have the correlation -cos(angle between their derivatives of those roots), taken where
 tungsten alone fits best. Beyond 0.95 each is more than three times as uncertain as if the other were known: the data
 know a combination of the two and not which it is.
+
+`--qualities` takes PTB's catalogue of beam qualities (Ankerhold 2000, PTB-Dos-34, 30 to 150 kV, as SpekPy ships it): half-value
+layers in Al and Cu and mean energies, and which hardness exponent or how much tungsten each wants of either of SpekPy's models.
+The priors `hardness_exponent`, `hardness_tilt` and `anode_roughness_um` have their widths from both.
 """
 
 import argparse
 import itertools
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +32,15 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 
 from raytwin.acquisition.setting import Filter
-from raytwin.spectra import Spectrum, spectrum_from_file, tube_spectrum
+from raytwin.materials import material_from_name
+from raytwin.spectra import (
+    MODELS,
+    Spectrum,
+    half_value_layer_mm,
+    mean_energy_keV,
+    spectrum_from_file,
+    tube_spectrum,
+)
 
 VOLTAGES_KV = (20, 25, 30, 35, 45)
 ABOVE_KEV = 13.0
@@ -163,13 +179,86 @@ def compare(measured: dict[int, Spectrum]) -> dict[str, Any]:
     }
 
 
+def compare_qualities(model: str) -> list[dict[str, Any]]:
+    """What PTB's beam qualities want of a tube model, by quantity and range of kV: rms error, hardness, tungsten.
+
+    hardness: least-squares exponent of (E / 50 keV) and the scatter of single qualities' exponents about it; tungsten_um: the
+    same fit by micrometres of tungsten.
+    """
+    import spekpy
+
+    quantities: dict[str, Callable[[Spectrum], float]] = {
+        "hvl_1_al": partial(half_value_layer_mm, material=material_from_name("Al")),
+        "hvl_1_cu": partial(half_value_layer_mm, material=material_from_name("Cu")),
+        "e_mean": mean_energy_keV,
+    }
+    names = {"Air Dry (Near Sea Level)": "air"}
+    found: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in quantities}
+    for path in sorted((Path(spekpy.__file__).parent / "data" / "state_def").glob("PTB_*.state")):
+        state = json.loads(path.read_text(encoding="utf-8"))
+        tube, published = state["model_parameters"], state["reference_values"]
+        if tube["kvp"] > 150:
+            continue
+        layers = [Filter(material=names.get(name, name), thickness_mm=mm) for name, mm in state["filters"]]
+        beams = [
+            tube_spectrum(kV=tube["kvp"], anode_angle_deg=tube["th"], filters=[*layers, *extra], model=model)
+            for extra in ((), (Filter(material="W", thickness_mm=1e-3),))
+        ]
+        harder = replace(beams[0], fluence=beams[0].fluence * (beams[0].energies_keV / REFERENCE_KEV) ** 0.1)
+        for name, quantity in quantities.items():
+            if published[name]:
+                ours = quantity(beams[0])
+                found[name].append(
+                    (
+                        tube["kvp"],
+                        float(np.log(published[name] / ours)),
+                        float(np.log(quantity(harder) / ours)) / 0.1,
+                        float(np.log(quantity(beams[1]) / ours)),
+                    )
+                )
+    rows = []
+    for name, values in found.items():
+        kV, error, by_hardness, by_tungsten = np.array(values).T
+        for low, high in ((30, 60), (60, 100), (100, 151), (30, 151)):
+            chosen = (kV >= low) & (kV < high)
+            y, hardness, tungsten = error[chosen], by_hardness[chosen], by_tungsten[chosen]
+            rows.append(
+                {
+                    "model": model,
+                    "quantity": name,
+                    "kV": [low, min(high, 150)],
+                    "qualities": int(chosen.sum()),
+                    "rms_percent": 100 * float(np.sqrt(np.mean(y**2))),
+                    "hardness": float(hardness @ y / (hardness @ hardness)),
+                    "hardness_scatter": float(np.std(y / hardness)),
+                    "tungsten_um": float(tungsten @ y / (tungsten @ tungsten)),
+                }
+            )
+    return rows
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "folder", type=Path, help="folder with W_20kV.dat, W_25kV.dat, W_30kV.dat, W_35kV.dat, W_45kV.dat"
+        "folder", type=Path, nargs="?", help="folder with W_20kV.dat, W_25kV.dat, W_30kV.dat, W_35kV.dat, W_45kV.dat"
     )
     parser.add_argument("--json", type=Path, help="also write the answer here")
+    parser.add_argument("--qualities", action="store_true", help="PTB's beam qualities instead, which come with SpekPy")
     arguments = parser.parse_args()
+    if arguments.qualities:
+        table = [row for model in MODELS for row in compare_qualities(model)]
+        for row in table:
+            print(
+                f"{row['model']:6s} {row['quantity']:9s} {row['kV'][0]:>3}-{row['kV'][1]} kV {row['qualities']:>3} qualities: rms"
+                f" {row['rms_percent']:.2f} %, hardness {row['hardness']:+.3f} (single ones scatter by"
+                f" {row['hardness_scatter']:.2f}), tungsten {row['tungsten_um']:+.2f} um"
+            )
+        if arguments.json is not None:
+            arguments.json.parent.mkdir(parents=True, exist_ok=True)
+            arguments.json.write_text(json.dumps(table, indent=1), encoding="utf-8")
+        return 0
+    if arguments.folder is None:
+        parser.error("name the folder of PTB's spectra, or --qualities")
     files = {kV: arguments.folder / f"W_{kV}kV.dat" for kV in VOLTAGES_KV}
     missing = [path.name for path in files.values() if not path.is_file()]
     if missing:

@@ -36,6 +36,7 @@ from raytwin.generator.generate import PairTransfer
 from raytwin.lab.bench import Bench, render
 from raytwin.lab.objects import BONE_MATERIAL, pixel_means
 from raytwin.lab.protocols import CORRECTION_FRAMES, make_plan, run_protocol, system_of_seed
+from raytwin.lab.unkindness import NONE
 
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)
 REFERENCE = (
@@ -108,12 +109,13 @@ class Spread:
 
 def run_seed(seed: int, *, rows: int, columns: int, frames: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows per band and rows per bone of one system."""
-    system = system_of_seed(seed, rows=rows, columns=columns)
+    # the plain line: what is compared is the generation, not how well a line is calibrated
+    system = replace(system_of_seed(seed, rows=rows, columns=columns, families=()), unkindness=NONE)
     bands: list[dict[str, Any]] = []
     bones: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session.h5"
-        run_protocol(session, protocol="calibration", seed=seed, rows=rows, columns=columns, frames=20)
+        run_protocol(session, protocol="calibration", seed=seed, system=system, frames=20)
         with open_acquisition(session) as acquisition:
             twin = calibrate_twin(acquisition, rng=np.random.default_rng(seed))
     plan = make_plan(

@@ -35,7 +35,7 @@ from scipy.ndimage import gaussian_filter, shift
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
-from raytwin.diagnosis.diagnose import diagnose
+from raytwin.diagnosis.diagnose_session import diagnose
 
 DARK_SLOPE_DN_PER_MS, OPTICAL = 0.02, 1.05
 DENSITY = {"Al": 2.699, "Pb": 11.35, "H2O": 1.0, "Cu": 8.96, "W": 19.3, "Gd2O2S": 4.38, "CsI": 4.51, "CdTe": 5.85}

@@ -5,16 +5,18 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 
 from . import __version__
-from .errors import RaytwinError
+from .errors import InputError, RaytwinError
 
 # name -> (module in raytwin.commands, one line for `raytwin --help`)
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the main job end to end on the virtual lab"),
     "spectrum": ("spectrum", "tube spectrum behind filters"),
     "mu": ("mu", "effective attenuation of a material"),
+    "check": ("check", "what measurements allow, what is suspicious, what to measure next"),
     "calibrate": ("calibrate", "measured flat and dark series -> calibrated twin"),
     "contrast": ("contrast", "contrast of a foreign object in a product, and maps of it"),
     "predict": ("predict", "flatfield at a setting, measured or not"),
@@ -30,7 +32,34 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "blind-check": ("blind_check", "the diagnosis on sealed cases of the virtual lab"),
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
+    "export": ("export", "the twin in the form other simulators read"),
+    "info": ("info", "what is installed; or a twin in a table"),
 }
+
+# what `raytwin` alone prints: the way from a first try to an answer
+_WAY = """raytwin: a calibrated digital twin of an X-ray inspection line.
+
+  raytwin demo                          the main job end to end on the virtual lab, in minutes
+
+With measurements of your own:
+  raytwin import images FOLDER -o session.h5      your files -> an acquisition file
+  raytwin calibrate session.h5 -o twin.h5         darks and flats -> the twin
+  raytwin info twin.h5                            the twin in a table
+  raytwin predict twin.h5 --kv 60 --power-w 30 --exposure-ms 20
+  raytwin diagnose session.h5 -o diagnosis        where and why measured and simulated differ
+
+Before any measurement:
+  raytwin spectrum --kv 60 --filter Al:2.5
+  raytwin contrast --product water:30 --object Al:0.5 --low SETTING --high SETTING
+
+`raytwin --help` lists all commands, `raytwin COMMAND --help` one of them; `import raytwin` has the same in Python.
+"""
+
+
+# commands that read HDF5 files of others: the library itself may die at damaged ones
+READING = frozenset(
+    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect"}
+)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -59,23 +88,58 @@ def _parser(selected: str | None) -> argparse.ArgumentParser:
                 formatter_class=argparse.RawDescriptionHelpFormatter,
             )
             module.add_arguments(command)
-            command.set_defaults(run=module.run)
+            command.set_defaults(run=module.run, option_of_argument=_options(command))
         else:
             commands.add_parser(name, help=line, add_help=False)
     return parser
 
 
+def _options(command: argparse.ArgumentParser) -> dict[str, str]:
+    """Python's name of an argument -> the option that sets it, for messages."""
+    return {action.dest: action.option_strings[0] for action in command._actions if action.option_strings}
+
+
+def _as_options(argument: str, options: Mapping[str, str]) -> str:
+    """Names of Python arguments as the options that set them; any other text as it is."""
+    names = argument.replace(" and ", ", ").split(", ")
+    if not all(name in options for name in names):
+        return argument
+    for name in names:
+        argument = argument.replace(name, options[name])
+    return argument
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 success, 1 internal failure, 2 bad input."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words:
+        sys.stdout.write(_WAY)
+        return 0
     selected = next((word for word in words if not word.startswith("-")), None)
+    if selected is not None and selected not in COMMANDS:
+        near = get_close_matches(selected, COMMANDS, n=1, cutoff=0.5)
+        hint = f"; did you mean `raytwin {near[0]}`?" if near else ""
+        known = ", ".join(COMMANDS)
+        sys.stderr.write(f"raytwin: error: got {selected!r}; expected a command: {known}{hint}\n")
+        return 2
+    if arguments is None and selected in READING:
+        from ._guard import code_of_child
+
+        code_there = code_of_child(words)
+        if code_there is not None:
+            return code_there
+    options: dict[str, str] = {}
     try:
         parsed = _parser(selected if selected in COMMANDS else None).parse_args(words)
+        options = parsed.option_of_argument
         code: int = parsed.run(parsed)
         sys.stdout.flush()
         return code
     except RaytwinError as error:
-        sys.stderr.write(f"raytwin {selected}: error: {' '.join(str(error).split())}\n")
+        message = str(error)
+        if isinstance(error, InputError):
+            message = error.message(argument=_as_options(error.argument, options))
+        sys.stderr.write(f"raytwin {selected}: error: {' '.join(message.split())}\n")
         return 2
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

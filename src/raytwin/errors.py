@@ -16,17 +16,19 @@ class InputError(RaytwinError, ValueError):
             expected: what would have been right, in lab words with units.
             remedy: what the user can do about it; empty where `expected` already says it.
         """
-        given = " ".join(str(received).split())
-        if len(given) > 160:
-            given = given[:157] + "..."
-        message = f"{argument}: got {given}; expected {expected}"
-        if remedy:
-            message += f"; {remedy}"
-        super().__init__(message)
         self.argument = argument
         self.received = received
         self.expected = expected
         self.remedy = remedy
+        super().__init__(self.message())
+
+    def message(self, *, argument: str | None = None) -> str:
+        """The message, on request with another name of the argument, such as a command's option."""
+        given = " ".join(str(self.received).split())
+        if len(given) > 160:
+            given = given[:157] + "..."
+        text = f"{argument or self.argument}: got {given}; expected {self.expected}"
+        return f"{text}; {self.remedy}" if self.remedy else text
 
 
 class FileFormatError(InputError):

@@ -1,10 +1,11 @@
 """Options that describe a beam and its detector, shared by the commands that take them."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from ..acquisition.setting import Filter, filter_from_text
-from ..materials import TABLES, Library, library_from_files, material_from_name, nist_identifier
+from ..errors import InputError
+from ..materials import TABLES
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
     DEFAULT_ANODE,
@@ -14,17 +15,10 @@ from ..spectra import (
     MAXIMUM_KV_OF_ANODE,
     MINIMUM_KV,
     MODELS,
-    Response,
-    Spectrum,
-    detector_response,
-    filtered_spectrum,
-    spectrum_from_file,
-    tube_spectrum,
 )
 from ._answer import say
-
-SOFT_KEV = 12.0
-SOFT_SHARE = 0.1
+from ._twin_file import HELP as TWIN_HELP
+from ._twin_file import twin_file
 
 
 def add_tube_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,75 +69,47 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--counting", action="store_true", help="photon-counting instead of energy-integrating")
 
 
+def add_twin_argument(parser: argparse.ArgumentParser) -> None:
+    """--twin, in place of the options that describe a tube."""
+    parser.add_argument("--twin", metavar="TWIN", type=twin_file, help=f"a calibrated tube: {TWIN_HELP}")
+
+
+def twin_of(arguments: argparse.Namespace) -> Mapping[str, Any]:
+    """--twin with what it leaves to say, as the arguments of `raytwin.spectrum` and `raytwin.mu`.
+
+    Raises:
+        InputError: no tube voltage, or an option that describes another tube.
+    """
+    if arguments.kv is None:
+        raise InputError("--kv", received="nothing", expected="the tube voltage in kV")
+    stated = {"anode": DEFAULT_ANODE, "angle": DEFAULT_ANGLE_DEG, "model": DEFAULT_MODEL, "table": "xraylib"}
+    given = [f"--{name}" for name, default in stated.items() if getattr(arguments, name) != default]
+    given += [f"--{name.replace('_', '-')}" for name in ("spectrum_file", "library") if getattr(arguments, name)]
+    if given:
+        raise InputError("--twin", received=f"also {', '.join(given)}", expected="a twin or a stated tube, not both")
+    return {"twin": arguments.twin, "kV": arguments.kv, "filter": arguments.filters}
+
+
 def kv_help() -> str:
     """The help line of --kv."""
     return f"tube voltage, {MINIMUM_KV:g} to {MAXIMUM_KV:g} kV (anodes other than W: to 50)"
 
 
-def library_of(arguments: argparse.Namespace) -> Library:
-    """The materials that the command knows."""
-    return library_from_files(arguments.library)
+def tube_of(arguments: argparse.Namespace) -> Mapping[str, Any]:
+    """The tube's options as the arguments of `raytwin.spectrum` and `raytwin.mu`."""
+    return {
+        "kV": arguments.kv,
+        "filter": arguments.filters,
+        "anode": arguments.anode,
+        "anode_angle_deg": arguments.angle,
+        "model": arguments.model,
+        "spectrum_file": arguments.spectrum_file,
+        "table": arguments.table,
+        "library": arguments.library,
+    }
 
 
-def layers_of(texts: Sequence[str], library: Library) -> tuple[Filter, ...]:
-    """Layers from option values; each name is looked up, a NIST name with commas by its plain spelling."""
-    layers = []
-    for text in texts:
-        for part in text.split("+"):
-            name, colon, thickness = part.rpartition(":")
-            plain = nist_identifier(name) if colon and "," in name else None
-            layer = filter_from_text(f"{plain}:{thickness}" if plain else part)
-            material_from_name(layer.material, library=library)
-            layers.append(layer)
-    return tuple(layers)
-
-
-def beam_of(arguments: argparse.Namespace, library: Library) -> Spectrum:
-    """The spectrum that the options describe."""
-    layers = layers_of(arguments.filters, library)
-    if arguments.spectrum_file is not None:
-        measured = spectrum_from_file(arguments.spectrum_file, kV=arguments.kv)
-        return filtered_spectrum(measured, layers, table=arguments.table, library=library)
-    return tube_spectrum(
-        kV=arguments.kv,
-        filters=layers,
-        anode=arguments.anode,
-        anode_angle_deg=arguments.angle,
-        model=arguments.model,
-        table=arguments.table,
-        library=library,
-    )
-
-
-def detector_of(arguments: argparse.Namespace, spectrum: Spectrum, library: Library) -> Response:
-    """The detector that the options describe, on the spectrum's energies."""
-    return detector_response(
-        energies_keV=spectrum.energies_keV,
-        scintillator=layers_of(arguments.scintillator, library) or DEFAULT_SCINTILLATOR,
-        cover=layers_of(arguments.cover, library),
-        counting=arguments.counting,
-        table=arguments.table,
-        library=library,
-    )
-
-
-def warn_of_soft_beam(spectrum: Spectrum) -> None:
-    """Say so where photons that no real window passes make up much of the beam's energy."""
-    energy = spectrum.energies_keV * spectrum.fluence
-    share = float(energy[spectrum.energies_keV < SOFT_KEV].sum() / energy.sum())
-    if share > SOFT_SHARE and spectrum.anode is not None:
-        say(
-            f"note: {100 * share:.0f} % of the beam's energy lies below {SOFT_KEV:g} keV, which most tube windows stop;"
-            " name the inherent filtration, for example --filter Be:0.8 --filter Al:1"
-        )
-
-
-def describe_beam(spectrum: Spectrum) -> str:
-    """One line about where a spectrum comes from."""
-    behind = " behind " + " + ".join(f"{layer.thickness_mm:g} mm {layer.material}" for layer in spectrum.filters)
-    if spectrum.anode is None:
-        return f"{spectrum.model}{behind if spectrum.filters else ''}"
-    return (
-        f"{spectrum.kV:g} kV, {spectrum.anode} anode at {spectrum.anode_angle_deg:g} degrees, {spectrum.model}"
-        f" ({spectrum.model_version}){behind if spectrum.filters else ', unfiltered'}"
-    )
+def tell(warnings: Sequence[str]) -> None:
+    """Notes on the beam, to standard error."""
+    for text in warnings:
+        say(f"note: {text}")

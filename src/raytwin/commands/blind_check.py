@@ -13,8 +13,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ._answer import answer, jsonable, say
-from ._folder import check_effects, written_folder
+from ..api._folder import check_effects, written_folder
+from ..results import plain
+from ._answer import answer, say
 
 EXAMPLE = """examples:
   raytwin blind-check -n 600 --seed 123456 -o blind --train-cases 300 --workers 2
@@ -151,7 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows = case_rows(check, result.outcomes)
     write_cases(folder / "cases.csv", rows)
     with whole_file(folder / "scores.json") as temporary:
-        temporary.write_text(json.dumps(jsonable(result.scores), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(plain(result.scores), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     write_report(result, rows, folder / "report.html", version=__version__)
     answer(
         result.scores,

@@ -6,19 +6,22 @@ once, with others in between, show how steady the line is: predictions of a stea
 """
 
 import argparse
-import sys
-from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ._answer import answer, say
+
+if TYPE_CHECKING:
+    from ..acquisition.instrument import Instrument
 
 EXAMPLE = """example:
   raytwin lab -o session.h5 --protocol calibration --seed 1
   raytwin calibrate session.h5 -o twin.h5
   raytwin calibrate monday.h5 tuesday.h5 -o twin.h5
   raytwin calibrate session.h5 -o twin.h5 --spectrum tube_40kV.csv:40 --spectrum tube_90kV.csv:90
+  raytwin calibrate --output-table doses.csv --angle 20 -o tube.h5
+  raytwin calibrate session.h5 --output-table doses.csv --transmission table.csv -o twin.h5
 """
 
 
@@ -28,8 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "acquisition",
         metavar="ACQ",
         type=Path,
-        nargs="+",
-        help="acquisition file with flats and darks; several are sessions of one line, each with its own darks",
+        nargs="*",
+        help="acquisition file with flats and darks; several are sessions of one line, each with its own darks. Without one a"
+        " dose table or a transmission table calibrates the tube alone",
     )
     parser.add_argument("-o", "--output", metavar="TWIN", type=Path, required=True, help="twin file to write")
     parser.add_argument(
@@ -40,6 +44,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a measured spectrum of the tube (two columns: keV, fluence per keV) in place of the tube model; repeatable."
         " At other voltages the model is scaled as at the nearest ones measured",
     )
+    parser.add_argument(
+        "--output-table",
+        metavar="FILE",
+        type=Path,
+        help="what a dosimeter read (CSV): kV, filter, mAs or current_mA and exposure_ms, distance_mm, air_kerma_uGy; or"
+        " hvl_mm_Al in place of the kerma",
+    )
+    parser.add_argument(
+        "--transmission",
+        metavar="FILE",
+        type=Path,
+        help="what an absorber let through (CSV): kV, filter, transmission; material and thickness_mm where they are known",
+    )
+    parser.add_argument("--anode", metavar="ELEMENT", help="of a tube alone (default W)")
+    parser.add_argument("--angle", metavar="DEG", type=float, help="anode angle of a tube alone (default 12)")
+    parser.add_argument("--inherent", metavar="MATERIAL:mm", help="declared layers of a tube alone, joined by +")
     parser.add_argument(
         "--estimator",
         choices=("pairs", "stack"),
@@ -58,45 +78,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin calibrate`."""
-    import numpy as np
+    from ..api._progress import Bar
+    from ..api.twins import calibrate
 
-    from .. import __version__
-    from ..acquisition import open_acquisition
-    from ..acquisition.sessions import merge_sessions, one_layer
-    from ..calibration.calibrate import calibrate_twin, calibration_answer
-    from ..files import sha256_of_file
-    from ..generator.twin_io import write_twin
-    from ..spectra import spectrum_from_file
-
-    spectra = []
+    spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")
         if not colon or not _is_number(voltage):
             raise InputError(
                 "--spectrum", received=repr(text), expected="FILE:kV", remedy="for example tube_60kV.csv:60"
             )
-        spectra.append(spectrum_from_file(file, kV=float(voltage)))
-    with ExitStack() as stack:
-        opened = [stack.enter_context(open_acquisition(path)) for path in arguments.acquisition]
-        acquisition = one_layer(merge_sessions(opened), arguments.layer)
-        twin = calibrate_twin(
-            acquisition,
-            rng=np.random.default_rng(arguments.seed),
+        spectra[float(voltage)] = file
+    with Bar(only_on_terminal=True) as bar:
+        twin = calibrate(
+            arguments.acquisition or None,
+            output_table=arguments.output_table,
+            transmission=arguments.transmission,
+            instrument=_instrument(arguments),
             spectra=spectra,
             estimator=arguments.estimator,
-            progress=_stage if sys.stderr.isatty() else None,
-            provenance={
-                "acquisition_sha256": "+".join(sha256_of_file(path) for path in arguments.acquisition),
-                "raytwin_version": __version__,
-                "seed": arguments.seed,
-            },
+            layer=arguments.layer,
+            seed=arguments.seed,
+            progress=bar,
         )
-    write_twin(arguments.output, twin)
-    result = calibration_answer(twin)
+    twin.save(arguments.output)
+    result = twin.to_dict()
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))
     return 0
+
+
+def _instrument(arguments: argparse.Namespace) -> "Instrument | None":
+    """What the options say of a tube alone; None: nothing.
+
+    Raises:
+        InputError: an acquisition states its own tube.
+    """
+    from ..acquisition.instrument import Instrument
+    from ..generator.predict_settings import as_filters
+
+    options = {name: getattr(arguments, name) for name in ("anode", "angle", "inherent")}
+    given = [f"--{name}" for name, value in options.items() if value is not None]
+    if given and arguments.acquisition:
+        raise InputError(
+            ", ".join(given),
+            received="an acquisition too",
+            expected="one statement of the tube: the acquisition's",
+            remedy="leave the option out, or correct the acquisition's instrument",
+        )
+    if not given:
+        return None
+    inherent = None if options["inherent"] is None else as_filters(options["inherent"])
+    return Instrument(anode=options["anode"], anode_angle_deg=options["angle"], inherent_filtration=inherent)
 
 
 def _is_number(text: str) -> bool:
@@ -106,25 +140,49 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _stage(name: str) -> None:
-    say(f"calibrating: {name}")
-
-
 def _interval(value: dict[str, float] | None, unit: str) -> str:
     if value is None:
         return "not known"
     return f"{value['value']:.4g} ({value['low']:.4g} to {value['high']:.4g}){unit}"
 
 
+def _table_lines(evidence: dict[str, Any]) -> list[str]:
+    """What dose and transmission tables say."""
+    lines = []
+    output = evidence.get("output_table")
+    if output is not None:
+        lines.append(
+            f"dose table          {output['rows']} rows, {len(output['settings'])} settings; a reading scatters by"
+            f" {output['scatter_percent']:.2g} % ({output['repeats']} repeats)"
+        )
+    for name, title in (("output_table", "kerma, departure"), ("transmission_table", "transmission, dep.")):
+        found = [row["departure_percent"] for row in evidence.get(name, {}).get("departures", ())]
+        if found:
+            rms = (sum(value**2 for value in found) / len(found)) ** 0.5
+            lines.append(f"{title:<19} {rms:.2g} % rms, {max(found, key=abs):+.2g} % at most, from the fit")
+    for absorber, materials in evidence.get("transmission_table", {}).get("absorbers", {}).items():
+        parts = " and ".join(f"{_interval(value, ' mm')} {material}" for material, value in materials.items())
+        lines.append(f"{absorber:<19} as {parts}")
+    return lines
+
+
 def _text(result: dict[str, Any], path: Path) -> str:
-    lines = [
-        f"dark                {_interval(result['dark_DN'], ' DN')}",
-        f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
-        f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['spread']['family']})",
+    lines = []
+    if result["bad_pixels"] is not None:
+        lines = [
+            f"dark                {_interval(result['dark_DN'], ' DN')}",
+            f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
+            f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['spread']['family']})",
+        ]
+    lines += [
         f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
         f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
-        f"bad pixels          {result['bad_pixels']['count']} ({result['bad_pixels']['share_percent']:.3g} %)",
     ]
+    if result["bad_pixels"] is not None:
+        lines.append(
+            f"bad pixels          {result['bad_pixels']['count']} ({result['bad_pixels']['share_percent']:.3g} %)"
+        )
+    lines += _table_lines(result["evidence"])
     for level in result["levels"]:
         voltage = "unknown kV" if level["kV"] is None else f"{level['kV']:g} kV"
         name = f"{voltage} {level['filter']}".strip()

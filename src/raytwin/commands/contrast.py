@@ -7,19 +7,15 @@ otherwise. In a map, kV changes at the power (or current) of --low and --high; a
 
 import argparse
 import math
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..acquisition.setting import Setting, filter_from_text, filters_from_text, setting_from_text, text_from_filters
+from ..api._progress import Bar
+from ..api.beams import MOST_VALUES, ContrastMap, contrast
 from ..errors import InputError
 from ..files import whole_file
 from ._answer import answer, say
 from ._twin_file import HELP, twin_file
-
-if TYPE_CHECKING:
-    from ..generator.contrast import Contrast, UncalibratedLine
-    from ..generator.twin import Twin
 
 EXAMPLE = """examples:
   raytwin contrast --product chicken_breast:20 --object bone_cortical_icru44:1 --object-pixels 100 \\
@@ -29,8 +25,6 @@ EXAMPLE = """examples:
   raytwin contrast --product water:30 --object Al:0.5 --map-kv-high 70:120:10 --map-filter "Cu:0.05;Cu:0.1;Al:1" \\
     --low kv=40,power_w=40,exposure_ms=20 --high kv=90,power_w=45,exposure_ms=20 --json"""
 
-_AXES = ("kv_low", "kv_high", "filter")
-_MOST_VALUES = 100
 # option -> (field of UncalibratedLine, unit for the help, meaning)
 _LINE_OPTIONS = {
     "angle": ("anode_angle_deg", "DEG", "anode angle"),
@@ -75,103 +69,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin contrast`."""
-    from tqdm import tqdm
-
-    from ..generator.contrast import compute_contrast_map, predict_contrast
-    from ..materials import material_from_name
-
-    low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
-    slabs: dict[str, Any] = {
-        "product": filter_from_text(arguments.product),
-        "foreign_object": filter_from_text(arguments.object),
-        "object_pixels": arguments.object_pixels,
-        "displaces": arguments.displaces,
-    }
-    for layer in (slabs["product"], slabs["foreign_object"], *low.filters, *high.filters):
-        material_from_name(layer.material)
     axes = _axes_of(arguments)
     if arguments.plot is not None and not axes:
         raise InputError("--plot", received="no map", expected="two of --map-kv-low, --map-kv-high, --map-filter")
-    line = _line_of(arguments)
-    result: dict[str, Any] = {
-        "product": str(slabs["product"]),
-        "object": str(slabs["foreign_object"]),
-        "object_pixels": arguments.object_pixels,
-        "displaces": arguments.displaces,
-        "twin": arguments.twin,
-    }
-    if not axes:
-        found = predict_contrast(line, low=low, high=high, **slabs)
-        result |= found.as_dict()
-        warnings = found.warnings
-        text = _text(found, result)
-    else:
-        rows, columns = axes
-        pairs = [[_at(_at((low, high), rows, row), columns, column) for column in axes[columns]] for row in axes[rows]]
-        bar = tqdm(pairs, desc="settings", unit="row", disable=None)
-        grid = compute_contrast_map(line, bar, **slabs)
-        warnings = tuple(dict.fromkeys(warning for row in grid for one in row for warning in one.warnings))
-        result |= _map_answer(axes, grid)
+    with Bar(only_on_terminal=True, unit="row") as bar:
+        found = contrast(
+            product=arguments.product,
+            foreign_object=arguments.object,
+            low=arguments.low,
+            high=arguments.high,
+            twin=arguments.twin,
+            object_pixels=arguments.object_pixels,
+            displaces=arguments.displaces,
+            progress=bar,
+            **axes,
+            **_line_of(arguments),
+        )
+    result = found.to_dict()
+    if isinstance(found, ContrastMap):
         text = _map_text(result)
         if arguments.plot is not None:
             with whole_file(arguments.plot) as temporary:
-                _figure(result).savefig(temporary, format="png", dpi=150)
+                _figure(found).savefig(temporary, format="png", dpi=150)
             result["plot"] = arguments.plot
-    result["warnings"] = list(warnings)
-    for warning in warnings:
+    else:
+        text = _text(found.contrast, result)
+    for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=text)
     return 0
 
 
-def _line_of(arguments: argparse.Namespace) -> "Twin | UncalibratedLine":
-    from ..generator.contrast import UncalibratedLine
-    from ..generator.twin_io import read_twin
-    from ..materials import material_from_name
-
-    given: dict[str, Any] = {}
-    for option, (field, _, _) in _LINE_OPTIONS.items():
-        if getattr(arguments, option) is not None:
-            given[field] = getattr(arguments, option)
-    for option in _LAYER_OPTIONS:
-        if getattr(arguments, option) is not None:
-            given[option] = filters_from_text(getattr(arguments, option))
-            for layer in given[option]:
-                material_from_name(layer.material)
-    for option in ("anode", "counting"):
-        if getattr(arguments, option) is not None:
-            given[option] = getattr(arguments, option)
-    if arguments.twin is None:
-        return UncalibratedLine(**given)
-    if given:
-        raise InputError("--twin", received=f"also {', '.join(given)}", expected="a twin or a stated line, not both")
-    return read_twin(arguments.twin)
+def _line_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the options state of a line without a twin."""
+    names = {option: field for option, (field, _, _) in _LINE_OPTIONS.items()}
+    names |= {option: option for option in (*_LAYER_OPTIONS, "anode", "counting")}
+    return {
+        field: getattr(arguments, option) for option, field in names.items() if getattr(arguments, option) is not None
+    }
 
 
 def _axes_of(arguments: argparse.Namespace) -> dict[str, list[Any]]:
     axes: dict[str, list[Any]] = {}
-    for name in ("kv_low", "kv_high"):
-        text = getattr(arguments, f"map_{name}")
+    for name, option in (("kV_low", "map_kv_low"), ("kV_high", "map_kv_high")):
+        text = getattr(arguments, option)
         if text is not None:
-            axes[name] = _range(f"--map-{name.replace('_', '-')}", text)
+            axes[name] = _range(f"--{option.replace('_', '-')}", text)
     if arguments.map_filter is not None:
-        from ..materials import material_from_name
-
-        stacks = [part.strip() for part in arguments.map_filter.split(";") if part.strip()]
-        axes["filter"] = [() if part == "none" else filters_from_text(part) for part in stacks]
-        for layer in (layer for stack in axes["filter"] for layer in stack):
-            material_from_name(layer.material)
-    if len(axes) not in (0, 2):
-        raise InputError(
-            "map",
-            received=f"{len(axes)} axes",
-            expected="exactly two of --map-kv-low, --map-kv-high and --map-filter, or none",
-        )
-    for name, values in axes.items():
-        if not 1 <= len(values) <= _MOST_VALUES:
-            raise InputError(
-                f"--map-{name.replace('_', '-')}", received=f"{len(values)} values", expected=f"1 to {_MOST_VALUES}"
-            )
+        axes["filters"] = [part.strip() for part in arguments.map_filter.split(";") if part.strip()]
     return axes
 
 
@@ -184,26 +129,12 @@ def _range(option: str, text: str) -> list[float]:
     if not fits:
         raise InputError(option, received=repr(text), expected="FROM:TO:STEP in kV", remedy="for example 35:60:5")
     count = math.floor((last - first) / step + 1e-9) + 1
-    if count > _MOST_VALUES:
-        raise InputError(option, received=f"{count} values", expected=f"at most {_MOST_VALUES}")
+    if count > MOST_VALUES:
+        raise InputError(option, received=f"{count} values", expected=f"at most {MOST_VALUES}")
     return [round(first + index * step, 9) for index in range(count)]
 
 
-def _at(pair: tuple[Setting, Setting], axis: str, value: Any) -> tuple[Setting, Setting]:
-    low, high = pair
-    if axis == "filter":
-        return replace(low, filters=value), replace(high, filters=value)
-    if axis == "kv_low":
-        return _at_kV(low, value), high
-    return low, _at_kV(high, value)
-
-
-def _at_kV(setting: Setting, kV: float) -> Setting:
-    """The same power where it was given (a current beside it follows), else the same current."""
-    return replace(setting, kV=kV, current_mA=None if setting.power_W is not None else setting.current_mA)
-
-
-def _text(found: "Contrast", result: dict[str, Any]) -> str:
+def _text(found: Any, result: dict[str, Any]) -> str:
     lines = [f"{result['object']} mm in {result['product']} mm, {found.object_pixels} pixels"]
     for name, channel in (("low", found.low), ("high", found.high)):
         lines.append(f"{name:<5} {channel.setting}")
@@ -222,32 +153,6 @@ def _text(found: "Contrast", result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _label(axis: str, value: Any) -> Any:
-    return (text_from_filters(value) or "none") if axis == "filter" else value
-
-
-def _map_answer(axes: dict[str, list[Any]], grid: "tuple[tuple[Contrast, ...], ...]") -> dict[str, Any]:
-    rows, columns = axes
-    best = max((one for row in grid for one in row), key=lambda one: one.cnr_object)
-    result: dict[str, Any] = {
-        "rows": {"axis": rows, "values": [_label(rows, value) for value in axes[rows]]},
-        "columns": {"axis": columns, "values": [_label(columns, value) for value in axes[columns]]},
-    }
-    values = {
-        "delta_R": [[one.delta_R.value for one in row] for row in grid],
-        "cnr_pixel": [[one.cnr_pixel for one in row] for row in grid],
-        "cnr_object": [[one.cnr_object for one in row] for row in grid],
-    }
-    result |= values
-    result["best"] = {
-        "low": str(best.low.setting),
-        "high": str(best.high.setting),
-        "delta_R": best.delta_R.value,
-        "cnr_object": best.cnr_object,
-    }
-    return result
-
-
 def _map_text(result: dict[str, Any]) -> str:
     rows, columns = result["rows"], result["columns"]
     lines = []
@@ -261,25 +166,14 @@ def _map_text(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _figure(result: dict[str, Any]) -> Any:
+def _figure(found: ContrastMap) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows, columns = result["rows"], result["columns"]
-    words = {"kv_low": "low tube voltage (kV)", "kv_high": "high tube voltage (kV)", "filter": "filter (mm)"}
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
-    for index, (name, title) in enumerate((("delta_R", "Delta R"), ("cnr_object", "contrast to noise of the object"))):
-        axis = figure.add_subplot(1, 2, index + 1)
-        image = axis.imshow(result[name], origin="lower", aspect="auto", cmap="viridis")
-        figure.colorbar(image, ax=axis)
-        for axis_of_figure, described in ((axis.xaxis, columns), (axis.yaxis, rows)):
-            shown = range(0, len(described["values"]), math.ceil(len(described["values"]) / 12))
-            axis_of_figure.set_ticks(list(shown), [_tick(described["values"][item]) for item in shown])
-        axis.set(title=title, xlabel=words[columns["axis"]], ylabel=words[rows["axis"]])
-    figure.suptitle(f"{result['object']} mm in {result['product']} mm, {result['object_pixels']} pixels", fontsize=10)
+    for axes, what in zip(figure.subplots(1, 2), ("delta_R", "cnr_object"), strict=True):
+        found.plot(ax=axes, what=what)
+    pixels = found.best.object_pixels
+    figure.suptitle(f"{found.foreign_object} mm in {found.product} mm, {pixels} pixels", fontsize=10)
     return figure
-
-
-def _tick(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}"

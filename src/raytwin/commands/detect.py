@@ -7,19 +7,11 @@ per network and image: contrast, size_mm, hit, network, image, foreign_object, s
 """
 
 import argparse
-import dataclasses
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ..errors import InputError
 from ._answer import answer, say
-from .train import set_threads
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..acquisition import Dataset
     from ..segmentation import Rate
 
 EXAMPLE = """example:
@@ -48,80 +40,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin detect`."""
-    from tqdm import tqdm
+    from ..api._progress import Bar
+    from ..api.images import detect
 
-    from ..acquisition import read_dataset
-    from ..files import sha256_of_file
-    from ..segmentation import (
-        choose_device,
-        detect_with_networks,
-        finished_networks,
-        open_runs,
-        summarise_detections,
-        write_detections,
-    )
-
-    runs = open_runs(arguments.runs)
-    set_threads(arguments.threads)
-    device = choose_device(arguments.device)
-    with read_dataset(arguments.dataset) as dataset:
-        trained_on = sha256_of_file(arguments.dataset) == runs.configuration["dataset_sha256"]
-        numbers = _numbers(dataset, split=arguments.split, setting=arguments.setting, trained_on=trained_on)
-        networks = finished_networks(runs)
-        unfinished = len(list(runs.path.glob("network_*/state.pt")))
-        if unfinished:
-            say(f"{unfinished} networks of {arguments.runs} are not finished and are left out")
-        with tqdm(total=len(numbers) * len(networks), disable=None, unit="image") as bar:
-            detections = list(
-                detect_with_networks(
-                    runs,
-                    dataset,
-                    numbers,
-                    threshold=arguments.threshold,
-                    device=device,
-                    progress=bar.update,
-                    warn=say,
-                )
-            )
-    unknown = sum(row.recall is not None and row.contrast is None and row.size_mm is None for row in detections)
-    if unknown:
-        say(f"{unknown} lines have a foreign object of unknown contrast and size: no POD curve can be fitted to them")
-    write_detections(arguments.output, detections)
-    rates = summarise_detections(detections)
+    with Bar(only_on_terminal=True, unit="image") as bar:
+        found = detect(
+            arguments.runs,
+            arguments.dataset,
+            output=arguments.output,
+            split=arguments.split,
+            setting=arguments.setting,
+            threshold=arguments.threshold,
+            device=arguments.device,
+            threads=arguments.threads,
+            progress=bar,
+        )
+    for line in found.warnings:
+        say(line)
+    rates = found.rates
     answer(
-        {
-            "table": arguments.output,
-            "networks": networks,
-            "images": len({row.image for row in detections}),
-            "threshold": arguments.threshold,
-            **{name: dataclasses.asdict(rate) for name, rate in rates.items()},
-        },
+        found.to_dict(),
         as_json=arguments.json,
-        text=f"{arguments.output}: {len(detections)} lines, {len(networks)} networks\n"
+        text=f"{arguments.output}: {len(found.rows)} lines, {len(found.networks)} networks\n"
         f"recall of the objects' pixels  {_text(rates['recall'])}\n"
         f"objects detected               {_text(rates['hit_rate'])}\n"
         f"false alarms                   {_text(rates['false_alarm_rate'])}",
     )
     return 0
-
-
-def _numbers(dataset: "Dataset", *, split: str | None, setting: str | None, trained_on: bool) -> "NDArray[np.intp]":
-    chosen = split or "test"
-    numbers = dataset.indices(split=None if chosen == "all" else chosen, setting=setting)
-    if not len(numbers) and split is None and not trained_on:
-        numbers = dataset.indices(setting=setting)
-        say(f"{dataset.path} has no images of split test: all {len(numbers)} are tried")
-    if not len(numbers):
-        settings = sorted({row.setting for row in dataset.rows})
-        raise InputError(
-            dataset.path,
-            received=f"no images of split {chosen}" + (f" at {setting}" if setting else ""),
-            expected="at least one; its settings are " + " | ".join(settings),
-            remedy="choose with --split and --setting",
-        )
-    if trained_on and chosen in ("train", "all"):
-        say("these networks were trained on some of these images: the rates are too good")
-    return numbers
 
 
 def _text(rate: "Rate") -> str:

@@ -1,6 +1,6 @@
 """Turn other file layouts into an acquisition file or a dataset file.
 
-images    a folder of TIFF, PNG or raw images, described by a sidecar raytwin.toml in it   -> acquisition
+images    a folder of TIFF, PNG, FITS or raw images, described by a sidecar raytwin.toml in it   -> acquisition
 nxtomo    a NeXus NXtomo file: flats, darks and projections told apart by image_key        -> acquisition
 emva1288  a set with EMVA1288_Data.txt and the images it lists                             -> acquisition
 zenodo    the paper's data, 10.5281/zenodo.10579608: processed images                      -> dataset
@@ -27,7 +27,7 @@ EXAMPLE = """examples:
   raytwin import reference session.h5 -o reference.h5 --low kv=40,exposure_ms=100 --high kv=90,exposure_ms=100"""
 
 _LAYOUTS = {
-    "images": "a folder of TIFF, PNG or raw images with a sidecar",
+    "images": "a folder of TIFF, PNG, FITS or raw images with a sidecar",
     "nxtomo": "a NeXus NXtomo file",
     "emva1288": "a folder with EMVA1288_Data.txt",
     "zenodo": "the paper's data: processed images, a raw session or calibration flats",
@@ -74,6 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ..acquisition import open_acquisition
+    from ..calibration.findings import Severity
+    from .check import say_short
 
     report = _import(arguments)
     notes = list(report.notes)
@@ -85,6 +87,12 @@ def run(arguments: argparse.Namespace) -> int:
     if len(report.skipped) > _SHOWN:
         say(f"skipped {len(report.skipped) - _SHOWN} more (all of them with --json)")
     result: dict[str, Any] = asdict(report) | {"notes": notes}
+    if report.format == "acquisition":
+        from ..calibration.check import check_acquisition
+
+        checked = check_acquisition(report.written)
+        result["findings"] = [item.to_dict() for item in checked.findings if item.severity != Severity.NOTE]
+        say_short(checked)
     answer(result, as_json=arguments.json, text=_text(result))
     return 0
 

@@ -2,8 +2,11 @@
 
 The lab stands in for a real X-ray line whose truth is known: photons are sampled one energy class at a time, their
 light spreads, electrons are read out and an ADC digitises. It shares no physics with the twin. The seed draws a hidden
-system (tube, filtration, scintillator, light, electronics), the same for every protocol, so that a twin calibrated on
-`--protocol calibration` can be judged on `--protocol set2` of the same seed.
+system (tube, filtration, scintillator, light, electronics, and the little that every line does wrong), the same for
+every protocol, so that a twin calibrated on `--protocol calibration` can be judged on `--protocol set2` of the same seed.
+
+Tubes and detectors depart from a plain one by families (K escape, light that is not proportional, covers, other tube
+models, worn anodes and more); `--family` draws from those named alone. What the acquisition says of the line is the label.
 
 The long sessions (`full`, `short`, `products`) are for a diagnosis. `full` has darks, flats at five exposures and two kV
 without and with a filter, beam-off frames, wedges at two gaps, a slab, edges, discs, flats with the panel turned, and
@@ -31,7 +34,10 @@ exposure time mean the same photons per pixel at every size. Long sessions are 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="ACQ", help="acquisition file to write")
     parser.add_argument(
-        "--protocol", required=True, metavar="NAME", help="calibration, set1, set2; full, short or products"
+        "--protocol",
+        required=True,
+        metavar="NAME",
+        help="calibration, averaged, averaged_pairs, set1, set2; full, short or products",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="draws system, products and noise (default 0)")
     parser.add_argument(
@@ -63,6 +69,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ID=STRENGTH",
         help="an effect to plant in a long session, with @always or @calibration (set in after it) where it should"
         " not be as usual; repeatable",
+    )
+    parser.add_argument(
+        "--family",
+        action="append",
+        metavar="NAME",
+        help="draw the system's departures from these families alone (thin_screen, gadox, k_escape, light_yield,"
+        " depth_light, cover, spectrum, ripple, anode, window, output, spread, defects; none: the plain system);"
+        " repeatable (default: all)",
+    )
+    parser.add_argument(
+        "--no-unkindness",
+        action="store_true",
+        help="without the little that every real line does all the time (drift, changes of shape, line noise, dust)",
     )
     parser.add_argument(
         "--geometry", metavar="NAME", help="long sessions: coarse (0.4 mm pixels, the default) or fine (0.12 mm)"
@@ -101,52 +120,44 @@ def _lengths(text: str | None) -> tuple[float, ...] | None:
         raise InputError("--bones-mm", received=repr(text), expected="lengths in mm joined by commas") from None
 
 
+def _families(names: list[str] | None) -> tuple[str, ...] | None:
+    """Families by name; the word none stands for no family."""
+    return None if names is None else tuple(name for name in names if name != "none")
+
+
 def run(arguments: argparse.Namespace) -> int:
-    from ..lab.effects import request_from_text
-    from ..lab.protocols import run_protocol, truth_path
-    from ..lab.session import SESSIONS
+    from ..api._progress import Bar
+    from ..api.sessions import lab_session
+    from ..lab.unkindness import NONE
 
-    effects = [request_from_text(text) for text in arguments.effect]
-    usual = "128" if arguments.protocol in SESSIONS else "128x160"
-    rows, columns = _size(usual if arguments.size is None else arguments.size)
-    bar: Any = None
-
-    def begin(frames: int) -> None:
-        from tqdm import tqdm
-
-        nonlocal bar
-        bar = tqdm(total=frames, unit="frame", disable=None, desc=arguments.protocol)
-
-    def advance() -> None:
-        bar.update()
-
-    try:
-        truth = run_protocol(
+    given: dict[str, Any] = {
+        "size": None if arguments.size is None else _size(arguments.size),
+        "bones_mm": _lengths(arguments.bones_mm),
+    }
+    with Bar(only_on_terminal=True, unit="frame") as bar:
+        found = lab_session(
             arguments.output,
             protocol=arguments.protocol,
             seed=arguments.seed,
-            rows=rows,
-            columns=columns,
             pixel_mm=arguments.pixel_mm,
             frames=arguments.frames,
             products=arguments.products,
             product_mm=arguments.product_mm,
-            bones_mm=_lengths(arguments.bones_mm),
             source_detector_mm=arguments.source_detector_mm,
             session=arguments.session,
             geometry=arguments.geometry,
-            effects=effects,
+            families=_families(arguments.family),
+            unkindness=NONE if arguments.no_unkindness else None,
+            effects=arguments.effect,
             leave_out=arguments.leave_out,
             only=arguments.only,
-            begin=begin,
-            advance=advance,
+            progress=bar,
+            **given,
         )
-    finally:
-        if bar is not None:
-            bar.close()
+    rows, columns = found.shape
     lines = [
-        f"{arguments.output}: {len(truth['series'])} series of {rows} x {columns} pixels ({arguments.protocol})",
-        f"{truth_path(arguments.output)}: the truth",
+        f"{arguments.output}: {len(found.truth['series'])} series of {rows} x {columns} pixels ({arguments.protocol})",
+        f"{found.truth_path}: the truth",
     ]
-    answer(truth, as_json=arguments.json, text="\n".join(lines))
+    answer(found.to_dict(), as_json=arguments.json, text="\n".join(lines))
     return 0

@@ -6,27 +6,16 @@ photon-counting detector.
 """
 
 import argparse
-from typing import Any
 
-from ..errors import InputError
-from ..materials import mass_attenuation_cm2_g, material_from_name, mu_per_mm
-from ..spectra import effective_mu_per_mm
+from ..api.beams import mu
 from ._answer import answer
-from ._beam import (
-    add_detector_arguments,
-    add_tube_arguments,
-    beam_of,
-    describe_beam,
-    detector_of,
-    kv_help,
-    library_of,
-    warn_of_soft_beam,
-)
+from ._beam import add_detector_arguments, add_tube_arguments, add_twin_argument, kv_help, tell, tube_of, twin_of
 
 EXAMPLE = """example:
   raytwin mu chicken_breast --kv 40 --filter Cu:0.05 --thickness-mm 20
   raytwin mu Al --energy-kev 65
-  raytwin mu "Glass, Plate" --kv 90 --scintillator Gd2O2S@4.5:0.3 --json"""
+  raytwin mu "Glass, Plate" --kv 90 --scintillator Gd2O2S@4.5:0.3 --json
+  raytwin mu PMMA --twin tube.h5 --kv 60 --filter Al:1 --thickness-mm 20"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,58 +30,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_tube_arguments(parser)
     add_detector_arguments(parser)
+    add_twin_argument(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the attenuation."""
-    library = library_of(arguments)
-    material = material_from_name(arguments.material, library=library)
-    has_beam = arguments.kv is not None or arguments.spectrum_file is not None
-    if has_beam == (arguments.energy_kev is not None):
-        raise InputError(
-            "--kv, --energy-kev",
-            received="both" if has_beam else "neither",
-            expected="a beam (--kv, or --spectrum-file) or one energy (--energy-kev)",
-        )
-    thickness = arguments.thickness_mm
-    if thickness is not None and not 0 <= thickness < float("inf"):
-        raise InputError("--thickness-mm", received=f"{thickness} mm", expected="a finite thickness of 0 mm or more")
-    result: dict[str, Any] = {
-        "material": material.name,
-        "density_g_cm3": material.density_g_cm3,
-        "source": material.source,
-        "mass_fractions": dict(material.mass_fractions),
-        "attenuation_table": arguments.table,
-        "thickness_mm": thickness,
-    }
-    if arguments.energy_kev is not None:
-        mu = float(mu_per_mm(material, arguments.energy_kev, table=arguments.table))
-        result["energy_keV"] = arguments.energy_kev
-        result["mass_attenuation_cm2_g"] = float(
-            mass_attenuation_cm2_g(material, arguments.energy_kev, table=arguments.table)
-        )
-        result["mu_eff_per_mm"] = mu
-        result["mu_eff_at_thickness_per_mm"] = None if thickness is None else mu
-        where = f"at {arguments.energy_kev:g} keV"
-        lines = [f"mu       {mu:.6g} /mm ({result['mass_attenuation_cm2_g']:.6g} cm2/g)"]
+    found = mu(
+        arguments.material,
+        energy_keV=arguments.energy_kev,
+        thickness_mm=arguments.thickness_mm,
+        scintillator=arguments.scintillator,
+        cover=arguments.cover,
+        counting=arguments.counting,
+        **(tube_of(arguments) if arguments.twin is None else twin_of(arguments)),
+    )
+    lines = [f"{found.material.name}, {found.material.density_g_cm3:.4g} g/cm3, {found.where}"]
+    if found.energy_keV is not None:
+        lines.append(f"mu       {found.mu_eff_per_mm:.6g} /mm ({found.mass_attenuation_cm2_g:.6g} cm2/g)")
     else:
-        spectrum = beam_of(arguments, library)
-        response = detector_of(arguments, spectrum, library)
-        thin = float(effective_mu_per_mm(material, spectrum=spectrum, response=response, table=arguments.table))
-        result["mu_eff_per_mm"] = thin
-        result["mu_eff_at_thickness_per_mm"] = None
-        where = f"in {describe_beam(spectrum)}"
-        lines = [f"mu_eff   {thin:.6g} /mm (limit of a thin object)"]
-        if thickness is not None:
-            thick = float(
-                effective_mu_per_mm(
-                    material, spectrum=spectrum, response=response, thickness_mm=thickness, table=arguments.table
-                )
+        intervals = found.intervals or {}
+        thin, thick = (_ends(intervals.get(f"mu_eff{name}_per_mm")) for name in ("", "_at_thickness"))
+        lines.append(f"mu_eff   {found.mu_eff_per_mm:.6g}{thin} /mm (limit of a thin object)")
+        if found.mu_eff_at_thickness_per_mm is not None:
+            lines.append(
+                f"mu_eff   {found.mu_eff_at_thickness_per_mm:.6g}{thick} /mm (measured through {found.thickness_mm:g} mm)"
             )
-            result["mu_eff_at_thickness_per_mm"] = thick
-            lines.append(f"mu_eff   {thick:.6g} /mm (measured through {thickness:g} mm)")
-        warn_of_soft_beam(spectrum)
-    head = f"{material.name}, {material.density_g_cm3:.4g} g/cm3, {where}"
-    answer(result, as_json=arguments.json, text="\n".join([head, *lines]))
+    tell(found.warnings)
+    answer(found.to_dict(), as_json=arguments.json, text="\n".join(lines))
     return 0
+
+
+def _ends(interval: dict[str, float] | None) -> str:
+    return "" if interval is None else f" ({interval['low']:.6g} to {interval['high']:.6g})"

@@ -6,13 +6,11 @@ informative trials expect a longer interval.
 """
 
 import argparse
-from dataclasses import asdict
 from typing import Any
 
-from ..errors import InputError
-from ..pod import AssumedCurve, expected_precision, fit_pod, plan_pod, read_pod_table, recommended_sizes
+from ..api.curves import plan
 from ._answer import answer, say
-from ._pod_answer import default_repeats, shown
+from ._pod_answer import shown
 
 EXAMPLE = """examples:
   raytwin plan --a50 1.5 --a90 3 --sd-network 0.4 --sd-image 0.8 --networks 10 --wanted 1.15
@@ -37,82 +35,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    curve = _assumed(arguments)
-    warnings: list[str] = []
-    result: dict[str, Any] = {"assumed": asdict(curve), "networks": arguments.networks}
-    if arguments.images is not None:
-        sizes = recommended_sizes(curve, arguments.images, networks=arguments.networks)
-        expected = expected_precision(curve, sizes, networks=arguments.networks)
-        result |= {"images": arguments.images, "expected": asdict(expected), "sizes": sizes.tolist()}
-    else:
-        plan = plan_pod(curve, wanted_over_a90=arguments.wanted, networks=arguments.networks)
-        result |= {
-            "wanted_over_a90": plan.wanted_over_a90,
-            "images": plan.images,
-            "expected": None if plan.expected is None else asdict(plan.expected),
-            "limit_over_a90": plan.limit_over_a90,
-            "fewest_networks": plan.fewest_networks,
-            "sizes": plan.sizes.tolist(),
-        }
-        if plan.images is None:
-            warnings.append(
-                f"{arguments.networks} networks leave a90/95 at {plan.limit_over_a90:.3g} a90 whatever the number of images:"
-                f" it takes at least {plan.fewest_networks} networks"
-            )
-    result["warnings"] = warnings
-    for line in warnings:
+    found = plan(
+        a50=arguments.a50,
+        a90=arguments.a90,
+        pilot=arguments.pilot,
+        size=arguments.size,
+        link=arguments.link,
+        log_size=arguments.log_size,
+        sd_network=arguments.sd_network,
+        sd_image=arguments.sd_image,
+        networks=arguments.networks,
+        wanted=arguments.wanted,
+        images=arguments.images,
+    )
+    result = found.to_dict()
+    for line in found.warnings:
         say(f"warning: {line}")
     answer(result, as_json=arguments.json, text=_text(result))
     return 0
-
-
-def _assumed(arguments: argparse.Namespace) -> AssumedCurve:
-    if arguments.pilot is None:
-        if arguments.a50 is None or arguments.a90 is None:
-            raise InputError(
-                "--a50 and --a90", received="not both", expected="both sizes", remedy="or --pilot HITS.csv"
-            )
-        return AssumedCurve(
-            a50=arguments.a50,
-            a90=arguments.a90,
-            link=arguments.link,
-            log_size=arguments.log_size,
-            sd_network=arguments.sd_network,
-            sd_image=arguments.sd_image,
-        )
-    table = read_pod_table(arguments.pilot, size=arguments.size)
-    fit = fit_pod(
-        table.size,
-        table.hits if table.hits is not None else [],
-        link=arguments.link,
-        log_size=arguments.log_size,
-        repeats=default_repeats(table),
-        network=table.network,
-        image=table.image,
-    )
-    if fit.a50 is None or fit.a90 is None:
-        raise InputError(
-            "--pilot",
-            received="; ".join(fit.warnings) or "no curve",
-            expected="a pilot with an a50 and an a90",
-            remedy="give --a50 and --a90",
-        )
-    if fit.repeats == "cluster" and arguments.networks > 1:
-        raise InputError(
-            "--pilot",
-            received=f"{arguments.pilot}, where every network hits or misses the same images, and --networks {arguments.networks}",
-            expected="a pilot whose networks differ, or one network",
-            remedy="plan with --networks 1: such networks add nothing to each other",
-        )
-    crossed = fit.crossed
-    return AssumedCurve(
-        a50=fit.a50,
-        a90=fit.a90,
-        link=arguments.link,
-        log_size=arguments.log_size,
-        sd_network=(crossed.sd_network or 0.0) if crossed else 0.0,
-        sd_image=(crossed.sd_image or 0.0) if crossed else 0.0,
-    )
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -8,42 +8,14 @@ trust below some 400). Rows with an empty size are products without foreign obje
 
 import argparse
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..errors import FitError, InputError
+from ..api.curves import PodCurve, fit_pod, roc_of
+from ..errors import InputError
 from ..files import whole_file
-from ..pod import (
-    PodFit,
-    PodTable,
-    Trials,
-    bootstrap_pod,
-    compare_models,
-    compute_roc,
-    explain_detection,
-    false_alarm_rate,
-    fit_as_published,
-    fit_covariates,
-    fit_lapse_pod,
-    fit_pod,
-    fit_response_pod,
-    read_pod_table,
-    size_at,
-    write_curve_table,
-)
 from ._answer import answer, say
-from ._pod_answer import (
-    default_repeats,
-    fit_answer,
-    notes_on_table,
-    response_answer,
-    text_from_answer,
-    trials_from_table,
-    where_from_options,
-)
+from ._pod_answer import text_from_answer, where_from_options
 
 EXAMPLE = """examples:
   raytwin pod HITS.csv --json
@@ -102,253 +74,84 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    table = read_pod_table(
+    curve = fit_pod(
         arguments.table,
         size=arguments.size,
         hit=arguments.hit,
         trials=arguments.trials,
-        response=arguments.response,
+        link=arguments.link,
+        log_size=arguments.log_size,
+        method=arguments.method,
+        repeats=arguments.repeats,
         site=arguments.site,
         network=arguments.network,
         image=arguments.image,
         where=where_from_options(arguments.where),
+        response=arguments.response,
+        decision=arguments.decision,
+        left_censored=arguments.left_censored,
+        right_censored=arguments.right_censored,
+        log_response=arguments.log_response,
+        box_cox=arguments.box_cox,
+        ceiling=arguments.ceiling,
+        floor=arguments.floor,
+        bootstrap=arguments.bootstrap,
+        by=arguments.by,
+        covariates=_covariates(arguments.covariate),
+        explain=[name.strip() for name in (arguments.explain or "").split(",") if name.strip()],
+        as_published=arguments.as_published,
+        seed=arguments.seed,
     )
-    result = _response(table, arguments) if arguments.response else _hit_miss(table, arguments)
-    if len(table.false_alarm) and "false_alarms" not in result:
-        result["false_alarms"] = asdict(
-            false_alarm_rate(table.false_alarm, network=table.false_alarm_network, image=table.false_alarm_image)
-        )
+    result = curve.to_dict()
+    if arguments.export:
+        curve.save_table(arguments.export)
+        result["export"] = arguments.export
+    if arguments.plots:
+        result["plots"] = [_saved(figure, Path(arguments.plots) / name) for name, figure in _figures(curve).items()]
     for line in result["warnings"]:
         say(f"warning: {line}")
-    answer(result, as_json=arguments.json, text=text_from_answer(result, table.size_name))
+    answer(result, as_json=arguments.json, text=text_from_answer(result, curve.table.size_name))
     return 0
 
 
-def _hit_miss(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
-    for name in ("decision", "left_censored", "right_censored", "box_cox"):
-        if getattr(arguments, name) is not None:
-            raise InputError("--" + name.replace("_", "-"), received="without --response", expected="--response COLUMN")
-    repeats = arguments.repeats or default_repeats(table)
-    fit = fit_pod(
-        table.size,
-        table.hits if table.hits is not None else [],
-        trials=table.trials,
-        link=arguments.link,
-        log_size=arguments.log_size,
-        method=arguments.method or "auto",
-        repeats=repeats,
-        network=table.network,
-        image=table.image,
-        site=table.site,
-    )
-    result = fit_answer(fit)
-    result["size"] = table.size_name
-    result["warnings"] = [*notes_on_table(table, repeats), *fit.warnings]
-    trials = trials_from_table(table, log_size=arguments.log_size)
-    result["alternatives"] = [asdict(one) for one in compare_models(trials)]
-    extras: dict[str, Callable[[], Any]] = {}
-    if arguments.ceiling or arguments.floor:
-        extras["lapse"] = lambda: _lapse(trials, arguments, repeats, result)
-    if arguments.bootstrap is not None:
-        extras["bootstrap"] = lambda: _bootstrap(table, arguments)
-    if arguments.covariate:
-        extras["covariates"] = lambda: _covariates(table, arguments, result)
-    if arguments.explain:
-        extras["explanation"] = lambda: _explanation(table, arguments, repeats)
-    for name, make in extras.items():
-        try:
-            result[name] = make()
-        except FitError as error:  # the curve stands; what cannot be added to it is null with its reason
-            result[name] = None
-            result["warnings"].append(f"no {name}: {error}")
-    if arguments.as_published:
-        result["as_published"] = asdict(fit_as_published(trials))
-    if arguments.export:
-        write_curve_table(arguments.export, fit, size_name=table.size_name)
-        result["export"] = arguments.export
-    if arguments.plots:
-        result["plots"] = _plots(fit, table, arguments)
-    return result
-
-
-def _lapse(trials: Trials, arguments: argparse.Namespace, repeats: str, result: dict[str, Any]) -> dict[str, Any]:
-    fit = fit_lapse_pod(
-        trials, link=arguments.link, log_size=arguments.log_size, ceiling=arguments.ceiling, floor=arguments.floor
-    )
-    if repeats != "pooled":
-        result["warnings"].append("ceiling and floor take all looks as independent: their intervals are too narrow")
-    result["warnings"] += [f"with ceiling or floor: {note}" for note in fit.warnings]
-    return asdict(fit)
-
-
-def _bootstrap(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
-    if arguments.bootstrap < 20:
-        raise InputError("--bootstrap", received=arguments.bootstrap, expected="20 refits or more (1000 is usual)")
-    by = arguments.by
-    if by is None:
-        known = table.network is not None, table.image is not None
-        by = {(True, True): "both", (True, False): "network", (False, True): "image"}.get(known, "row")
-    if by == "row" and table.trials is not None:
-        raise InputError("--bootstrap", received="grouped trials", expected="one trial a row, or a column of images")
-    found = bootstrap_pod(
-        trials_from_table(table, log_size=arguments.log_size),
-        link=arguments.link,
-        log_size=arguments.log_size,
-        by=by,
-        replicates=arguments.bootstrap,
-        rng=np.random.default_rng(arguments.seed),
-    )
-    return {
-        "by": by,
-        "replicates": arguments.bootstrap,
-        "a90_95": found.a90_95,
-        "a90_low": found.a90_low,
-        "a90_high": found.a90_high,
-        "unknown": found.unknown,
-    }
-
-
-def _covariates(table: PodTable, arguments: argparse.Namespace, result: dict[str, Any]) -> dict[str, Any]:
-    columns = {table.size_name: table.size}
-    held: dict[str, float] = {}
-    for option in arguments.covariate:
+def _covariates(options: list[str]) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for option in options:
         name, equals, value = option.partition("=")
-        if name == table.size_name:
-            raise InputError("--covariate", received=repr(option), expected="another property than the size")
-        columns[name] = table.numbers(name)
         try:
-            held[name] = float(value) if equals else float(np.median(columns[name]))
+            found[name] = float(value) if equals else None
         except ValueError:
             raise InputError("--covariate", received=repr(option), expected="COLUMN or COLUMN=NUMBER") from None
-    trials = trials_from_table(table, log_size=arguments.log_size)
-    logs = (table.size_name,) if arguments.log_size else ()
-    fit = fit_covariates(trials, columns, link=arguments.link, logs=logs, method=arguments.method or "auto")
-    at = size_at(fit, trials, columns, name=table.size_name, held=held)
-    result["warnings"] += [f"with covariates: {note}" for note in at.warnings]
-    names = ("constant", *fit.names)
-    scales = (False, *fit.logs)
-    return {
-        "coefficients": [
-            {"name": name, "log": log, "value": value, "error": error, "p": p}
-            for name, log, value, error, p in zip(
-                names, scales, fit.coefficients.tolist(), fit.errors.tolist(), fit.p.tolist(), strict=True
-            )
-        ],
-        "method": fit.method,
-        "deviance": fit.deviance,
-        "aic": fit.aic,
-        "held": dict(at.held),
-        "a50": at.a50,
-        "a90": at.a90,
-        "a90_95": asdict(at.a90_95),
-    }
+    return found
 
 
-def _explanation(table: PodTable, arguments: argparse.Namespace, repeats: str) -> list[dict[str, Any]]:
-    names = [name.strip() for name in arguments.explain.split(",") if name.strip()]
-    columns = {name: table.numbers(name) for name in names}
-    found, _ = explain_detection(
-        trials_from_table(table, log_size=False),
-        columns,
-        rng=np.random.default_rng(arguments.seed),
-        link=arguments.link,
-        repeats=repeats,
-    )
-    return [
-        {
-            "name": one.name,
-            "log": one.log,
-            "gain": one.gain,
-            "behind": one.behind,
-            "behind_error": one.behind_error,
-            "area": one.area,
-            "rising": one.rising,
-            "aic": one.aic,
-            "a50": one.fit.a50,
-            "a90": one.fit.a90,
-            "a90_95": asdict(one.fit.a90_95),
-            "p_beyond": one.p_beyond,
-        }
-        for one in found
-    ]
+def _figures(curve: PodCurve) -> dict[str, Any]:
+    """File name -> figure."""
+    from matplotlib.figure import Figure
 
+    from ..pod import PodFit, compare_models
+    from ..pod.plots import plot_joint_region, plot_models, plot_roc
 
-def _plots(fit: PodFit, table: PodTable, arguments: argparse.Namespace) -> list[str]:
-    from ..pod.plots import plot_joint_region, plot_models, plot_pod
+    def drawn(plot: Callable[..., Any]) -> Figure:
+        figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+        plot(ax=figure.subplots())
+        return figure
 
-    trials = trials_from_table(table, log_size=arguments.log_size)
-    figures = {"pod.png": plot_pod(fit, trials, size_label=table.size_name)}
+    fit = curve.fit
+    if not isinstance(fit, PodFit):
+        figures = {"response.png": drawn(curve.plot)}
+        roc = roc_of(curve)
+        return figures if roc is None else {**figures, "roc.png": plot_roc(roc)}
+    figures = {"pod.png": drawn(curve.plot)}
     if fit.curve is not None and not fit.separated and fit.curve.at_maximum:
         figures["region.png"] = plot_joint_region(fit)
-    alternatives = compare_models(trials)
+    alternatives = compare_models(curve.trials)
     if any(one.aic is not None for one in alternatives):
         figures["models.png"] = plot_models(alternatives)
-    return [_saved(figure, Path(arguments.plots) / name) for name, figure in figures.items()]
+    return figures
 
 
 def _saved(figure: Any, path: Path) -> str:
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=150)
     return str(path)
-
-
-def _response(table: PodTable, arguments: argparse.Namespace) -> dict[str, Any]:
-    if arguments.decision is None:
-        raise InputError(
-            "--decision",
-            received="none",
-            expected="the response above which an object counts as detected",
-            remedy="for example --decision 200",
-        )
-    power: float | None = 0.0 if arguments.log_response else 1.0
-    if arguments.box_cox is not None:
-        try:
-            power = None if arguments.box_cox == "auto" else float(arguments.box_cox)
-        except ValueError:
-            raise InputError("--box-cox", received=repr(arguments.box_cox), expected="a number or auto") from None
-    repeats = arguments.repeats
-    notes: list[str] = []
-    if repeats is None:
-        repeats = "cluster" if table.network is not None and table.image is not None else "pooled"
-    elif repeats in ("crossed", "scaled"):
-        notes.append(f"repeats {repeats} is not there for a response: bounds robust to networks and images instead")
-        repeats = "cluster"
-    response = table.response if table.response is not None else np.zeros(0)
-    fit = fit_response_pod(
-        table.size,
-        response,
-        decision=arguments.decision,
-        left=arguments.left_censored,
-        right=arguments.right_censored,
-        log_size=arguments.log_size,
-        box_cox=power,
-        network=table.network,
-        image=table.image,
-        repeats=repeats,
-    )
-    result = response_answer(fit)
-    result["size"] = table.size_name
-    result["warnings"] = [*notes, *notes_on_table(table, repeats), *fit.warnings]
-    roc = None
-    if len(table.noise_response) > 1:
-        roc = compute_roc(table.noise_response, response)
-        alarms = (table.noise_response > arguments.decision).astype(float)
-        result["roc"] = {"area": roc.area, "low": roc.area_low, "high": roc.area_high}
-        result["false_alarms"] = asdict(false_alarm_rate(alarms))
-    if arguments.plots:
-        from ..pod.plots import plot_response, plot_roc
-
-        folder = Path(arguments.plots)
-        figure = plot_response(
-            fit,
-            table.size,
-            response,
-            size_label=table.size_name,
-            response_label=arguments.response,
-            left=arguments.left_censored,
-            right=arguments.right_censored,
-        )
-        result["plots"] = [_saved(figure, folder / "response.png")]
-        if roc is not None:
-            result["plots"].append(_saved(plot_roc(roc), folder / "roc.png"))
-    return result

@@ -35,32 +35,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin predict`."""
-    from ..acquisition import Setting, filter_from_text
-    from ..generator.dual_layer import predict_back_layer
-    from ..generator.line_limits import frames_per_s
-    from ..generator.predict import predict_flatfield
-    from ..generator.twin_io import read_twin
-    from ..materials import material_from_name
+    from ..api.twins import predict
 
-    setting = Setting(
+    found = predict(
+        arguments.twin,
         kV=arguments.kv,
         exposure_ms=arguments.exposure_ms,
         current_mA=arguments.current_ma,
         power_W=arguments.power_w,
-        filters=tuple(filter_from_text(text) for text in arguments.filter),
+        filter="+".join(arguments.filter),
         averaged=arguments.averaged,
         source_detector_mm=arguments.source_detector_mm,
         binning=arguments.binning,
         frame_interval_ms=arguments.frame_interval_ms,
         belt_speed_mm_s=arguments.belt_speed_mm_s,
     )
-    for layer in setting.filters:
-        material_from_name(layer.material)
-    twin = read_twin(arguments.twin)
-    result = predict_flatfield(twin, setting).as_dict()
-    result["frames_per_s"] = frames_per_s(twin.instrument, setting)
-    if twin.instrument.dual_layer and twin.spectral is not None:
-        result["back_layer"] = predict_back_layer(twin, setting).as_dict()
+    result = found.to_dict()
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result))
@@ -68,15 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _text(result: dict[str, Any]) -> str:
-    units = {
-        "mean_DN": "DN above dark",
-        "sd_DN": "DN",
-        "gain_DN": "DN",
-        "photons_absorbed": "photons a pixel and frame",
-        "air_kerma_uGy": "uGy a frame",
-    }
+    from ..generator.predict import UNITS
+
     lines = [result["setting"]]
-    for name, unit in units.items():
+    for name, unit in UNITS.items():
         value = result[name]
         text = (
             "not known" if value is None else f"{value['value']:.5g} ({value['low']:.5g} to {value['high']:.5g}) {unit}"

@@ -11,16 +11,10 @@ import signal
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import InputError
 from ._answer import answer, say
-from ._folder import written_folder
-
-if TYPE_CHECKING:
-    from ..campaign.sweep_file import Campaign
-    from ..campaign.sweep_runners import Runner
-    from ..campaign.sweep_settings import Outlook
 
 EXAMPLE = """examples:
   raytwin sweep campaign.toml --plan
@@ -59,136 +53,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin sweep`."""
-    from ..campaign.sweep_file import read_campaign
+    from ..api._progress import Bar
+    from ..api.campaigns import SweepPlan, sweep
 
-    for option, value in (("--workers", arguments.workers), ("--threads", arguments.threads)):
-        if value < 1:
-            raise InputError(option, received=value, expected="a whole number, 1 or more")
     if arguments.output is None and not arguments.plan:
         raise InputError("-o", received="none", expected="a folder for the sweep, or --plan to look ahead only")
-    campaign = read_campaign(arguments.campaign)
-    if arguments.plan:
-        return _plan(campaign, arguments)
-    if arguments.scheduler is None:
-        from ..segmentation import choose_device
+    main_thread = threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGTERM, _interrupt) if main_thread else None
+    counts: list[int] = []
+    try:
+        with Bar(only_on_terminal=True, unit="setting") as bar:
 
-        choose_device(arguments.device)  # says at once how to install torch where it is missing
-    with written_folder(arguments.output):
-        return _sweep(campaign, arguments)
+            def told(stage: str, done: int, total: int | None) -> None:
+                bar(stage, done, total)
+                if stage == "settings" and bar.hidden and not counts:
+                    counts.extend((done, total or 0))
+                    if done:
+                        say(f"{done} of {total} settings are done already")
 
+            def finished(row: Mapping[str, Any]) -> None:
+                if bar.hidden and counts:
+                    counts[0] += 1
+                    say(f"[{counts[0]}/{counts[1]}] {row['label']}: {_told(row)}")
 
-def _plan(campaign: "Campaign", arguments: argparse.Namespace) -> int:
-    from ..campaign.sweep import outlook_row
-    from ..campaign.sweep_settings import labels_of
-
-    outlooks = _looked_at(campaign)
-    rows = [
-        outlook_row(one, label) for one, label in zip(outlooks, labels_of([one.pair for one in outlooks]), strict=True)
-    ]
-    kept = sum(one.kept for one in outlooks)
-    result = {
-        "settings": len(rows),
-        "feasible": sum(one.feasible for one in outlooks),
-        "to_train": kept,
-        "rows": [row | {"kept": one.kept} for row, one in zip(rows, outlooks, strict=True)],
-    }
-    text = "\n".join(
-        [
-            *_plan_lines(rows),
-            f"{len(rows)} setting{'s' * (len(rows) != 1)}, {result['feasible']} feasible, {kept} to train",
-        ]
-    )
-    answer(result, as_json=arguments.json, text=text)
+            found = sweep(
+                arguments.campaign,
+                output=arguments.output,
+                plan_only=arguments.plan,
+                workers=arguments.workers,
+                scheduler=arguments.scheduler,
+                device=arguments.device,
+                threads=arguments.threads,
+                keep_images=arguments.keep_images,
+                progress=told,
+                tell=say,
+                each=finished,
+            )
+    finally:
+        if previous is not None:
+            signal.signal(signal.SIGTERM, previous)
+    result = found.to_dict()
+    if isinstance(found, SweepPlan):
+        rows = result["rows"]
+        count = f"{len(rows)} setting{'s' * (len(rows) != 1)}"
+        lines = [*_plan_lines(rows), f"{count}, {result['feasible']} feasible, {result['to_train']} to train"]
+    else:
+        lines = [*_result_lines(result["rows"]), result["sentence"], f"report: {result['paths']['report']}"]
+    answer(result, as_json=arguments.json, text="\n".join(lines))
     return 0
-
-
-def _looked_at(campaign: "Campaign") -> "tuple[Outlook, ...]":
-    from tqdm import tqdm
-
-    from ..campaign.sweep import look_ahead
-
-    with tqdm(total=len(campaign.settings), unit="setting", desc="looking ahead", disable=None) as bar:
-        return look_ahead(campaign, each=bar.update)
 
 
 def _interrupt(number: int, frame: object) -> None:
     """End as a key press does: processes are stopped, nothing half done counts."""
     raise KeyboardInterrupt
-
-
-def _sweep(campaign: "Campaign", arguments: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from .. import __version__
-    from ..campaign.sweep import Progress, run_sweep, seconds_of
-    from ..campaign.sweep_report import write_report
-
-    bar: Any = None
-    count = 0
-
-    def begin(total: int, done: int) -> None:
-        nonlocal bar, count
-        bar, count = tqdm(total=total, initial=done, unit="setting", desc="settings", disable=None), done
-        if done and bar.disable:
-            say(f"{done} of {total} settings are done already")
-
-    def advance(row: Mapping[str, Any]) -> None:
-        nonlocal count
-        count += 1
-        bar.update()
-        if bar.disable:
-            say(f"[{count}/{bar.total}] {row['label']}: {_told(row)}")
-
-    main_thread = threading.current_thread() is threading.main_thread()
-    previous = signal.signal(signal.SIGTERM, _interrupt) if main_thread else None
-    runner: Runner | None = None
-    try:
-        runner = _runner(arguments, version=__version__)
-        result = run_sweep(
-            campaign,
-            arguments.output,
-            runner=runner,
-            version=__version__,
-            device=arguments.device,
-            threads=arguments.threads,
-            keep_images=arguments.keep_images,
-            outlooks=_looked_at(campaign),
-            progress=Progress(tell=say, begin=begin, advance=advance),
-        )
-    finally:
-        if bar is not None:
-            bar.close()
-        if runner is not None:
-            runner.close()
-        if previous is not None:
-            signal.signal(signal.SIGTERM, previous)
-    seconds = seconds_of(arguments.output, result["rows"])
-    report = write_report(
-        result, arguments.output / "report.html", campaign=campaign, seconds=seconds, version=__version__
-    )
-    shown = {
-        **result,
-        "rows": [row | {"seconds": seconds.get(row["setting"])} for row in result["rows"]],
-        "paths": {"report": report, "json": arguments.output / "sweep.json", "csv": arguments.output / "sweep.csv"},
-    }
-    text = "\n".join([*_result_lines(result["rows"]), result["sentence"], f"report: {report}"])
-    answer(shown, as_json=arguments.json, text=text)
-    return 0
-
-
-def _runner(arguments: argparse.Namespace, *, version: str) -> "Runner":
-    from ..campaign.sweep import marker_of
-    from ..campaign.sweep_runners import DaskCluster, Processes
-
-    if arguments.scheduler is None:
-        return Processes(arguments.workers)
-    cluster = DaskCluster(arguments.scheduler)
-    try:
-        cluster.check(marker_of(arguments.output), version=version)
-    except BaseException:
-        cluster.close()
-        raise
-    return cluster
 
 
 def _told(row: Mapping[str, Any]) -> str:

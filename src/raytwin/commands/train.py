@@ -9,19 +9,12 @@ sees the same noise twice.
 """
 
 import argparse
-import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ..errors import InputError
 from ._answer import answer, say
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ..segmentation import EpochResult, NetworkResult, Recipe
+    from ..segmentation import NetworkResult
 
 EXAMPLE = """example:
   raytwin train images.h5 -o networks --networks 5 --seed 1
@@ -68,126 +61,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin train`."""
-    from tqdm import tqdm
+    from ..api._progress import Bar
+    from ..api.images import train
 
-    from ..acquisition import read_dataset
-    from ..segmentation import choose_device, train_networks
+    with Bar(only_on_terminal=True, unit="epoch") as bar:
 
-    recipe = _recipe(arguments)
-    fresh, fresh_noise = _fresh(arguments)
-    set_threads(arguments.threads)
-    device = choose_device(arguments.device)
-    with read_dataset(arguments.dataset) as dataset, tqdm(disable=None, unit="epoch") as bar:
+        def told(stage: str, done: int, total: int | None) -> None:
+            bar(stage, done, total)
+            if bar.hidden and done == total:
+                say(f"{stage}: {done} epochs done")
 
-        def progress(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
-            bar.set_description(f"network {network + 1}/{arguments.networks}", refresh=False)
-            bar.total = wanted
-            bar.n = done
-            if result is not None and result.validation_loss is not None:
-                bar.set_postfix(loss=f"{result.loss:.3f}", validation=f"{result.validation_loss:.3f}", refresh=False)
-            bar.refresh()
-            if bar.disable and done == wanted and result is not None:
-                say(f"network {network}: {done} epochs done")
-
-        results = train_networks(
-            dataset,
+        found = train(
+            arguments.dataset,
             arguments.output,
-            recipe=recipe,
             networks=arguments.networks,
-            seed=arguments.seed,
-            device=device,
+            recipe=arguments.recipe,
+            epochs=arguments.epochs,
+            steps=arguments.steps,
+            batch=arguments.batch,
+            learning_rate=arguments.learning_rate,
+            crop_px=arguments.crop_px,
+            encoder_weights=None if arguments.encoder_weights == "none" else arguments.encoder_weights,
             start_from=arguments.start_from,
-            fresh=fresh,
-            fresh_noise=fresh_noise,
-            progress=progress,
-            warn=say,
+            fresh_noise=arguments.fresh_noise,
+            low=arguments.low,
+            high=arguments.high,
+            device=arguments.device,
+            threads=arguments.threads,
+            seed=arguments.seed,
+            progress=told,
         )
-    summary = [_network_answer(result) for result in results]
+    for line in found.warnings:
+        say(f"note: {line}")
     answer(
-        {"runs": arguments.output, "recipe": dataclasses.asdict(recipe), "device": device, "networks": summary},
+        found.to_dict(),
         as_json=arguments.json,
-        text=f"{arguments.output}: {len(results)} networks\n" + "\n".join(map(_line, results)),
+        text=f"{arguments.output}: {len(found.networks)} networks\n" + "\n".join(map(_line, found.networks)),
     )
     return 0
-
-
-def _fresh(
-    arguments: argparse.Namespace,
-) -> "tuple[Callable[[int, int], NDArray[np.float32]] | None, dict[str, Any] | None]":
-    """What makes the images of an epoch, and what decides them."""
-    given = (arguments.fresh_noise, arguments.low, arguments.high)
-    if given == (None, None, None):
-        return None, None
-    if None in given:
-        raise InputError(
-            "--fresh-noise",
-            received="only a part of --fresh-noise, --low and --high",
-            expected="all three: a twin and the two settings to train for",
-        )
-    from ..acquisition import setting_from_text
-    from ..files import sha256_of_file
-    from ..generator.fresh import FreshReferences
-    from ..generator.twin_io import read_twin
-
-    low, high = setting_from_text(arguments.low), setting_from_text(arguments.high)
-    source = FreshReferences(
-        read_twin(arguments.fresh_noise), arguments.dataset, low=low, high=high, seed=arguments.seed
-    )
-    for line in source.warnings:
-        say(f"warning: {line}")
-
-    def images(number: int, epoch: int) -> "NDArray[np.float32]":
-        return source.example(number, epoch=epoch).log_images
-
-    decided_by = {"twin_sha256": sha256_of_file(arguments.fresh_noise), "low": str(low), "high": str(high)}
-    return images, decided_by
-
-
-def set_threads(threads: int | None) -> None:
-    """Let torch use that many processor threads; None leaves all."""
-    if threads is None:
-        return
-    if threads < 1:
-        raise InputError("--threads", received=threads, expected="a whole number, 1 or more")
-    from ..segmentation._torch import load_torch
-
-    load_torch().set_num_threads(threads)
-
-
-def _recipe(arguments: argparse.Namespace) -> "Recipe":
-    from ..segmentation import RECIPES, recipe_for_fine_tuning
-
-    recipe = RECIPES.get(arguments.recipe)
-    if recipe is None:
-        raise InputError("--recipe", received=arguments.recipe, expected="one of " + ", ".join(RECIPES))
-    if arguments.start_from is not None:
-        recipe = recipe_for_fine_tuning(recipe)
-    changes: dict[str, Any] = {}
-    if arguments.epochs is not None or arguments.steps is not None:
-        changes |= {"epochs": arguments.epochs, "steps": arguments.steps}
-    for field in ("batch", "learning_rate", "crop_px"):
-        if getattr(arguments, field) is not None:
-            changes[field] = getattr(arguments, field)
-    if arguments.encoder_weights != "none":
-        changes["encoder_weights"] = arguments.encoder_weights
-    return dataclasses.replace(recipe, **changes)
-
-
-def _network_answer(result: "NetworkResult") -> dict[str, Any]:
-    validated = [epoch for epoch in result.history if epoch.validation_loss is not None]
-    return {
-        "network": result.network,
-        "best_epoch": result.best_epoch,
-        "best_validation_loss": result.best_validation_loss,
-        "validation_recall": result.best.validation_recall,
-        "validation_hit_rate": result.best.validation_hit_rate,
-        "validation_false_alarm_rate": result.best.validation_false_alarm_rate,
-        "epochs": len(result.history),
-        "losses": [epoch.loss for epoch in result.history],
-        "validation_epochs": [epoch.epoch for epoch in validated],
-        "validation_losses": [epoch.validation_loss for epoch in validated],
-        "weights_sha256": result.weights_sha256,
-    }
 
 
 def _line(result: "NetworkResult") -> str:

@@ -6,7 +6,6 @@ fitted again without each of the twin's levels in turn, which is then predicted 
 """
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -42,35 +41,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin validate`."""
-    from dataclasses import replace
-
-    import numpy as np
-    from tqdm import tqdm
-
-    from ..acquisition import open_acquisition
-    from ..acquisition.sessions import one_layer
-    from ..calibration.validate import leave_one_out, plot_validation, validate_twin
-    from ..generator.twin_io import read_twin
+    from ..api._progress import Bar
+    from ..api.twins import validate
+    from ..calibration.validate import plot_validation
 
     if arguments.plot is not None and arguments.plot.suffix.lower() not in _FORMATS:
         raise InputError("--plot", received=arguments.plot.name, expected="a name that ends in " + ", ".join(_FORMATS))
-    twin = read_twin(arguments.twin)
-    with open_acquisition(arguments.acquisition) as acquisition:
-        validation = validate_twin(twin, one_layer(acquisition, arguments.layer))
-    if arguments.leave_one_out:
-        with tqdm(total=len(twin.levels), disable=None, file=sys.stderr, desc="leaving out", unit="level") as bar:
-            left_out = leave_one_out(
-                twin, rng=np.random.default_rng(arguments.seed), progress=lambda name: bar.update() and None
-            )
-        validation = replace(validation, left_out=left_out)
-        if not left_out:
-            say("nothing can be left out: fewer than two levels with kV and tube load")
-    result = validation.as_dict()
+    with Bar(only_on_terminal=True, unit="level") as bar:
+        found = validate(
+            arguments.twin,
+            arguments.acquisition,
+            layer=arguments.layer,
+            leave_one_out=arguments.leave_one_out,
+            seed=arguments.seed,
+            progress=bar,
+        )
+    if found.left_out == ():
+        say("nothing can be left out: fewer than two levels with kV and tube load")
+    result = found.to_dict()
     for line in result["skipped"]:
         say(f"skipped: {line}")
     if arguments.plot is not None:
         with whole_file(arguments.plot) as temporary:
-            plot_validation(validation).savefig(temporary, format=arguments.plot.suffix[1:].lower(), dpi=150)
+            plot_validation(found).savefig(temporary, format=arguments.plot.suffix[1:].lower(), dpi=150)
         result["plot"] = str(arguments.plot)
     answer(result, as_json=arguments.json, text=_text(result))
     return 0

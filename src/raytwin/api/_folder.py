@@ -1,4 +1,4 @@
-"""Folders that a command writes into: whether they can be written is known before the work begins."""
+"""Folders that are written into: whether they can be written is known before the work begins."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ def written_folder(path: Path) -> Iterator[Path]:
     except OSError as error:
         what = ", a file" if path.is_file() else f" ({error.strerror or error})"
         raise InputError(
-            "-o", received=f"{path}{what}", expected="a folder that can be written, which may not exist yet"
+            "output", received=f"{path}{what}", expected="a folder that can be written, which may not exist yet"
         ) from None
     try:
         yield path

@@ -1,0 +1,187 @@
+"""What is installed, what a twin is, and the twin in the form that other simulators read."""
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..results import Result, Table, plain
+from ._folder import written_folder
+from ._given import PathLike, as_any_twin, as_twin
+
+if TYPE_CHECKING:
+    from ..acquisition.setting import Setting
+    from ..generator.tube_twin import TubeTwin
+    from ..generator.twin import Twin
+
+_EXTRAS = {"segmentation": ("torch", "segmentation_models_pytorch"), "cluster": ("dask", "distributed")}
+_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "h5py",
+    "numba",
+    "spekpy",
+    "xraylib",
+    "xraydb",
+    "statsmodels",
+    "pandas",
+    "torch",
+    "dask",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Info(Result):
+    """The installation: version, python, extras (name -> installed), libraries (name -> version, None: absent), cache (folder, and
+    its size in bytes), devices that networks can train on, shipped calibrations."""
+
+    version: str
+    python: str
+    extras: Mapping[str, bool]
+    libraries: Mapping[str, str | None]
+    cache: str
+    cache_bytes: int
+    devices: tuple[str, ...]
+    processors: int
+    calibrations: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin info --json` prints."""
+        found: dict[str, Any] = plain({name: getattr(self, name) for name in self.__slots__})
+        return found
+
+    def _table(self) -> Table:
+        rows = [
+            ("Python", self.python),
+            *(
+                (f"extra {name}", "installed" if there else f"absent: pip install 'raytwin[{name}]'")
+                for name, there in self.extras.items()
+            ),
+            ("devices", ", ".join(self.devices)),
+            ("processors", str(self.processors)),
+            ("cache of spectra", f"{self.cache} ({self.cache_bytes / 2**20:.1f} MB)"),
+            ("shipped twins", ", ".join(self.calibrations) or "none"),
+            ("libraries", ", ".join(f"{name} {version}" for name, version in self.libraries.items() if version)),
+        ]
+        return Table(title=f"raytwin {self.version}", rows=tuple(rows))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Exported(Result):
+    """Files that were written for another simulator: its name, folder, files (name -> what it holds), warnings."""
+
+    to: str
+    folder: Path
+    files: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin export --json` prints."""
+        found: dict[str, Any] = plain(
+            {"to": self.to, "folder": self.folder, "files": self.files, "warnings": self.warnings}
+        )
+        return found
+
+    def _table(self) -> Table:
+        notes = tuple(f"warning: {text}" for text in self.warnings)
+        return Table(title=f"{self.folder}, for {self.to}", rows=tuple(self.files.items()), notes=notes)
+
+
+def info(twin: "Twin | TubeTwin | PathLike | None" = None) -> "Info | Twin | TubeTwin":
+    """The installation: version, extras, libraries, cache, devices; or a twin, whose `repr` is its table.
+
+    Args:
+        twin: a twin, its file, or a shipped calibration's name; None: the installation.
+
+    Raises:
+        FileFormatError: a file that is no twin.
+
+    Example:
+        >>> rt.info().version == rt.__version__
+        True
+        >>> rt.info("twin.h5").instrument.pixel_mm
+        0.45
+    """
+    if twin is not None:
+        return as_any_twin(twin)
+    from .. import __version__
+    from ..generator.shipped import shipped_calibrations
+    from ..spectra._cache import cache_folder
+
+    folder = cache_folder()
+    size = 0
+    if folder is not None and folder.is_dir():
+        size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return Info(
+        version=__version__,
+        python=f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+        extras={name: all(map(_there, modules)) for name, modules in _EXTRAS.items()},
+        libraries={name: _version(name) for name in _LIBRARIES},
+        cache="none" if folder is None else str(folder),
+        cache_bytes=size,
+        devices=_devices(),
+        processors=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        calibrations=tuple(name for name, path in shipped_calibrations().items() if path.suffix == ".h5"),
+    )
+
+
+def _there(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _devices() -> tuple[str, ...]:
+    if not _there("torch"):
+        return ("cpu (torch is not installed)",)
+    import torch
+
+    found = ["cpu"]
+    if torch.cuda.is_available():
+        found += [f"cuda: {torch.cuda.get_device_name(number)}" for number in range(torch.cuda.device_count())]
+    if torch.backends.mps.is_available():
+        found.append("mps")
+    return tuple(found)
+
+
+def export(
+    twin: "Twin | PathLike",
+    output: PathLike,
+    *,
+    to: str,
+    settings: "Setting | str | Sequence[Setting | str] | None" = None,
+) -> Exported:
+    """A twin in the form that another simulator reads: spectrum at the detector, its response, optical spread, noise.
+
+    Args:
+        twin: a twin with a spectral part, its file, or a shipped calibration's name.
+        output: folder to write, new or not.
+        to: `csv`, `gvxr` (gVirtualXray's JSON), `xcist` (gecatsim's spectrum and configuration files) or `leap`.
+        settings: that the spectra are written for; None: the measured kV and filters, at 1 mAs.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: another simulator, a twin without spectral part, a setting that the twin cannot have.
+
+    Example:
+        >>> written = rt.export("twin.h5", "for_others", to="csv")
+        >>> sorted(written.files)[:2]
+        ['levels.csv', 'noise.json']
+    """
+    from ..generator.export import export_twin
+
+    folder = Path(output)
+    with written_folder(folder):
+        files, warnings = export_twin(as_twin(twin), folder, to=to, settings=settings)
+    return Exported(to=to, folder=folder, files=files, warnings=warnings)

@@ -150,6 +150,8 @@ def fit_flat_noise(
     # darks that are single means bound the read noise by their difference
     means = [(total.mean_DN, total.frames * item.averaged) for item, total in darks.sums]
     most_read = most_read_variance(means, good) if darks.effective == 0 else None
+    if acquisition.instrument.counting and not darks.sums:
+        most_read = 0.0  # a counter has no electronic noise
     fit = _fit(powers, groups, in_fit, most_read)
     # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
     bent: list[str] = []

@@ -283,7 +283,9 @@ class _Problem:
                 both = [group, groups + group]
                 matrix[np.ix_(both, both)] += np.outer(row, row)
         square = self.square
-        if math.isfinite(self.most_read_DN2) and self.most_read_DN2 > 0:
+        if self.most_read_DN2 <= 0:
+            matrix[read, read] += 1e9 * max(matrix[read, read], 1e-300)  # declared to be 0
+        elif math.isfinite(self.most_read_DN2):
             # mean and variance of r^2 for r anywhere between 0 and its largest value
             mean, precision = self.most_read_DN2 / 3.0, 1.0 / (self.most_read_DN2**2 * (1.0 / 5.0 - 1.0 / 9.0))
             matrix[read, read] += precision
@@ -445,7 +447,7 @@ def fit_spread(
     Args:
         series: noise powers, darks included (signal 0).
         group: per series, the index of its kV and filter; -1 for darks.
-        most_read_DN2: read variance that the darks allow at most, where they were not repeated.
+        most_read_DN2: read variance that the darks allow at most, where they were not repeated; 0: there is none.
         families: kernel families to try.
 
     Raises:

@@ -25,6 +25,7 @@ FloatArray = NDArray[np.float64]
 # quantum, K = 100-1000; the width leaves room for other white noise that follows the signal.
 WHITE_FRACTION_PRIOR = (0.003, 0.03)
 _LOW_BAND = 0.2  # cycles a pixel, up to which the second route extrapolates to 0
+_SILENT = 1e-6  # of the brightest series' power: below that a series is known as well as can be used
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
@@ -204,7 +205,10 @@ class _Problem:
 
     def weigh(self, expected: Sequence[FloatArray]) -> None:
         """Take the weights from expected powers (cell,) of each series."""
-        self.weights = [modes / power**2 for modes, power in zip(self.modes, expected, strict=True)]
+        # a silent dark has no power at all
+        floor = _SILENT * max(float(np.mean(data)) for data in self.data)
+        pairs = zip(self.modes, expected, strict=True)
+        self.weights = [modes / np.maximum(power, floor) ** 2 for modes, power in pairs]
         self.sums: dict[tuple[int, int], FloatArray] = {}
         self.square = 0.0
         for item, group, data, weight in zip(self.series, self.group, self.data, self.weights, strict=True):

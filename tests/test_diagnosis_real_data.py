@@ -57,10 +57,10 @@ def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be
 
 
 @pytest.mark.skipif(not CCD.is_dir(), reason="the EMVA 1288 camera set is not here (shared/realdata/emva_ccd)")
-def test_ccd_camera_shows_lines_and_a_lamp_that_flickers(tmp_path, capsys):
+def test_ccd_camera_shows_lines_of_its_readout(tmp_path, capsys):
     # a corner of the sensor says the same in a twentieth of the time
     session, answer = diagnosed(CCD, "emva1288", tmp_path, capsys, side_px=128)
-    dark, flat = "dark_027_5.16ms", "flat_013_5.16ms"
+    dark = "dark_027_5.16ms"
     with h5py.File(session) as file:
         frames = np.diff(file["series"][dark]["frames"][:].astype(np.float64), axis=0)
         frames -= frames.mean(axis=(1, 2), keepdims=True)
@@ -68,7 +68,6 @@ def test_ccd_camera_shows_lines_and_a_lamp_that_flickers(tmp_path, capsys):
         ratio = frames.mean(axis=2).var() * frames.shape[2] / frames.var()
     assert ratio > 1.2
     assert max(places(answer, "texture", dark, "row_ratio")) > 5
-    assert max(places(answer, "time", flat, "frame_factor")) > 5
     assert {item["effect"] for item in answer["not_tested"]} >= NEEDS_A_SPECTRUM
     assert not {"row_noise", "nonlinearity", "output_drift"} & {item["effect"] for item in answer["not_tested"]}
     # three flats are saturated throughout

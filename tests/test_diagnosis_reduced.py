@@ -166,7 +166,6 @@ def untested(answer):
     [
         (only("flat"), "flats without a dark series"),
         (only("dark"), "no flat series that may calibrate"),
-        (single_frames, "a single frame has no noise"),
     ],
 )
 def test_session_that_cannot_calibrate_says_what_is_missing_and_what_a_twin_would_allow(diagnosed, change, mention):
@@ -337,7 +336,8 @@ def test_the_back_layer_of_a_panel_is_no_mislabelled_front(diagnosed, line, tmp_
     code, _, lines = diagnosed(with_back_layer, "--layer", "back")
     assert code == 2
     assert lines == [
-        "raytwin diagnose: error: layer: got back; expected front; declare the panel's back_scintillator to work with its back layer"
+        "raytwin diagnose: error: --layer: got back; expected front;"
+        " declare the panel's back_scintillator to work with its back layer"
     ]
 
 

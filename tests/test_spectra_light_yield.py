@@ -14,7 +14,7 @@ def test_electrons_take_the_photons_whole_energy(name, monkeypatch):
     assert light_yield._photon_light(material_from_name(name), energies) == pytest.approx(1.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("name", "edge_keV"), [("CsI", 33.17), ("CsI", 35.98), ("Gd2O2S@7.32", 50.24)])
+@pytest.mark.parametrize(("name", "edge_keV"), [("CsI", 33.17), ("Gd2O2S@7.32", 50.24)])
 def test_light_dips_above_the_k_edges_by_a_few_per_cent(name, edge_keV):
     below, above = light_per_keV(name, np.array([edge_keV - 0.1, edge_keV + 0.1]))
     assert -0.05 < above - below < -0.001

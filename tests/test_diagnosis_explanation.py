@@ -51,7 +51,7 @@ def diagnosis(verdict, **more):
         "probability_no_gap": 0.0,
         "probability_unknown": 0.91,
         "unknown_location": "position of flat",
-        "problem": SimpleNamespace(views=views),
+        "compared": SimpleNamespace(views=views),
     }
     return SimpleNamespace(**fields | more)
 

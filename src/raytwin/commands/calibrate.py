@@ -140,6 +140,14 @@ def _is_number(text: str) -> bool:
         return False
 
 
+def _spread(result: dict[str, Any]) -> str:
+    """Width of the core, or what of the noise the spread leaves in a pixel where it has none, and the kernel family."""
+    spread = result["spread"]
+    if result["psf_sigma_px"] is None:
+        return f"{spread['family']}: {100 * spread['variance_share']:.2g} % of the quantum variance is left in a pixel"
+    return f"{_interval(result['psf_sigma_px'], ' px')} ({spread['family']})"
+
+
 def _interval(value: dict[str, float] | None, unit: str) -> str:
     if value is None:
         return "not known"
@@ -172,7 +180,7 @@ def _text(result: dict[str, Any], path: Path) -> str:
         lines = [
             f"dark                {_interval(result['dark_DN'], ' DN')}",
             f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
-            f"optical spread      {_interval(result['psf_sigma_px'], ' px')} ({result['spread']['family']})",
+            f"optical spread      {_spread(result)}",
         ]
     lines += [
         f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",

@@ -194,6 +194,10 @@ class _Problem:
             # cells of one bin scatter as overlapping squares do, wide ones as their modes say
             self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
         self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
+        darks = [item for item, number in zip(series, group, strict=True) if number < 0]
+        self.electronic = {
+            side: electronic_shape([item for item in darks if item.square_px == side], side) for side in self.sides
+        }
         self.most_read_DN2 = math.inf
         if min(group) >= 0:
             # darks were not repeated, but white noise is at no frequency more than what was measured there
@@ -204,7 +208,7 @@ class _Problem:
         self.weigh([np.full(data.size, max(float(np.mean(data)), 1e-12)) for data in self.data])
 
     def weigh(self, expected: Sequence[FloatArray]) -> None:
-        """Take the weights from expected powers (cell,) of each series."""
+        """Take the weights from expected powers (cell,) of each series, and sum over those that share a beam."""
         # a silent dark has no power at all
         floor = _SILENT * max(float(np.mean(data)) for data in self.data)
         pairs = zip(self.modes, expected, strict=True)
@@ -213,10 +217,17 @@ class _Problem:
         self.square = 0.0
         for item, group, data, weight in zip(self.series, self.group, self.data, self.weights, strict=True):
             signal = item.signal_DN if group >= 0 else 0.0
-            rows = np.stack([weight * signal**2, weight * signal, weight * signal * data, weight, weight * data])
+            read = self.read_in_cells(item.square_px)
+            rows = np.stack(
+                [weight * signal**2, weight * signal * read, weight * signal * data, weight * read**2, weight * read * data]
+            )
             key = (item.square_px, group)
             self.sums[key] = self.sums[key] + rows if key in self.sums else rows
             self.square += float(np.sum(weight * data**2))
+
+    def read_in_cells(self, side: int) -> FloatArray:
+        """Power of a unit of electronic noise (cell,)."""
+        return np.asarray(_cells(side)[0] @ self.electronic[side][usable(side)])
 
     def shapes(self, spread: Spread) -> dict[int, FloatArray]:
         """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
@@ -277,8 +288,9 @@ class _Problem:
             cross = item.signal_DN * (columns.T @ weighted)
             matrix[np.ix_(places, own)] += cross
             matrix[np.ix_(own, places)] += cross.T
-            matrix[own, read] += weighted.sum(axis=0)
-            matrix[read, own] += weighted.sum(axis=0)
+            of_read = weighted.T @ self.read_in_cells(item.square_px)
+            matrix[own, read] += of_read
+            matrix[read, own] += of_read
             right[own] += weighted.T @ self.data[number]
         if gains is not None:
             centre, width = WHITE_FRACTION_PRIOR
@@ -319,7 +331,7 @@ class _Problem:
         read = 2 * self.groups
         expected = []
         for number, (item, group, data) in enumerate(zip(self.series, self.group, self.data, strict=True)):
-            power = np.full(data.size, coefficients[read])
+            power = coefficients[read] * self.read_in_cells(item.square_px)
             if group >= 0:
                 power += item.signal_DN * (
                     coefficients[group] * shapes[item.square_px] + coefficients[self.groups + group]
@@ -330,6 +342,30 @@ class _Problem:
                 power += slow @ coefficients[place : place + 2]
             expected.append(np.maximum(power, 0.05 * np.minimum(data, float(np.mean(data)))))
         self.weigh(expected)
+
+
+def electronic_shape(darks: Sequence[NoisePower], side: int) -> FloatArray:
+    """Power of electronic noise over its mean (K + 1, K + 1), as repeated darks show it; 1 without any.
+
+    White, but for the frequencies whose power no white noise has: interference from power supplies and clocks stands in narrow
+    lines. There the darks' own power is taken.
+
+    Source: a bin of M modes is gamma distributed, its cube root nearly Gaussian (Wilson and Hilferty, PNAS 17 (1931) 684);
+    of n Gaussian numbers none exceeds sqrt(2 ln n) standard deviations but by chance (Donoho and Johnstone, Biometrika 81
+    (1994) 425).
+    """
+    shape = np.ones((side // 2 + 1, side // 2 + 1))
+    if not darks:
+        return shape
+    used = usable(side)
+    modes = np.sum([item.modes[used] for item in darks], axis=0)
+    over_median = [item.power_DN2[used] / max(float(np.median(item.power_DN2[used])), 1e-300) for item in darks]
+    power = np.sum([item.modes[used] * own for item, own in zip(darks, over_median, strict=True)], axis=0) / modes
+    root_variance = 1.0 / (9.0 * modes)
+    departure = (np.cbrt(power) - (1.0 - root_variance)) / np.sqrt(root_variance)
+    lines = np.abs(departure) > math.sqrt(2.0 * math.log(power.size))
+    shape[used] = np.where(lines, power, 1.0)
+    return shape / float(np.average(shape[used], weights=mode_share(side)[used]))
 
 
 @lru_cache(maxsize=16)
@@ -602,7 +638,7 @@ def _expected(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
     groups = problem.groups
     result = []
     for one, group in zip(problem.series, problem.group, strict=True):
-        power = np.full(one.power_DN2.shape, float(item.coefficients[2 * groups]))
+        power = float(item.coefficients[2 * groups]) * problem.electronic[one.square_px]
         if group >= 0:
             quantum, white = item.coefficients[group], item.coefficients[groups + group]
             power = power + one.signal_DN * (quantum * shapes[one.square_px] + white)
@@ -624,14 +660,15 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
             continue
         frequency = np.arange(power.shape[0]) / one.square_px
         square = frequency[:, None] ** 2 + frequency[None, :] ** 2
-        band = one.used & (square < _LOW_BAND**2) & (power > read)
+        electronic = read * problem.electronic[one.square_px]
+        band = one.used & (square < _LOW_BAND**2) & (power > electronic)
         if not band.any():
             continue
         excess = np.zeros(power.shape)
         if number in lit:
             place = 2 * problem.groups + 1 + 2 * lit.index(number)
             excess = np.tensordot(item.coefficients[place : place + 2], _slow(one.square_px), axes=1)
-        quanta = (power - read)[band]
+        quanta = (power - electronic)[band]
         values.append((one.power_DN2 - power - excess)[band] / quanta)
         weights.append(one.modes[band] * (quanta / power[band]) ** 2)
         grid = np.broadcast_arrays(frequency[:, None] ** 2, frequency[None, :] ** 2)

@@ -145,19 +145,26 @@ def usable(side: int) -> NDArray[np.bool_]:
 
 
 @lru_cache(maxsize=16)
-def _smeared_axis(side: int) -> FloatArray:
-    taper = _taper(side)
+def _seen_axis(side: int) -> FloatArray:
+    """What squares show at each frequency of noise at each other (shown, of noise): 1 in sum for white noise.
+
+    Of the covariance at a lag a square keeps what taper and projection leave of it, over what they leave of white noise.
+    """
+    basis, taper = _removed(side), _taper(side)
+    lines = np.fft.rfft(np.diag(taper) - basis @ (basis.T * taper), axis=0)
     order = np.arange(side // 2 + 1)
-    kept = np.array([np.sum(taper[: side - lag] * taper[lag:]) for lag in order]) / np.sum(taper**2)
+    kept = np.stack([np.sum(lines[:, : side - lag] * lines[:, lag:].conj(), axis=1).real for lag in order], axis=1)
+    # where nothing is left of white noise the frequency is not in use
+    kept /= np.maximum(kept[:, :1], 1e-12)
     weight = np.full(order.size, 2.0)
     weight[0] = weight[-1] = 1.0
     cosine = np.cos(2.0 * np.pi * np.outer(order, order) / side)
-    return np.asarray((cosine * (weight * kept)) @ (cosine * weight) / side)
+    return np.asarray((kept * weight) @ (cosine * weight) / side)
 
 
 def smeared(power: FloatArray) -> FloatArray:
-    """A power (K + 1, K + 1) as tapered squares show it: covariances fall with the lag as the taper's own overlap does."""
-    axis = _smeared_axis(2 * (power.shape[0] - 1))
+    """A power (K + 1, K + 1) as squares show it after taper and projection, white noise unchanged."""
+    axis = _seen_axis(2 * (power.shape[0] - 1))
     return np.asarray(axis @ power @ axis.T)
 
 

@@ -249,7 +249,13 @@ class _Problem:
             signal = item.signal_DN if group >= 0 else 0.0
             read = self.read_in_cells(item.square_px)
             rows = np.stack(
-                [weight * signal**2, weight * signal * read, weight * signal * data, weight * read**2, weight * read * data]
+                [
+                    weight * signal**2,
+                    weight * signal * read,
+                    weight * signal * data,
+                    weight * read**2,
+                    weight * read * data,
+                ]
             )
             key = (item.square_px, group)
             self.sums[key] = self.sums[key] + rows if key in self.sums else rows
@@ -425,9 +431,7 @@ def _starts(family: str) -> list[FloatArray]:
     return [np.array([one[name] for name in _FAMILIES[family][2]]) for one in _STARTS]
 
 
-def _fitted(
-    problem: _Problem, family: str, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()
-) -> _Candidate:
+def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()) -> _Candidate:
     """A family at its best, with the parameters `fixed` as they start."""
     names = _FAMILIES[family][2]
     free = [place for place, name in enumerate(names) if name not in fixed]
@@ -453,9 +457,7 @@ def _fitted(
     return _Candidate(family, theta, spread, coefficients, covariance, chi_square, problem.groups)
 
 
-def _slopes(
-    problem: _Problem, family: str, theta: FloatArray, free: Sequence[int]
-) -> list[dict[int, FloatArray]]:
+def _slopes(problem: _Problem, family: str, theta: FloatArray, free: Sequence[int]) -> list[dict[int, FloatArray]]:
     """Derivatives of the shapes (cell,), by side, by the parameters of the spread at the places `free`."""
     found = []
     for place in free:
@@ -678,9 +680,7 @@ def _representative(
     scale = np.array([float(np.mean(_log_ratio(item.gains, candidates[0].gains))) for item in candidates])
     mean = float(weights @ scale)
     sd = math.sqrt(float(weights @ (scale - mean) ** 2))
-    likely = [
-        place for place, item in enumerate(candidates) if (item.chi_square - least) / inflation <= _AS_LIKELY
-    ]
+    likely = [place for place, item in enumerate(candidates) if (item.chi_square - least) / inflation <= _AS_LIKELY]
     near = [place for place in likely if abs(scale[place] - mean) <= _NEAR_THE_MEAN * sd]
     if not near:
         near = [min(likely, key=lambda place: abs(scale[place] - mean))]

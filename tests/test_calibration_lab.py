@@ -19,7 +19,7 @@ from raytwin.lab.protocols import run_protocol
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     path = tmp_path_factory.mktemp("lab") / "session.h5"
-    truth = run_protocol(path, protocol="calibration", seed=5, rows=48, columns=48, frames=8)
+    truth = run_protocol(path, protocol="calibration", seed=5, rows=48, columns=48, frames=8, families=())
     with open_acquisition(path) as acquisition:
         twin = calibrate_twin(
             acquisition, rng=np.random.default_rng(1), provenance={"acquisition_sha256": sha256_of_file(path)}

@@ -610,8 +610,8 @@ def fit_spread(
     weights /= weights.sum()
     candidates = [item for _, item in members]
     chosen = _representative(candidates, weights, (least, inflation))
-    if not (np.all(np.isfinite(chosen.coefficients)) and np.any(chosen.coefficients[:groups] > 0)):
-        raise FitError("the noise power has no fit with quanta in it; look for saturated, constant or processed frames")
+    if not np.all(np.isfinite(chosen.coefficients)):
+        raise FitError("the noise power has no fit; look for saturated, constant or processed frames")
     gain, slope = chosen.gains, chosen.slopes
     gain_variance, slope_variance = np.zeros(groups), np.zeros(groups)
     spread_variance = dict.fromkeys(_spread_variances(chosen, inflation), 0.0)

@@ -554,7 +554,8 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
 
 def _share_density(share: float) -> float:
     """Prior density of the share of the light that is in the tail."""
-    return _ANY_TAIL + (1.0 - _ANY_TAIL) * _TAIL_SHARE_POWER * (1.0 - share) ** (_TAIL_SHARE_POWER - 1.0)
+    beta = _TAIL_SHARE_POWER * (1.0 - share) ** (_TAIL_SHARE_POWER - 1.0)
+    return float(_ANY_TAIL + (1.0 - _ANY_TAIL) * beta)
 
 
 def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:

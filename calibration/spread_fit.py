@@ -12,7 +12,7 @@ knows no kernel, tests the first.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -133,6 +133,8 @@ class _Candidate:
     covariance: FloatArray  # of coefficients and theta
     chi_square: float
     groups: int
+    variance_share: float  # of the quanta's variance, in one pixel
+    share_slopes: FloatArray  # its derivatives by theta
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -148,7 +150,7 @@ class _Candidate:
     def slopes(self) -> FloatArray:
         """Variance of a pixel per signal (group,), DN."""
         quantum, white = np.split(self.coefficients[: 2 * self.groups], 2)
-        return np.asarray(quantum * self.spread.variance_share + white)
+        return np.asarray(quantum * self.variance_share + white)
 
 
 @lru_cache(maxsize=16)
@@ -454,21 +456,58 @@ def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fix
     places = [*range(linear), *(linear + place for place in free)]
     covariance = np.zeros((linear + len(names), linear + len(names)))
     covariance[np.ix_(places, places)] = normal.covariance()
-    return _Candidate(family, theta, spread, coefficients, covariance, chi_square, problem.groups)
+    share_slopes = np.zeros(len(names))
+    for place in free:
+        (above, more), (below, less) = _moved(family, theta, place)
+        share_slopes[place] = (_variance_share(problem, more) - _variance_share(problem, less)) / (above - below)
+    share = _variance_share(problem, spread)
+    return _Candidate(family, theta, spread, coefficients, covariance, chi_square, problem.groups, share, share_slopes)
+
+
+def _variance_share(problem: _Problem, spread: Spread) -> float:
+    """Share of the quanta's variance that the spread leaves in one pixel: its power's mean over all frequencies."""
+    side = problem.sides[-1]
+    return float(np.sum(mode_share(side) * spread.noise_power(side)))
+
+
+def _moved(family: str, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:
+    """A parameter of the spread a little more and a little less, with the spreads that it makes."""
+    name = _FAMILIES[family][2][place]
+    ends = []
+    for step in (0.005, -0.005):
+        moved = theta.copy()
+        moved[place] = np.clip(theta[place] + step, *_BOUNDS[name])
+        ends.append((float(moved[place]), _spread_of(family, moved)))
+    return ends
+
+
+def _with_share(problem: _Problem, best: _Candidate, share_at: int, share: float) -> _Candidate:
+    """The spread with another share of light in the tail and a core that follows, as its fit says it does."""
+    linear = len(best.coefficients)
+    place = linear + share_at
+    follows = best.covariance[place] / best.covariance[place, place]
+    theta = best.theta + follows[linear:] * (share - best.theta[share_at])
+    theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(best.names, theta, strict=True)])
+    spread = _spread_of(best.family, theta)
+    coefficients, chi_square = problem.solve(spread)
+    return replace(
+        best,
+        theta=theta,
+        spread=spread,
+        coefficients=coefficients,
+        covariance=best.covariance - np.outer(follows, best.covariance[place]),
+        chi_square=chi_square,
+        variance_share=_variance_share(problem, spread),
+    )
 
 
 def _slopes(problem: _Problem, family: str, theta: FloatArray, free: Sequence[int]) -> list[dict[int, FloatArray]]:
     """Derivatives of the shapes (cell,), by side, by the parameters of the spread at the places `free`."""
     found = []
     for place in free:
-        name = _FAMILIES[family][2][place]
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = theta.copy()
-            moved[place] = np.clip(theta[place] + sign * 0.005, *_BOUNDS[name])
-            ends.append((moved[place], problem.in_cells(_spread_of(family, moved))))
-        step = max(ends[0][0] - ends[1][0], 1e-9)
-        found.append({side: (ends[0][1][side] - ends[1][1][side]) / step for side in problem.sides})
+        (above, more), (below, less) = _moved(family, theta, place)
+        shapes = problem.in_cells(more), problem.in_cells(less)
+        found.append({side: (shapes[0][side] - shapes[1][side]) / (above - below) for side in problem.sides})
     return found
 
 
@@ -535,20 +574,12 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
             best = _fitted(problem, family, starts, fixed=("log_tail_px",))
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             sd = min(max(math.sqrt(max(variance, 0.0)), _LEAST_SD), _MOST_SD)
-            middle = float(best.theta[share_at])
-            shares = np.unique(np.clip(middle + sd * np.array(_TAIL_STEPS), 0.0, 1.0))
+            shares = np.unique(np.clip(best.theta[share_at] + sd * np.array(_TAIL_STEPS), 0.0, 1.0))
             widths = 0.5 * np.diff(shares, prepend=shares[0], append=shares[-1])
             for share, width in zip(shares, widths[:-1] + widths[1:], strict=True):
                 density = (1.0 - _NO_TAIL) * _share_density(float(share))
                 mass = width * density / (len(families) * len(_REACHES_PX))
-                theta = best.theta.copy()
-                theta[share_at] = share
-                if share == 0.0:
-                    yield mass, core
-                elif share == middle:
-                    yield mass, best
-                else:
-                    yield mass, _fitted(problem, family, [theta], fixed=_TAIL)
+                yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, float(share))
             starts = [best.theta.copy()]
 
 
@@ -718,22 +749,13 @@ def _variances(item: _Candidate, groups: int, inflation: float) -> tuple[FloatAr
     """Sampling variances of gains and slopes (group,), DN^2."""
     size = len(item.covariance)
     linear = len(item.coefficients)
-    share = item.spread.variance_share
-    slopes = np.zeros(len(item.theta))
-    for place, name in enumerate(item.names):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = item.theta.copy()
-            moved[place] = np.clip(moved[place] + sign * 0.01, *_BOUNDS[name])
-            ends.append((moved[place], _spread_of(item.family, moved).variance_share))
-        slopes[place] = (ends[0][1] - ends[1][1]) / max(ends[0][0] - ends[1][0], 1e-9)
     gains, pixel = [], []
     for g in range(groups):
         direction = np.zeros(size)
         direction[g] = direction[groups + g] = 1.0
         gains.append(max(float(direction @ item.covariance @ direction), 0.0))
-        direction[g] = share
-        direction[linear:] = item.coefficients[g] * slopes
+        direction[g] = item.variance_share
+        direction[linear:] = item.coefficients[g] * item.share_slopes
         pixel.append(max(float(direction @ item.covariance @ direction), 0.0))
     return inflation * np.array(gains), inflation * np.array(pixel)
 

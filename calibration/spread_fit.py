@@ -87,8 +87,9 @@ class SpreadFit:
     slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
     white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
     in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
-    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its standard
-    deviation; criteria (family -> Schwarz's criterion above the best); expected_DN2: power of each series.
+    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its
+    standard deviation; criteria (family -> twice the logarithm of the best family's evidence over its own); expected_DN2: power of
+    each series as squares show it; quanta_DN2: that of what follows the signal, not smeared.
     """
 
     spread: Spread
@@ -110,6 +111,7 @@ class SpreadFit:
     other_route: tuple[float, float]
     criteria: dict[str, float]
     expected_DN2: tuple[FloatArray, ...] = field(repr=False)
+    quanta_DN2: tuple[FloatArray, ...] = field(repr=False)
 
     @property
     def sigma_px(self) -> float:
@@ -690,6 +692,7 @@ def fit_spread(
             family: -2.0 * math.log(max(value, 1e-300) / max(evidence.values())) for family, value in evidence.items()
         },
         expected_DN2=expected,
+        quanta_DN2=_quanta(problem, chosen),
     )
 
 
@@ -788,6 +791,17 @@ def _expected(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
             power = power + one.signal_DN * (quantum * shapes[one.square_px] + white)
         result.append(power)
     return tuple(result)
+
+
+def _quanta(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
+    """Fitted power (K + 1, K + 1) of what follows the signal in each series, as no square has smeared it; 0 for darks."""
+    powers = {side: item.spread.noise_power(side) for side in problem.sides}
+    return tuple(
+        one.signal_DN * (item.coefficients[group] * powers[one.square_px] + item.coefficients[problem.groups + group])
+        if group >= 0
+        else np.zeros(one.power_DN2.shape)
+        for one, group in zip(problem.series, problem.group, strict=True)
+    )
 
 
 def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]) -> tuple[float, float]:

@@ -78,18 +78,21 @@ def measure_seed(
             settings = {item.name: item.setting for item in acquisition.series}
     answer = calibration_answer(twin)
     add("psf_sigma_px", truth["psf_sigma_px"], answer["psf_sigma_px"])
-    exact_at = {(one["lag_row"], one["lag_column"]): one["value"] for one in truth["noise_correlation"]}
-    for one in answer["evidence"].get("noise_correlation") or []:
-        lag = one["lag_row"], one["lag_column"]
-        if lag in exact_at:
-            estimate = {name: one[name] for name in ("value", "low", "high")}
-            add("noise_correlation", exact_at[lag], estimate, f"{lag[0]},{lag[1]}")
     add("read_noise_DN", truth["read_noise_DN"], answer["read_noise_DN"])
     dark = {entry["exposure_ms"]: entry["dark_DN"] for entry in truth["dark_DN_at"]}
     add("dark_DN", dark[twin.maps.dark_exposure_ms], answer["dark_DN"])
     add("inherent_filtration_mm_Al", truth["inherent_filtration_mm_Al"], answer["inherent_filtration_mm_Al"])
     add("flux_scale", truth["flux_scale"], answer["flux_scale"])
     exact = {(level["kV"], level["filter"]): level for level in truth["levels"]}
+    measured = [exact[level["kV"], level["filter"]]["photon_transfer_slope_DN"] for level in answer["levels"]]
+    # what follows the signal is quanta, whose correlation the truth has, and the white noise of electrons
+    of_quanta = float(np.mean([1.0 - truth["DN_per_electron"] / slope for slope in measured]))
+    exact_at = {(one["lag_row"], one["lag_column"]): of_quanta * one["value"] for one in truth["noise_correlation"]}
+    for one in answer["evidence"].get("noise_correlation") or []:
+        lag = one["lag_row"], one["lag_column"]
+        if lag in exact_at:
+            estimate = {name: one[name] for name in ("value", "low", "high")}
+            add("noise_correlation", exact_at[lag], estimate, f"{lag[0]},{lag[1]}")
     for level in answer["levels"]:
         true_level = exact[level["kV"], level["filter"]]
         for name in ("gain_DN", "photon_transfer_slope_DN"):

@@ -75,11 +75,12 @@ def flat_evidence(
     ]
     sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
     in_use = [source for source in sources if source.in_fit]
-    white_DN2 = fit.read_variance_DN2 - fit.row_variance_DN2 - fit.column_variance_DN2
+    lit = [place for place, source in enumerate(in_use) if source.group >= 0]
     correlation = correlation_of_quanta(
-        [source.power for source in in_use if source.group >= 0],
-        [power for source, power in zip(in_use, fit.expected_DN2, strict=True) if source.group >= 0],
-        white_DN2=white_DN2,
+        [in_use[place].power for place in lit],
+        [fit.expected_DN2[place] for place in lit],
+        [fit.quanta_DN2[place] for place in lit],
+        unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
     )
     evidence = {
         "stack_over_pair_variance": ratio,

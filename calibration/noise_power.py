@@ -145,19 +145,26 @@ def usable(side: int) -> NDArray[np.bool_]:
 
 
 @lru_cache(maxsize=16)
-def _smeared_axis(side: int) -> FloatArray:
-    taper = _taper(side)
+def _seen_axis(side: int) -> FloatArray:
+    """What squares show at each frequency of noise at each other (shown, of noise): 1 in sum for white noise.
+
+    Of the covariance at a lag a square keeps what taper and projection leave of it, over what they leave of white noise.
+    """
+    basis, taper = _removed(side), _taper(side)
+    lines = np.fft.rfft(np.diag(taper) - basis @ (basis.T * taper), axis=0)
     order = np.arange(side // 2 + 1)
-    kept = np.array([np.sum(taper[: side - lag] * taper[lag:]) for lag in order]) / np.sum(taper**2)
+    kept = np.stack([np.sum(lines[:, : side - lag] * lines[:, lag:].conj(), axis=1).real for lag in order], axis=1)
+    # where nothing is left of white noise the frequency is not in use
+    kept /= np.maximum(kept[:, :1], 1e-12)
     weight = np.full(order.size, 2.0)
     weight[0] = weight[-1] = 1.0
     cosine = np.cos(2.0 * np.pi * np.outer(order, order) / side)
-    return np.asarray((cosine * (weight * kept)) @ (cosine * weight) / side)
+    return np.asarray((kept * weight) @ (cosine * weight) / side)
 
 
 def smeared(power: FloatArray) -> FloatArray:
-    """A power (K + 1, K + 1) as tapered squares show it: covariances fall with the lag as the taper's own overlap does."""
-    axis = _smeared_axis(2 * (power.shape[0] - 1))
+    """A power (K + 1, K + 1) as squares show it after taper and projection, white noise unchanged."""
+    axis = _seen_axis(2 * (power.shape[0] - 1))
     return np.asarray(axis @ power @ axis.T)
 
 
@@ -476,47 +483,53 @@ def _folded(power: FloatArray) -> FloatArray:
 
 
 def correlation_of_quanta(
-    powers: Sequence[NoisePower], expected_DN2: Sequence[FloatArray], *, white_DN2: float, reach: int = 2
+    powers: Sequence[NoisePower],
+    expected_DN2: Sequence[FloatArray],
+    quanta_DN2: Sequence[FloatArray],
+    *,
+    unseen_sd: float = 0.0,
+    reach: int = 2,
 ) -> list[dict[str, float]]:
     """Correlation of neighbouring pixels' signal-following noise, with 95 % intervals.
 
-    rho(o) = C(o) / C(0) from the power less `white_DN2` (electronic noise), pooled over series in proportion to what each
-    tells; frequencies that were not measured are taken from the fit.
+    rho(o) = C(o) / C(0), pooled over series in proportion to what each tells. The fitted power of the quanta, which squares
+    have not smeared, is taken times what was measured of it over what was expected there.
 
     Args:
         powers: of series with signal.
-        expected_DN2: their fitted power over all frequencies.
-        white_DN2: electronic variance of one pixel without offsets of lines.
+        expected_DN2: their fitted power (K + 1, K + 1) as squares show it, electronic noise included.
+        quanta_DN2: fitted power of what follows the signal (K + 1, K + 1), not smeared.
+        unseen_sd: relative standard deviation of the fitted power at frequencies that were not measured.
         reach: largest lag, px.
 
     Returns:
         Rows `lag_row`, `lag_column`, `value`, `low`, `high`, lag (0, 0) left out.
     """
     lags = [(row, column) for row in range(reach + 1) for column in range(reach + 1) if row or column]
-    sums, information = np.zeros(len(lags)), np.zeros(len(lags))
-    for item, fitted in zip(powers, expected_DN2, strict=True):
+    sums, information, unseen = (np.zeros(len(lags)) for _ in range(3))
+    for item, expected, fitted in zip(powers, expected_DN2, quanta_DN2, strict=True):
         side = item.square_px
         order = np.arange(side // 2 + 1)
         share = mode_share(side)
-        quanta = item.filled(smeared(fitted)) - white_DN2
+        shown = smeared(fitted)
+        seen = item.used & (shown > 0)
+        raised = fitted / np.where(seen, shown, 1.0)
+        quanta = np.where(seen, fitted + raised * (item.filled(expected) - expected), fitted)
         whole = float(np.sum(share * quanta))
         if not whole > 0:
             continue
-        scatter = np.where(item.used, item.filled(fitted) ** 2 / np.where(item.used, item.modes, 1.0), 0.0)
-        taper = _taper(side)
+        scatter = np.where(seen, (raised * expected) ** 2 / np.where(seen, item.modes, 1.0), 0.0)
         for number, (row, column) in enumerate(lags):
             wave = np.outer(np.cos(2 * np.pi * order * row / side), np.cos(2 * np.pi * order * column / side))
-            kept = math.prod(
-                float(np.sum(taper[: side - lag] * taper[lag:]) / np.sum(taper**2)) for lag in (row, column)
-            )
             value = float(np.sum(share * wave * quanta)) / whole
-            variance = float(np.sum((share * (wave - value)) ** 2 * scatter)) / whole**2 / kept**2
-            sums[number] += value / kept / variance
+            variance = float(np.sum((share * (wave - value)) ** 2 * scatter)) / whole**2
+            sums[number] += value / variance
             information[number] += 1.0 / variance
+            unseen[number] += float(np.sum(np.where(seen, 0.0, share * (wave - value) * quanta))) / whole / variance
     rows = []
-    for (row, column), total, weight in zip(lags, sums, information, strict=True):
+    for (row, column), total, weight, model in zip(lags, sums, information, unseen, strict=True):
         if weight > 0:
-            value, half = total / weight, 1.959964 / math.sqrt(weight)
+            value, half = total / weight, 1.959964 * math.hypot(1.0 / math.sqrt(weight), unseen_sd * model / weight)
             rows.append(
                 {"lag_row": row, "lag_column": column, "value": value, "low": value - half, "high": value + half}
             )

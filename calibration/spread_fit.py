@@ -4,13 +4,15 @@ P_s(f) = I_s [A_g S(f) + W_g] + r^2 + E_s f_0 / f + F_s (f_0 / f)^2
 
 S: power of unit quanta after the spread (1 at f = 0), so that the gain of a beam g is A_g + W_g; W: white noise that
 follows the signal; r^2: electronic noise; E, F: what is left of slow changes between frames, where the data show any or
-come from two series. The spread is chosen among kernel families by their evidence (Schwarz's criterion), and what the
-choice leaves open is part of the standard deviations. A second route to the gain, which knows no kernel, tests the first.
+come from two series. The spread is a Gaussian core, of one width or two, and a tail. Frames that are small or few hardly show
+a tail that takes a tenth of the light and a fifth of the gain with it: tails are averaged over by their evidence, with what
+is known of panels as prior, and what they leave open is part of the standard deviations. A second route to the gain, which
+knows no kernel, tests the first.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -35,17 +37,29 @@ _BOUNDS = {
     "tail_share": (0.0, 1.0),
     "log_tail_px": (-1.6, 1.6),
 }
-# A tail that squares of M px cannot show passes for a smaller gain: it is glare, not spread. The longest reach L is that whose
-# transfer function is still 0.8 at 2 / M, the lowest frequency in full use: 2 pi L (2 / M) = 1/2.
-_LONGEST_TAIL = 1.0 / (8.0 * math.pi)
+# Light that goes farther is glare, not spread. The longest reach L is that whose transfer function is still 0.8 at 2 / M, the
+# lowest frequency that the largest squares, of M px, have in full use: 2 pi L (2 / M) = 1/2.
+_LONGEST_TAIL_PX = LARGEST_SQUARE_PX / (8.0 * math.pi)
 # Of a core wider than this share of the square less than a fifth of the power is left there: it cannot be told from drift.
 _WIDEST_CORE = 0.1
-# narrow, wide, and nearly all light in the tail
+# narrow and wide, and of the tail little, much and nearly all
 _STARTS = (
-    {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
+    {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.05, "log_tail_px": 0.0},
     {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},
 )
+# Reaches of tails, equally likely: a factor of 1.5 apart changes the gain by less than a tail's share is known to.
+_REACHES_PX = (0.5, 0.75, 1.13, 1.7, _LONGEST_TAIL_PX)
+# Whether there is a tail is open; the low-frequency drop of panels with a scintillator is 2 to 20 %, which a beta law of mean 0.1
+# describes; of those with a tail one in ten may have any.
+_NO_TAIL = 0.5
+_TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
+_TAIL_STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations of the share, at which it is averaged over
+_LEAST_SD, _MOST_SD = 0.005, 0.15  # of the share between such steps
+# A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
+# deviation of the mean adds an eighth to that.
+_AS_LIKELY = 2.0 * math.log(10.0)
+_NEAR_THE_MEAN = 0.5
 _WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
 _TAIL = ("tail_share", "log_tail_px")
 _LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
@@ -59,6 +73,9 @@ _FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
     "two widths with a Lorentzian tail": ("aperture", _LORENTZIAN, (*_WIDTHS, *_TAIL)),
     "two widths with an exponential tail": ("aperture", _EXPONENTIAL, (*_WIDTHS, *_TAIL)),
 }
+_SIMPLEST = "Gaussian, light collected in pixels"
+_MOST_GENERAL = "two widths with an exponential tail"
+_CORES = tuple(family for family, (*_, names) in _FAMILIES.items() if not set(names) & set(_TAIL))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +87,9 @@ class SpreadFit:
     slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
     white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
     in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
-    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its standard
-    deviation; criteria (family -> Schwarz's criterion above the best); expected_DN2: power of each series.
+    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its
+    standard deviation; criteria (family -> twice the logarithm of the best family's evidence over its own); expected_DN2: power of
+    each series as squares show it; quanta_DN2: that of what follows the signal, not smeared.
     """
 
     spread: Spread
@@ -93,6 +111,7 @@ class SpreadFit:
     other_route: tuple[float, float]
     criteria: dict[str, float]
     expected_DN2: tuple[FloatArray, ...] = field(repr=False)
+    quanta_DN2: tuple[FloatArray, ...] = field(repr=False)
 
     @property
     def sigma_px(self) -> float:
@@ -110,15 +129,30 @@ class _Candidate:
     """One family at its best."""
 
     family: str
-    theta: FloatArray
+    theta: FloatArray  # those held fixed have no variance in `covariance`
     spread: Spread
     coefficients: FloatArray
     covariance: FloatArray  # of coefficients and theta
     chi_square: float
+    groups: int
+    variance_share: float  # of the quanta's variance, in one pixel
+    share_slopes: FloatArray  # its derivatives by theta
 
     @property
     def names(self) -> tuple[str, ...]:
         return _FAMILIES[self.family][2]
+
+    @property
+    def gains(self) -> FloatArray:
+        """Quantum and white part (group,), DN."""
+        quantum, white = np.split(self.coefficients[: 2 * self.groups], 2)
+        return np.asarray(quantum + white)
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Variance of a pixel per signal (group,), DN."""
+        quantum, white = np.split(self.coefficients[: 2 * self.groups], 2)
+        return np.asarray(quantum * self.variance_share + white)
 
 
 @lru_cache(maxsize=16)
@@ -194,6 +228,10 @@ class _Problem:
             # cells of one bin scatter as overlapping squares do, wide ones as their modes say
             self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
         self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
+        darks = [item for item, number in zip(series, group, strict=True) if number < 0]
+        self.electronic = {
+            side: electronic_shape([item for item in darks if item.square_px == side], side) for side in self.sides
+        }
         self.most_read_DN2 = math.inf
         if min(group) >= 0:
             # darks were not repeated, but white noise is at no frequency more than what was measured there
@@ -204,7 +242,7 @@ class _Problem:
         self.weigh([np.full(data.size, max(float(np.mean(data)), 1e-12)) for data in self.data])
 
     def weigh(self, expected: Sequence[FloatArray]) -> None:
-        """Take the weights from expected powers (cell,) of each series."""
+        """Take the weights from expected powers (cell,) of each series, and sum over those that share a beam."""
         # a silent dark has no power at all
         floor = _SILENT * max(float(np.mean(data)) for data in self.data)
         pairs = zip(self.modes, expected, strict=True)
@@ -213,10 +251,23 @@ class _Problem:
         self.square = 0.0
         for item, group, data, weight in zip(self.series, self.group, self.data, self.weights, strict=True):
             signal = item.signal_DN if group >= 0 else 0.0
-            rows = np.stack([weight * signal**2, weight * signal, weight * signal * data, weight, weight * data])
+            read = self.read_in_cells(item.square_px)
+            rows = np.stack(
+                [
+                    weight * signal**2,
+                    weight * signal * read,
+                    weight * signal * data,
+                    weight * read**2,
+                    weight * read * data,
+                ]
+            )
             key = (item.square_px, group)
             self.sums[key] = self.sums[key] + rows if key in self.sums else rows
             self.square += float(np.sum(weight * data**2))
+
+    def read_in_cells(self, side: int) -> FloatArray:
+        """Power of a unit of electronic noise (cell,)."""
+        return np.asarray(_cells(side)[0] @ self.electronic[side][usable(side)])
 
     def shapes(self, spread: Spread) -> dict[int, FloatArray]:
         """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
@@ -277,8 +328,9 @@ class _Problem:
             cross = item.signal_DN * (columns.T @ weighted)
             matrix[np.ix_(places, own)] += cross
             matrix[np.ix_(own, places)] += cross.T
-            matrix[own, read] += weighted.sum(axis=0)
-            matrix[read, own] += weighted.sum(axis=0)
+            of_read = weighted.T @ self.read_in_cells(item.square_px)
+            matrix[own, read] += of_read
+            matrix[read, own] += of_read
             right[own] += weighted.T @ self.data[number]
         if gains is not None:
             centre, width = WHITE_FRACTION_PRIOR
@@ -319,7 +371,7 @@ class _Problem:
         read = 2 * self.groups
         expected = []
         for number, (item, group, data) in enumerate(zip(self.series, self.group, self.data, strict=True)):
-            power = np.full(data.size, coefficients[read])
+            power = coefficients[read] * self.read_in_cells(item.square_px)
             if group >= 0:
                 power += item.signal_DN * (
                     coefficients[group] * shapes[item.square_px] + coefficients[self.groups + group]
@@ -330,6 +382,30 @@ class _Problem:
                 power += slow @ coefficients[place : place + 2]
             expected.append(np.maximum(power, 0.05 * np.minimum(data, float(np.mean(data)))))
         self.weigh(expected)
+
+
+def electronic_shape(darks: Sequence[NoisePower], side: int) -> FloatArray:
+    """Power of electronic noise over its mean (K + 1, K + 1), as repeated darks show it; 1 without any.
+
+    White, but for the frequencies whose power no white noise has: interference from power supplies and clocks stands in narrow
+    lines. There the darks' own power is taken.
+
+    Source: a bin of M modes is gamma distributed, its cube root nearly Gaussian (Wilson and Hilferty, PNAS 17 (1931) 684);
+    of n Gaussian numbers none exceeds sqrt(2 ln n) standard deviations but by chance (Donoho and Johnstone, Biometrika 81
+    (1994) 425).
+    """
+    shape = np.ones((side // 2 + 1, side // 2 + 1))
+    if not darks:
+        return shape
+    used = usable(side)
+    modes = np.sum([item.modes[used] for item in darks], axis=0)
+    over_median = [item.power_DN2[used] / max(float(np.median(item.power_DN2[used])), 1e-300) for item in darks]
+    power = np.sum([item.modes[used] * own for item, own in zip(darks, over_median, strict=True)], axis=0) / modes
+    root_variance = 1.0 / (9.0 * modes)
+    departure = (np.cbrt(power) - (1.0 - root_variance)) / np.sqrt(root_variance)
+    lines = np.abs(departure) > math.sqrt(2.0 * math.log(power.size))
+    shape[used] = np.where(lines, power, 1.0)
+    return shape / float(np.average(shape[used], weights=mode_share(side)[used]))
 
 
 @lru_cache(maxsize=16)
@@ -354,44 +430,92 @@ def _spread_of(family: str, theta: FloatArray) -> Spread:
     )
 
 
-def _fitted(problem: _Problem, family: str, *, start: FloatArray | None = None) -> _Candidate:
-    """A family at its best."""
+def _starts(family: str) -> list[FloatArray]:
+    """Where a family's descent begins."""
+    return [np.array([one[name] for name in _FAMILIES[family][2]]) for one in _STARTS]
+
+
+def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()) -> _Candidate:
+    """A family at its best, with the parameters `fixed` as they start."""
     names = _FAMILIES[family][2]
+    free = [place for place, name in enumerate(names) if name not in fixed]
     bounds = np.array([_BOUNDS[name] for name in names]).T
     bounds[1, names.index("sigma_px2")] = (_WIDEST_CORE * max(problem.sides)) ** 2
-    if "log_tail_px" in names:
-        bounds[1, names.index("log_tail_px")] = math.log(_LONGEST_TAIL * max(problem.sides))
-
-    starts = [start] if start is not None else [np.array([one[name] for name in names]) for one in _STARTS]
     tried = [
-        _descended(problem, family, np.clip(one, bounds[0] + 1e-3, bounds[1] - 1e-3), bounds)
+        _descended(problem, family, np.clip(one, bounds[0], bounds[1]), bounds, free)
         for one in {tuple(one): one for one in starts}.values()
     ]
     theta, chi_square = min(tried, key=lambda one: one[1])
     spread = _spread_of(family, theta)
     coefficients, _ = problem.solve(spread)
-    slopes = _slopes(problem, family, theta)
     normal = problem.normal(
-        problem.in_cells(spread), problem.gains(coefficients), coefficients[: problem.groups], slopes
+        problem.in_cells(spread),
+        problem.gains(coefficients),
+        coefficients[: problem.groups],
+        _slopes(problem, family, theta, free),
     )
-    return _Candidate(family, theta, spread, coefficients, normal.covariance(), chi_square)
+    linear = len(coefficients)
+    places = [*range(linear), *(linear + place for place in free)]
+    covariance = np.zeros((linear + len(names), linear + len(names)))
+    covariance[np.ix_(places, places)] = normal.covariance()
+    share_slopes = np.zeros(len(names))
+    for place in free:
+        (above, more), (below, less) = _moved(family, theta, place)
+        share_slopes[place] = (_variance_share(problem, more) - _variance_share(problem, less)) / (above - below)
+    share = _variance_share(problem, spread)
+    return _Candidate(family, theta, spread, coefficients, covariance, chi_square, problem.groups, share, share_slopes)
 
 
-def _slopes(problem: _Problem, family: str, theta: FloatArray) -> list[dict[int, FloatArray]]:
-    """Derivatives of the shapes (cell,), by side, by each parameter of the spread."""
+def _variance_share(problem: _Problem, spread: Spread) -> float:
+    """Share of the quanta's variance that the spread leaves in one pixel: its power's mean over all frequencies."""
+    side = problem.sides[-1]
+    return float(np.sum(mode_share(side) * spread.noise_power(side)))
+
+
+def _moved(family: str, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:
+    """A parameter of the spread a little more and a little less, with the spreads that it makes."""
+    name = _FAMILIES[family][2][place]
+    ends = []
+    for step in (0.005, -0.005):
+        moved = theta.copy()
+        moved[place] = np.clip(theta[place] + step, *_BOUNDS[name])
+        ends.append((float(moved[place]), _spread_of(family, moved)))
+    return ends
+
+
+def _with_share(problem: _Problem, best: _Candidate, share_at: int, share: float) -> _Candidate:
+    """The spread with another share of light in the tail and a core that follows, as its fit says it does."""
+    linear = len(best.coefficients)
+    place = linear + share_at
+    follows = best.covariance[place] / best.covariance[place, place]
+    theta = best.theta + follows[linear:] * (share - best.theta[share_at])
+    theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(best.names, theta, strict=True)])
+    spread = _spread_of(best.family, theta)
+    coefficients, chi_square = problem.solve(spread)
+    return replace(
+        best,
+        theta=theta,
+        spread=spread,
+        coefficients=coefficients,
+        covariance=best.covariance - np.outer(follows, best.covariance[place]),
+        chi_square=chi_square,
+        variance_share=_variance_share(problem, spread),
+    )
+
+
+def _slopes(problem: _Problem, family: str, theta: FloatArray, free: Sequence[int]) -> list[dict[int, FloatArray]]:
+    """Derivatives of the shapes (cell,), by side, by the parameters of the spread at the places `free`."""
     found = []
-    for place, name in enumerate(_FAMILIES[family][2]):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = theta.copy()
-            moved[place] = np.clip(theta[place] + sign * 0.005, *_BOUNDS[name])
-            ends.append((moved[place], problem.in_cells(_spread_of(family, moved))))
-        step = max(ends[0][0] - ends[1][0], 1e-9)
-        found.append({side: (ends[0][1][side] - ends[1][1][side]) / step for side in problem.sides})
+    for place in free:
+        (above, more), (below, less) = _moved(family, theta, place)
+        shapes = problem.in_cells(more), problem.in_cells(less)
+        found.append({side: (shapes[0][side] - shapes[1][side]) / (above - below) for side in problem.sides})
     return found
 
 
-def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatArray) -> tuple[FloatArray, float]:
+def _descended(
+    problem: _Problem, family: str, theta: FloatArray, bounds: FloatArray, free: Sequence[int]
+) -> tuple[FloatArray, float]:
     """Parameters of the spread at the least chi-square near a start, and that chi-square (Gauss and Newton's steps, halved
     until they help)."""
     coefficients, chi_square = problem.solve(_spread_of(family, theta))
@@ -400,9 +524,10 @@ def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatA
             problem.in_cells(_spread_of(family, theta)),
             problem.gains(coefficients),
             coefficients[: problem.groups],
-            _slopes(problem, family, theta),
+            _slopes(problem, family, theta, free),
         )
-        step = normal.solved(problem.not_negative)[0][-len(theta) :]
+        step = np.zeros(len(theta))
+        step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
             moved = np.clip(theta + share * step, bounds[0], bounds[1])
             there, value = problem.solve(_spread_of(family, moved))
@@ -417,23 +542,67 @@ def _descended(problem: _Problem, family: str, theta: FloatArray, bounds: FloatA
     return theta, chi_square
 
 
-def _best(problem: _Problem, families: Sequence[str]) -> tuple[dict[str, _Candidate], str]:
-    """All families at their best, and the one of the highest evidence; the weights are its own."""
-    # the simplest and the most general family set the weights, which hardly depend on the rest
-    found = {family: _fitted(problem, family) for family in dict.fromkeys((families[0], families[-1]))}
-    for _ in range(_REWEIGHTED - 1):
-        best = min(found, key=lambda family: _criterion(problem, found[family]))
-        problem.reweight(found[best].spread, found[best].coefficients)
-        found = {best: _fitted(problem, best, start=found[best].theta)}
-    found = {family: _fitted(problem, family) for family in families}
-    lit = {family: item for family, item in found.items() if np.all(item.coefficients[: problem.groups] > 0)}
-    found = lit or found
-    return found, min(found, key=lambda family: _criterion(problem, found[family]))
+def _cores(problem: _Problem) -> dict[str, _Candidate]:
+    """Families without a tail at their best; the weights are those of the best spread."""
+    found: dict[str, _Candidate] = {}
+    for _ in range(_REWEIGHTED):
+        for family in (_SIMPLEST, _MOST_GENERAL):
+            found[family] = _fitted(problem, family, [found[family].theta] if family in found else _starts(family))
+        best = min(found.values(), key=lambda item: _criterion(problem, item))
+        problem.reweight(best.spread, best.coefficients)
+    return {family: _fitted(problem, family, _starts(family)) for family in _CORES}
 
 
 def _criterion(problem: _Problem, candidate: _Candidate) -> float:
-    """Schwarz's criterion (Ann. Stat. 6 (1978) 461): chi-square and ln n for each parameter of the spread."""
-    return candidate.chi_square + len(candidate.names) * math.log(max(problem.independent, 2.0))
+    """Schwarz's criterion (Ann. Stat. 6 (1978) 461): chi-square and ln n for each parameter of the core.
+
+    A tail is weighed by its prior instead: its share and reach are averaged over.
+    """
+    core = len(set(candidate.names) - set(_TAIL))
+    return candidate.chi_square + core * math.log(max(problem.independent, 2.0))
+
+
+def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _Candidate]]:
+    """Spreads with this core, without a tail and with tails of all reaches, orders and shares, each with its prior probability."""
+    yield _NO_TAIL, core
+    families = [family for family, (model, *_, names) in _FAMILIES.items() if set(names) == {*core.names, *_TAIL}]
+    for family in families:
+        names = _FAMILIES[family][2]
+        share_at, reach_at = names.index("tail_share"), names.index("log_tail_px")
+        starts = _starts(family)
+        for reach_px in _REACHES_PX:
+            for start in starts:
+                start[reach_at] = math.log(reach_px)
+            best = _fitted(problem, family, starts, fixed=("log_tail_px",))
+            variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
+            sd = min(max(math.sqrt(max(variance, 0.0)), _LEAST_SD), _MOST_SD)
+            shares = np.unique(np.clip(best.theta[share_at] + sd * np.array(_TAIL_STEPS), 0.0, 1.0))
+            widths = 0.5 * np.diff(shares, prepend=shares[0], append=shares[-1])
+            for share, width in zip(shares, widths[:-1] + widths[1:], strict=True):
+                density = (1.0 - _NO_TAIL) * _share_density(float(share))
+                mass = width * density / (len(families) * len(_REACHES_PX))
+                yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, float(share))
+            starts = [best.theta.copy()]
+
+
+def _share_density(share: float) -> float:
+    """Prior density of the share of the light that is in the tail."""
+    beta = _TAIL_SHARE_POWER * (1.0 - share) ** (_TAIL_SHARE_POWER - 1.0)
+    return float(_ANY_TAIL + (1.0 - _ANY_TAIL) * beta)
+
+
+def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
+    """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts."""
+    cores = _cores(problem)
+    collecting = [item for item in cores.values() if item.spread.model == "aperture"]
+    core = min(collecting, key=lambda item: _criterion(problem, item))
+    found = [(1.0, item) for item in cores.values() if item.spread.model != "aperture"]
+    found += _with_tails(problem, core)
+    lit = [(mass, item) for mass, item in found if mass > 0 and np.all(item.coefficients[: problem.groups] > 0)]
+    return [
+        (math.log(mass) - 0.5 * (_criterion(problem, item) - item.chi_square), item)
+        for mass, item in lit or [(1.0, core)]
+    ]
 
 
 def fit_spread(
@@ -441,18 +610,17 @@ def fit_spread(
     *,
     group: Sequence[int],
     most_read_DN2: float | None = None,
-    families: Sequence[str] = tuple(_FAMILIES),
 ) -> SpreadFit:
     """Spread, gains and read noise from the noise power of series (weighted least squares, weights from the fit itself).
 
-    Standard deviations hold: sampling; the misfit, by chi-square where it is above its expectation; what other families
-    say, by their evidence (model averaging); and for gains the second route, where it differs by more than its own noise.
+    The spread is the simplest of those that are likely and whose gains are near the mean of all. Standard deviations hold:
+    sampling; the misfit, by chi-square where it is above its expectation; what other spreads say, by their evidence (model
+    averaging); and for gains the second route, where it differs by more than its own noise.
 
     Args:
         series: noise powers, darks included (signal 0).
         group: per series, the index of its kV and filter; -1 for darks.
         most_read_DN2: read variance that the darks allow at most, where they were not repeated; 0: there is none.
-        families: kernel families to try.
 
     Raises:
         FitError: no series with signal, or the least-squares problem has no solution.
@@ -463,40 +631,35 @@ def fit_spread(
     if not any(index >= 0 for index in group):
         raise FitError("the noise fit needs at least one flat series with two or more frames")
     problem = _Problem(series, group, most_read_DN2)
-    found, best = _best(problem, families)
-    drifting = _drifting(problem, found[best])
+    members = _members(problem)
+    drifting = _drifting(problem, _likeliest(members))
     if drifting != problem.drifting:
         problem.drifting = drifting
-        found, best = _best(problem, families)
-    chosen = found[best]
+        members = _members(problem)
     groups = problem.groups
-    if not (np.all(np.isfinite(chosen.coefficients)) and np.any(chosen.coefficients[:groups] > 0)):
-        raise FitError("the noise power has no fit with quanta in it; look for saturated, constant or processed frames")
-    inflation = max(1.0, chosen.chi_square / problem.independent)
-    criteria = {family: _criterion(problem, item) for family, item in found.items()}
-    lowest = min(criteria.values())
-    weights = {family: math.exp(-0.5 * (value - lowest) / inflation) for family, value in criteria.items()}
-    total = sum(weights.values())
-
-    def gains_of(item: _Candidate) -> tuple[FloatArray, FloatArray]:
-        quantum, white = item.coefficients[:groups], item.coefficients[groups : 2 * groups]
-        return quantum + white, quantum * item.spread.variance_share + white
-
-    gain, slope = gains_of(chosen)
-    gain_variance, slope_variance = _variances(chosen, groups, inflation)
-    spread_variance = _spread_variances(chosen, inflation)
-    for family, item in found.items():
-        if family == best:
-            continue
-        share = weights[family] / total
-        other_gain, other_slope = gains_of(item)
+    least = _likeliest(members).chi_square
+    inflation = max(1.0, least / problem.independent)
+    logs = np.array([log_mass - 0.5 * (item.chi_square - least) / inflation for log_mass, item in members])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    candidates = [item for _, item in members]
+    chosen = _representative(candidates, weights, (least, inflation))
+    if not np.all(np.isfinite(chosen.coefficients)):
+        raise FitError("the noise power has no fit; look for saturated, constant or processed frames")
+    gain, slope = chosen.gains, chosen.slopes
+    gain_variance, slope_variance = np.zeros(groups), np.zeros(groups)
+    spread_variance = dict.fromkeys(_spread_variances(chosen, inflation), 0.0)
+    evidence: dict[str, float] = {}
+    for share, item in zip(weights, candidates, strict=True):
+        evidence[item.family] = evidence.get(item.family, 0.0) + float(share)
+        own_gain, own_slope = _variances(item, groups, inflation)
         # scales are averaged by their logarithms
-        gain_variance = gain_variance + share * (gain * _log_ratio(other_gain, gain)) ** 2
-        slope_variance = slope_variance + share * (slope * _log_ratio(other_slope, slope)) ** 2
-        for name in spread_variance:
+        gain_variance += share * (own_gain + (gain * _log_ratio(item.gains, gain)) ** 2)
+        slope_variance += share * (own_slope + (slope * _log_ratio(item.slopes, slope)) ** 2)
+        for name, own in _spread_variances(item, inflation).items():
             moved = getattr(item.spread, name) - getattr(chosen.spread, name)
-            if name != "tail_px" or min(item.spread.tail_share, chosen.spread.tail_share) > 0:
-                spread_variance[name] += share * moved**2
+            reach_of_none = name == "tail_px" and min(item.spread.tail_share, chosen.spread.tail_share) == 0
+            spread_variance[name] += float(share) * (own + (0.0 if reach_of_none else moved**2))
     expected = _expected(problem, chosen)
     other = _other_route(problem, chosen, expected)
     gain_variance = gain_variance + max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2) * gain**2
@@ -507,7 +670,7 @@ def fit_spread(
     excess[list(problem.drifting)] = chosen.coefficients[2 * groups + 1 :].reshape(-1, 2).sum(axis=1)
     return SpreadFit(
         spread=chosen.spread,
-        family=best,
+        family=chosen.family,
         spread_sd={name: math.sqrt(value) for name, value in spread_variance.items()},
         gain_DN=gain,
         gain_sd_DN=np.sqrt(gain_variance),
@@ -525,9 +688,38 @@ def fit_spread(
         degrees=problem.independent,
         excess_DN2=excess,
         other_route=other,
-        criteria={family: value - lowest for family, value in criteria.items()},
+        criteria={
+            family: -2.0 * math.log(max(value, 1e-300) / max(evidence.values())) for family, value in evidence.items()
+        },
         expected_DN2=expected,
+        quanta_DN2=_quanta(problem, chosen),
     )
+
+
+def _likeliest(members: Sequence[tuple[float, _Candidate]]) -> _Candidate:
+    """The spread of the least chi-square."""
+    return min((item for _, item in members), key=lambda item: item.chi_square)
+
+
+def _representative(
+    candidates: Sequence[_Candidate], weights: FloatArray, likelihood: tuple[float, float]
+) -> _Candidate:
+    """The spread with the fewest parameters of those that are likely and whose gains lie near the mean of all.
+
+    Args:
+        candidates: spreads.
+        weights: of each; they add up to 1.
+        likelihood: least chi-square, and what a chi-square is divided by.
+    """
+    least, inflation = likelihood
+    scale = np.array([float(np.mean(_log_ratio(item.gains, candidates[0].gains))) for item in candidates])
+    mean = float(weights @ scale)
+    sd = math.sqrt(float(weights @ (scale - mean) ** 2))
+    likely = [place for place, item in enumerate(candidates) if (item.chi_square - least) / inflation <= _AS_LIKELY]
+    near = [place for place in likely if abs(scale[place] - mean) <= _NEAR_THE_MEAN * sd]
+    if not near:
+        near = [min(likely, key=lambda place: abs(scale[place] - mean))]
+    return candidates[min(near, key=lambda place: (len(candidates[place].names), -weights[place]))]
 
 
 def _log_ratio(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -560,22 +752,13 @@ def _variances(item: _Candidate, groups: int, inflation: float) -> tuple[FloatAr
     """Sampling variances of gains and slopes (group,), DN^2."""
     size = len(item.covariance)
     linear = len(item.coefficients)
-    share = item.spread.variance_share
-    slopes = np.zeros(len(item.theta))
-    for place, name in enumerate(item.names):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = item.theta.copy()
-            moved[place] = np.clip(moved[place] + sign * 0.01, *_BOUNDS[name])
-            ends.append((moved[place], _spread_of(item.family, moved).variance_share))
-        slopes[place] = (ends[0][1] - ends[1][1]) / max(ends[0][0] - ends[1][0], 1e-9)
     gains, pixel = [], []
     for g in range(groups):
         direction = np.zeros(size)
         direction[g] = direction[groups + g] = 1.0
         gains.append(max(float(direction @ item.covariance @ direction), 0.0))
-        direction[g] = share
-        direction[linear:] = item.coefficients[g] * slopes
+        direction[g] = item.variance_share
+        direction[linear:] = item.coefficients[g] * item.share_slopes
         pixel.append(max(float(direction @ item.covariance @ direction), 0.0))
     return inflation * np.array(gains), inflation * np.array(pixel)
 
@@ -602,12 +785,23 @@ def _expected(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
     groups = problem.groups
     result = []
     for one, group in zip(problem.series, problem.group, strict=True):
-        power = np.full(one.power_DN2.shape, float(item.coefficients[2 * groups]))
+        power = float(item.coefficients[2 * groups]) * problem.electronic[one.square_px]
         if group >= 0:
             quantum, white = item.coefficients[group], item.coefficients[groups + group]
             power = power + one.signal_DN * (quantum * shapes[one.square_px] + white)
         result.append(power)
     return tuple(result)
+
+
+def _quanta(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
+    """Fitted power (K + 1, K + 1) of what follows the signal in each series, as no square has smeared it; 0 for darks."""
+    powers = {side: item.spread.noise_power(side) for side in problem.sides}
+    return tuple(
+        one.signal_DN * (item.coefficients[group] * powers[one.square_px] + item.coefficients[problem.groups + group])
+        if group >= 0
+        else np.zeros(one.power_DN2.shape)
+        for one, group in zip(problem.series, problem.group, strict=True)
+    )
 
 
 def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]) -> tuple[float, float]:
@@ -624,14 +818,15 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
             continue
         frequency = np.arange(power.shape[0]) / one.square_px
         square = frequency[:, None] ** 2 + frequency[None, :] ** 2
-        band = one.used & (square < _LOW_BAND**2) & (power > read)
+        electronic = read * problem.electronic[one.square_px]
+        band = one.used & (square < _LOW_BAND**2) & (power > electronic)
         if not band.any():
             continue
         excess = np.zeros(power.shape)
         if number in lit:
             place = 2 * problem.groups + 1 + 2 * lit.index(number)
             excess = np.tensordot(item.coefficients[place : place + 2], _slow(one.square_px), axes=1)
-        quanta = (power - read)[band]
+        quanta = (power - electronic)[band]
         values.append((one.power_DN2 - power - excess)[band] / quanta)
         weights.append(one.modes[band] * (quanta / power[band]) ** 2)
         grid = np.broadcast_arrays(frequency[:, None] ** 2, frequency[None, :] ** 2)

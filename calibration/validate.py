@@ -34,18 +34,22 @@ _COLOURS = {
     "extrapolated": "#d9822b",
     "left out": "#2e7d4f",
 }
+_WORDS = {True: "yes", False: "NO", None: "-"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidationRow:
-    """One flat series: measured and predicted detector-median level above dark and temporal noise of one pixel, DN."""
+    """One flat series: measured and predicted detector-median level above dark and temporal noise of one pixel, DN.
+
+    A single frame, averaged or not, shows no noise: its `measured_sd_DN` is None.
+    """
 
     series: str
     setting: Setting
     role: str
     used_in_calibration: bool
     measured_mean_DN: float
-    measured_sd_DN: float
+    measured_sd_DN: float | None
     predicted_mean_DN: Estimate
     predicted_sd_DN: Estimate
     extrapolated: bool
@@ -56,9 +60,23 @@ class ValidationRow:
         return self.predicted_mean_DN.low <= self.measured_mean_DN <= self.predicted_mean_DN.high
 
     @property
-    def inside_sd(self) -> bool:
-        """Measured noise inside the interval."""
+    def inside_sd(self) -> bool | None:
+        """Measured noise inside the interval; None where none was measured."""
+        if self.measured_sd_DN is None:
+            return None
         return self.predicted_sd_DN.low <= self.measured_sd_DN <= self.predicted_sd_DN.high
+
+    @property
+    def mean_error_percent(self) -> float:
+        """Predicted level over the measured one, less 1."""
+        return 100.0 * (self.predicted_mean_DN.value / self.measured_mean_DN - 1.0)
+
+    @property
+    def sd_error_percent(self) -> float | None:
+        """Predicted noise over the measured one, less 1; None where none was measured."""
+        if self.measured_sd_DN is None:
+            return None
+        return 100.0 * (self.predicted_sd_DN.value / self.measured_sd_DN - 1.0)
 
     def as_dict(self) -> dict[str, Any]:
         """A row of `raytwin validate --json`."""
@@ -74,8 +92,8 @@ class ValidationRow:
             "measured_sd_DN": self.measured_sd_DN,
             "mean_DN": self.predicted_mean_DN.as_dict(),
             "sd_DN": self.predicted_sd_DN.as_dict(),
-            "mean_error_percent": 100.0 * (self.predicted_mean_DN.value / self.measured_mean_DN - 1.0),
-            "sd_error_percent": 100.0 * (self.predicted_sd_DN.value / self.measured_sd_DN - 1.0),
+            "mean_error_percent": self.mean_error_percent,
+            "sd_error_percent": self.sd_error_percent,
             "inside": {"mean": self.inside_mean, "sd": self.inside_sd},
             "extrapolated": self.extrapolated,
         }
@@ -165,9 +183,9 @@ class Validation(Result):
             (
                 row.series,
                 str(row.setting),
-                f"{100.0 * (row.predicted_mean_DN.value / row.measured_mean_DN - 1.0):+.2f}",
-                f"{100.0 * (row.predicted_sd_DN.value / row.measured_sd_DN - 1.0):+.2f}",
-                f"{'yes' if row.inside_mean else 'NO'}/{'yes' if row.inside_sd else 'NO'}",
+                f"{row.mean_error_percent:+.2f}",
+                "-" if row.sd_error_percent is None else f"{row.sd_error_percent:+.2f}",
+                f"{'yes' if row.inside_mean else 'NO'}/{_WORDS[row.inside_sd]}",
             )
             for row in self.rows
         ]
@@ -176,11 +194,10 @@ class Validation(Result):
         if self.rows:
             found = _summary(self.rows)
             error, share = found["median_abs_error_percent"], found["coverage"]
-            notes.insert(
-                0,
-                f"median error: level {error['mean']:.2f} %, noise {error['sd']:.2f} %; inside the interval: level"
-                f" {100 * share['mean']:.0f} %, noise {100 * share['sd']:.0f} %",
-            )
+            line = f"level: median error {error['mean']:.2f} %, inside the interval {100 * share['mean']:.0f} %"
+            if error["sd"] is not None:
+                line += f"; noise: {error['sd']:.2f} %, {100 * share['sd']:.0f} %"
+            notes.insert(0, line)
         return Table(
             title=title,
             header=("series", "setting", "level, %", "noise, %", "inside"),
@@ -190,13 +207,16 @@ class Validation(Result):
 
 
 def _summary(rows: Sequence[ValidationRow]) -> dict[str, Any]:
-    errors = [abs(row.predicted_mean_DN.value / row.measured_mean_DN - 1.0) for row in rows]
-    noise = [abs(row.predicted_sd_DN.value / row.measured_sd_DN - 1.0) for row in rows]
+    with_noise = [row for row in rows if row.sd_error_percent is not None]
+    noise = [abs(row.sd_error_percent or 0.0) for row in with_noise]
     return {
-        "median_abs_error_percent": {"mean": 100.0 * float(np.median(errors)), "sd": 100.0 * float(np.median(noise))},
+        "median_abs_error_percent": {
+            "mean": float(np.median([abs(row.mean_error_percent) for row in rows])),
+            "sd": float(np.median(noise)) if noise else None,
+        },
         "coverage": {
             "mean": float(np.mean([row.inside_mean for row in rows])),
-            "sd": float(np.mean([row.inside_sd for row in rows])),
+            "sd": float(np.mean([bool(row.inside_sd) for row in with_noise])) if with_noise else None,
             "rows": len(rows),
         },
     }
@@ -255,8 +275,7 @@ def validate_twin(
             continue
         total = sum_frames(item.iter_frames(), name=f"series {item.name}")
         if total.frames < 2:
-            skipped.append(f"{item.name}: a single frame has no noise")
-            continue
+            skipped.append(f"{item.name}: a single frame has no noise, its level alone is compared")
         if "offset" in item.corrected:
             dark: Any = 0.0
         else:
@@ -270,10 +289,12 @@ def validate_twin(
                 continue
         signal = total.mean_DN - dark
         mean = float(np.median(signal[good]))
-        variance = float(np.mean(total.pair_variance_DN2[good]))
-        if not (mean > 0 and variance > 0):
-            nothing = "no signal above dark" if variance > 0 else "all frames alike: copies, or no noise"
-            skipped.append(f"{item.name}: {nothing}")
+        repeated = total.frames > 1
+        variance = float(np.mean(total.pair_variance_DN2[good])) if repeated else None
+        if mean <= 0 or variance == 0:
+            skipped.append(
+                f"{item.name}: {'no signal above dark' if variance != 0 else 'all frames alike: copies, or no noise'}"
+            )
             continue
         try:
             predicted = predict_flatfield(twin, setting, after_calibration=not seen)
@@ -284,13 +305,13 @@ def validate_twin(
         pixels = int(good.sum())
         # quantum noise is correlated: the mean over pixels carries gain, not slope
         spread = predicted.gain_DN.value * mean / item.averaged + twin.noise.read_variance_DN2 / item.averaged
-        mean_sd = math.sqrt(max(spread, variance) / total.frames / pixels) * 1.2533
-        # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
-        quantum = (
-            min(max(1.0 - twin.noise.read_variance_DN2 / item.averaged / variance, 0.0), 1.0) if variance > 0 else 0.0
-        )
-        shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
-        noise_sd = math.sqrt(0.5 * variance * shared / (effective_frames(total.frames) * pixels))
+        mean_sd = math.sqrt(max(spread, variance or 0.0) / total.frames / pixels) * 1.2533
+        noise_sd = 0.0
+        if variance is not None:
+            # neighbours share quantum noise, so a variance over pixels counts fewer of them: by the sum of squared correlations
+            quantum = min(max(1.0 - twin.noise.read_variance_DN2 / item.averaged / variance, 0.0), 1.0)
+            shared = 1.0 + quantum**2 * (squared_correlations - 1.0)
+            noise_sd = math.sqrt(0.5 * variance * shared / (effective_frames(total.frames) * pixels))
         rows.append(
             ValidationRow(
                 series=item.name,
@@ -298,7 +319,7 @@ def validate_twin(
                 role=item.role or "",
                 used_in_calibration=seen,
                 measured_mean_DN=mean,
-                measured_sd_DN=math.sqrt(variance),
+                measured_sd_DN=None if variance is None else math.sqrt(variance),
                 predicted_mean_DN=_widened(predicted.mean_DN, mean_sd),
                 predicted_sd_DN=_widened(predicted.sd_DN, noise_sd),
                 extrapolated=predicted.extrapolated,
@@ -477,7 +498,9 @@ def _compared(result: Validation) -> dict[str, list[tuple[str, float, Estimate, 
     """Quantity -> (name, measured, predicted, kind) of each row that has it."""
     groups: dict[str, list[tuple[str, float, Estimate, str]]] = {}
 
-    def add(what: str, name: str, measured: float, predicted: Estimate, kind: str) -> None:
+    def add(what: str, name: str, measured: float | None, predicted: Estimate, kind: str) -> None:
+        if measured is None:
+            return
         groups.setdefault(what, []).append((name, measured, predicted, kind))
 
     for row in result.rows:

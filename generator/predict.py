@@ -111,9 +111,21 @@ def binned_over_single(twin: Twin, binning: int) -> float:
     return (spread.binned_variance_share(binning) + white) / (spread.variance_share + white)
 
 
-def _slope_share_sd(twin: Twin) -> float:
+def _restored_sd(twin: Twin) -> float:
+    """Relative standard deviation of what restoring the spread does to all gains alike: what they are known less by than slopes."""
+    excess = [
+        _relative_sd(level.gain_DN) ** 2 - _relative_sd(level.photon_transfer_slope_DN) ** 2
+        for level in twin.levels
+        if level.gain_DN.value > 0 and level.photon_transfer_slope_DN.value > 0
+    ]
+    if excess:
+        return math.sqrt(max(float(np.median(excess)), 0.0))
     ends = [spread.variance_share for spread in twin.noise.spread.ends()]
-    return abs(ends[0] - ends[1]) / (2 * 1.959964)
+    return abs(ends[0] - ends[1]) / (2 * 1.959964) / slope_share(twin)
+
+
+def _relative_sd(estimate: Estimate) -> float:
+    return (estimate.high - estimate.low) / (2 * 1.959964) / estimate.value
 
 
 def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float) -> Estimate:
@@ -310,7 +322,7 @@ def _by_model(
     widen = math.sqrt(1.0 + len(outside))
     level_sd = widen * posterior.level_discrepancy
     gain_sd = widen * posterior.gain_discrepancy
-    share = slope_share(twin)
+    share, restored_sd = slope_share(twin), _restored_sd(twin)
     # level and gain are known together, not one by one: their product draw by draw
     own_share = slope_over_gain(twin.levels, twin.noise, signal.gain_DN)
     at_object_mm = twin.instrument.source_object_mm
@@ -319,10 +331,11 @@ def _by_model(
         at_object_mm = distance_mm
     return _Flat(
         mean_DN=_estimate_from_draws(rate_draws, level_sd),
-        gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, _slope_share_sd(twin) / share)),
+        gain_DN=_estimate_from_draws(signal.gain_DN, math.hypot(gain_sd, restored_sd)),
         quantum_DN2=signal.gain_DN * (share if own_share is None else own_share) * rate_draws,
         quantum_sd=math.hypot(level_sd, gain_sd),
-        photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, level_sd),
+        # photons are counted by the gain: what it is known less by, they are as well
+        photons=_estimate_from_draws(signal.absorbed_per_mAs * load_mAs * factor, math.hypot(level_sd, restored_sd)),
         kerma_uGy=_estimate_from_draws(
             signal.kerma_uGy_per_mAs * load_mAs * (1000.0 / at_object_mm) ** 2,
             level_sd if posterior.kerma_discrepancy is None else widen * posterior.kerma_discrepancy,

@@ -5,9 +5,12 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.setting import text_from_filters
+from ..materials import material_from_name, mu_per_mm
 from ..results import Table, interval_text
 from .tube_twin import TubeTwin
-from .twin import Estimate, SpreadEstimate, Twin
+from .twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
+
+_EQUIVALENT_KEV = 30.0
 
 
 def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
@@ -36,7 +39,7 @@ def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
     filtration = flux = None
     warnings = list(twin.warnings)
     if spectral is not None:
-        filtration = spectral.interval("inherent_filtration_mm_Al")
+        filtration = equivalent_filtration(spectral)
         if any(level.rate_DN_per_mAs for level in twin.levels):
             flux = _output_scale(twin)
     if twin.noise.spread.gaussian_px is None:
@@ -116,6 +119,36 @@ def twin_table(twin: Twin) -> Table:
     return Table(title=title, header=("", "value", "95 % interval", "unit"), rows=tuple(rows), notes=tuple(notes))
 
 
+def equivalent_filtration(spectral: SpectralPosterior, *, seen_by_detector: bool = True) -> Estimate:
+    """Filtration that nobody declared, as mm of aluminium: aluminium itself, the metal of a rough anode, the detector's cover.
+
+    Measurements tell the sum of these, hardly its parts. Layers count by their attenuation at 30 keV, where a beam of 40 to
+    60 kV behind thin filters has its mean energy.
+
+    Args:
+        spectral: the posterior of a line or of a tube.
+        seen_by_detector: False: without the detector's cover, which a dosimeter does not see.
+
+    Returns:
+        Median and 95 % interval, mm Al.
+    """
+    layers = [("anode_roughness_um", spectral.anode, 1e-3)]
+    if seen_by_detector:
+        layers.append(("cover_mm_C", "C", 1.0))
+    total = spectral.column("inherent_filtration_mm_Al").copy()
+    for name, material, unit_mm in layers:
+        if name in spectral.names:
+            total += unit_mm * _attenuation_over_aluminium(material) * spectral.column(name)
+    low, middle, high = np.quantile(total, [0.025, 0.5, 0.975])
+    return Estimate(value=float(middle), low=float(low), high=float(high))
+
+
+def _attenuation_over_aluminium(material: str) -> float:
+    """Linear attenuation of a material over that of aluminium at 30 keV."""
+    own, aluminium = (float(mu_per_mm(material_from_name(name), _EQUIVALENT_KEV)) for name in (material, "Al"))
+    return own / aluminium
+
+
 def _output_scale(twin: Twin | TubeTwin) -> Estimate | None:
     """Output of the tube over the spectrum model's."""
     if twin.spectral is None:
@@ -132,7 +165,7 @@ def _tube_answer(twin: TubeTwin) -> dict[str, Any]:
         "spread": None,
         "read_noise_DN": None,
         "dark_DN": None,
-        "inherent_filtration_mm_Al": twin.spectral.interval("inherent_filtration_mm_Al").as_dict(),
+        "inherent_filtration_mm_Al": equivalent_filtration(twin.spectral, seen_by_detector=False).as_dict(),
         "flux_scale": None if flux is None else flux.as_dict(),
         "levels": [],
         "bad_pixels": None,

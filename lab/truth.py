@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting, text_from_filters
 from .attenuation import mu_per_mm
@@ -37,6 +38,13 @@ def aluminium_equivalent_mm(system: LabSystem) -> float:
     return float(total / mu_per_mm("Al", energy_keV)[0])
 
 
+def electronic_noise_DN(system: LabSystem, read_noise_DN: NDArray[np.float32]) -> float:
+    """Temporal noise of a pixel's electronics (median of pixels (n,) or (row, column)), with what its row and column share."""
+    sizes = system.unkindness
+    lines = 1.0 + sizes.row_noise_sigma**2 + sizes.column_noise_sigma**2
+    return float(np.median(read_noise_DN)) * math.sqrt(lines)
+
+
 def flat_truth(system: LabSystem, maps: DetectorMaps, setting: Setting) -> dict[str, float]:
     """Expected flatfield at a setting, detector median over good pixels.
 
@@ -59,7 +67,7 @@ def flat_truth(system: LabSystem, maps: DetectorMaps, setting: Setting) -> dict[
     gain = gain_DN(system, level, DN_per_electron=conversion)
     slope = (gain - conversion) * noise_shares(system) + conversion
     dark_variance_DN2 = (
-        float(np.median(maps.read_noise_DN)) ** 2
+        electronic_noise_DN(system, maps.read_noise_DN) ** 2
         + conversion * float(np.median(maps.dark_current_DN_per_ms)) * setting.exposure_ms
         + 1.0 / 12.0
     )
@@ -147,9 +155,10 @@ def compute_truth(system: LabSystem, *, settings: Iterable[Setting], exposures_m
             {"lag_row": row, "lag_column": column, "value": noise_shares(system, row, column) / noise_shares(system)}
             for row, column in ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0))
         ],
-        "read_noise_DN": float(np.median(maps.read_noise_DN[good])),
+        # of one pixel: what its row and its column share is part of it
+        "read_noise_DN": electronic_noise_DN(system, maps.read_noise_DN[good]),
         # What a dark series shows: electronic noise and the rounding of the ADC.
-        "dark_sd_DN": math.sqrt(float(np.median(maps.read_noise_DN[good])) ** 2 + 1.0 / 12.0),
+        "dark_sd_DN": math.sqrt(electronic_noise_DN(system, maps.read_noise_DN[good]) ** 2 + 1.0 / 12.0),
         "dark_DN": float(np.median(maps.dark_DN[good])),
         "dark_current_DN_per_ms": float(np.median(maps.dark_current_DN_per_ms[good])),
         "dark_DN_at": [

@@ -2,12 +2,13 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
-from raytwin.acquisition import open_acquisition
+from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.cli import main
@@ -72,6 +73,32 @@ def test_held_back_settings_are_predicted_within_their_intervals(session):
         assert prediction.mean_DN.value == pytest.approx(expected["mean_DN"], rel=0.06)
         assert prediction.gain_DN.value == pytest.approx(expected["gain_DN"], rel=0.05)
         assert prediction.photons_absorbed.low < expected["photons_absorbed"] < prediction.photons_absorbed.high
+
+
+def test_a_single_averaged_flat_is_compared_by_its_level_alone(session, tmp_path, capsys):
+    path = tmp_path / "averages.h5"
+    with open_acquisition(session["path"]) as acquisition, write_acquisition(path, acquisition.instrument) as writer:
+        for item in acquisition.series:
+            if item.kind == "dark" or item.role == "evaluation":
+                frames = np.concatenate(list(item.iter_frames()))
+                mean = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
+                writer.add_series(
+                    item.name,
+                    kind=item.kind,
+                    role=item.role,
+                    setting=replace(item.setting, averaged=len(frames)) if item.setting else None,
+                    exposure_ms=None if item.setting else item.exposure_ms,
+                    frames=mean[None],
+                )
+    with open_acquisition(path) as acquisition:
+        single = validate_twin(session["twin"], acquisition)
+    for row, whole in zip(single.rows, session["validation"].rows, strict=True):
+        assert row.measured_mean_DN == pytest.approx(whole.measured_mean_DN, rel=1e-4)
+        assert row.measured_sd_DN is None and row.inside_sd is None
+    assert single.to_dict()["median_abs_error_percent"]["sd"] is None
+    session["twin"].save(tmp_path / "twin.h5")
+    assert main(["validate", str(tmp_path / "twin.h5"), str(path)]) == 0
+    assert "yes/-" in capsys.readouterr().out
 
 
 def test_the_spectral_posterior_names_what_flats_leave_open(session):

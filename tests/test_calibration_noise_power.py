@@ -134,9 +134,9 @@ def test_single_averaged_flats_at_two_levels_hold_the_noise_of_one_exposure():
 
 def test_correlation_of_neighbours_is_that_of_the_spread_and_its_interval_holds_it():
     found = compute_noise_power([frames_of(20)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
-    fitted = GAIN * SIGNAL * SPREAD.noise_power(found.square_px) + READ_DN2
+    quanta = GAIN * SIGNAL * SPREAD.noise_power(found.square_px)
     rho = SPREAD.noise_autocovariance(2) / SPREAD.variance_share
-    for row in correlation_of_quanta([found], [fitted], white_DN2=READ_DN2):
+    for row in correlation_of_quanta([found], [smeared(quanta) + READ_DN2], [quanta]):
         true = rho[2 + row["lag_row"], 2 + row["lag_column"]]
         assert abs(row["value"] - true) < 2.0 * (row["high"] - row["low"])
         assert row["high"] - row["low"] < 0.03

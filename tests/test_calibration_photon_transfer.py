@@ -82,11 +82,16 @@ def clean(tmp_path_factory):
     return transfer_of(write_session(tmp_path_factory.mktemp("session") / "clean.h5"))
 
 
+def is_gain(estimate):
+    """Frames of 48 x 48 pixels show a tail of the spread hardly; half of 95 % is a tenth."""
+    return estimate.low < GAIN < estimate.high and abs(estimate.value / GAIN - 1.0) < 0.1
+
+
 def test_a_clean_session_gives_its_truth_and_no_warning(clean):
     assert clean.warnings == ()
     (level,) = clean.levels
     assert level.gain_DN.low < GAIN < level.gain_DN.high
-    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    assert is_gain(level.gain_DN)
     slope = GAIN * (blur_variance_share("aperture", SIGMA) + WHITE) / (1 + WHITE)
     assert level.photon_transfer_slope_DN.value == pytest.approx(slope, rel=0.03)
     assert clean.noise.spread.value.sigma_px == pytest.approx(SIGMA, rel=0.03)
@@ -123,7 +128,7 @@ def test_a_drifting_tube_shows_in_the_stack_variance_and_not_in_the_gain(tmp_pat
     assert found.evidence["stack_over_pair_variance"] > 1.02
     assert any("drifts or frames are correlated" in line for line in found.warnings)
     assert found.evidence["drift_percent_per_series"]["flat_40W"] == pytest.approx(4.0, abs=0.3)
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    assert is_gain(found.levels[0].gain_DN)
 
 
 def test_lag_shows_as_stack_variances_above_pair_variances(tmp_path):
@@ -150,7 +155,7 @@ def test_output_noise_from_frame_to_frame_is_named_with_its_size(tmp_path):
     assert any("tube output varies by" in line for line in found.warnings)
     level = found.levels[0]
     assert level.gain_DN.low < GAIN < level.gain_DN.high
-    assert level.gain_DN.value == pytest.approx(GAIN, rel=0.06)
+    assert is_gain(level.gain_DN)
 
 
 def test_a_nonlinear_detector_departs_from_the_line_in_load(tmp_path):
@@ -171,14 +176,14 @@ def test_a_flat_above_full_well_is_left_out_and_named(tmp_path):
 
     found = planted(tmp_path, clip)
     assert any("left out of the fit: flat_40W (its variance bends" in line for line in found.warnings)
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+    assert is_gain(found.levels[0].gain_DN)
 
 
 def test_a_saturated_series_is_masked_with_a_warning_and_its_level(tmp_path):
     found = planted(tmp_path, lambda frames, setting, rng: frames, powers=(0.5, 2.0, 5.0, 10.0, 45.0), bits=12)
     assert any("left out of the fit: flat_45W (saturated at 4095 DN)" in line for line in found.warnings)
     assert found.levels[0].saturation_DN == 4095.0
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.08)
+    assert is_gain(found.levels[0].gain_DN)
     assert [point.series for point in found.points if not point.used] == ["flat_45W"]
 
 
@@ -198,7 +203,7 @@ def test_bad_pixels_are_found_with_their_reasons(tmp_path):
         assert found.maps.bad_pixels[place] == BAD_PIXEL_CODES[reason], reason
     assert int(np.sum(found.maps.bad_pixels > 0)) == 4
     assert bad_pixel_counts(found)["dead"] == 1
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.03)
+    assert is_gain(found.levels[0].gain_DN)
 
 
 def test_gain_map_of_a_uniform_detector_is_flat_and_of_two_halves_is_not(tmp_path, clean):
@@ -242,7 +247,7 @@ def test_without_kV_there_are_gain_and_noise_but_no_spectral_part(tmp_path):
             writer.add_series(f"flat_{level:g}", kind="flat", frames=as_adc(flat_frames(level, rng=rng)))
     with open_acquisition(path) as acquisition:
         answer = calibration_answer(calibrate_twin(acquisition, rng=np.random.default_rng(0)))
-    assert answer["levels"][0]["gain_DN"] == pytest.approx(GAIN, rel=0.04)
+    assert answer["levels"][0]["gain_DN"] == pytest.approx(GAIN, rel=0.1)
     assert answer["inherent_filtration_mm_Al"] is None
     assert answer["flux_scale"] is None
     assert any("no series states its kV" in line for line in answer["warnings"])
@@ -261,7 +266,7 @@ def test_averaged_frames_give_the_gain_of_single_ones(tmp_path):
         for level in (300.0, 3000.0):
             writer.add_series(f"f{level:g}", kind="flat", frames=mean_of_four(level), exposure_ms=20.0, averaged=4)
     found = transfer_of(path)
-    assert found.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.04)
+    assert is_gain(found.levels[0].gain_DN)
     assert found.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.03)
 
 

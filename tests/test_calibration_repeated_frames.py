@@ -156,7 +156,7 @@ def test_behind_objects_the_gain_is_harder_and_its_interval_says_so(tmp_path):
     (row,) = covered.evidence["repeated_frames"]
     assert row["where"] == "behind objects"
     (level,) = covered.levels
-    assert level.gain_DN.value == pytest.approx(HARDER * GAIN, rel=0.08)
+    assert level.gain_DN.low < HARDER * GAIN < level.gain_DN.high
     assert level.gain_DN.high - level.gain_DN.low > 2.0 * 1.96 * 0.03 * level.gain_DN.value
 
 

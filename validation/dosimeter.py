@@ -35,6 +35,7 @@ from raytwin.calibration.output_table import OutputTable, read_output_table
 from raytwin.calibration.transmission_table import read_transmission_table
 from raytwin.calibration.tube import calibrate_tube, predict_ratio
 from raytwin.generator.tube_twin import TubeTwin, predict_spectrum, predict_tube
+from raytwin.generator.twin_answer import equivalent_filtration
 from raytwin.lab.attenuation import mu_per_mm
 from raytwin.lab.tube import beam
 from raytwin.materials import mass_energy_absorption_cm2_g, material_from_name
@@ -83,6 +84,12 @@ def draw_system(seed: int, family: str) -> System:
         scatter=rng.uniform(0.002, 0.02),
         digits=int(rng.integers(3, 5)),
     )
+
+
+def equivalent_mm(system: System) -> float:
+    """Filtration with the worn anode's own metal, mm of aluminium at 30 keV."""
+    tungsten, aluminium = (float(mu_per_mm(name, np.array([30.0]))[0]) for name in ("W", "Al"))
+    return system.filtration_mm_Al + 1e-3 * system.tungsten_um * tungsten / aluminium
 
 
 class Truth:
@@ -183,8 +190,8 @@ def measure_system(seed: int, family: str, protocols: Sequence[str] = PROTOCOLS)
 
         yield row(
             "inherent_filtration_mm_Al",
-            truth.system.filtration_mm_Al,
-            twin.spectral.interval("inherent_filtration_mm_Al"),
+            equivalent_mm(truth.system),
+            equivalent_filtration(twin.spectral, seen_by_detector=False),
         )
         for kV, filters in UNMEASURED:
             layers = filters_from_text(filters)

@@ -107,11 +107,12 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"{'setting':<52} {'mean DN':>9} {'predicted (95 %)':>28} {'sd DN':>8} {'predicted (95 %)':>26}  inside"]
     for row in rows:
         mean, sd = row["mean_DN"], row["sd_DN"]
-        inside = ("yes" if row["inside"]["mean"] else "NO") + "/" + ("yes" if row["inside"]["sd"] else "NO")
+        inside = "/".join({True: "yes", False: "NO", None: "-"}[row["inside"][name]] for name in ("mean", "sd"))
+        measured_sd = "-" if row["measured_sd_DN"] is None else f"{row['measured_sd_DN']:.2f}"
         lines.append(
             f"{row['setting']:<52} {row['measured_mean_DN']:9.1f} "
             f"{mean['value']:9.1f} ({mean['low']:.1f}-{mean['high']:.1f})".ljust(90)
-            + f" {row['measured_sd_DN']:8.2f} {sd['value']:8.2f} ({sd['low']:.2f}-{sd['high']:.2f})".ljust(36)
+            + f" {measured_sd:>8} {sd['value']:8.2f} ({sd['low']:.2f}-{sd['high']:.2f})".ljust(36)
             + f"  {inside}"
         )
     return lines
@@ -119,7 +120,9 @@ def _table(rows: list[dict[str, Any]]) -> list[str]:
 
 def _summary(result: dict[str, Any]) -> str:
     error, coverage = result["median_abs_error_percent"], result["coverage"]
-    return (
-        f"median error: mean {error['mean']:.2f} %, sd {error['sd']:.2f} %; inside the interval: mean"
-        f" {100 * coverage['mean']:.0f} %, sd {100 * coverage['sd']:.0f} % of {coverage['rows']} series"
-    )
+    parts = [
+        f"{name}: median error {error[name]:.2f} %, inside the interval {100 * coverage[name]:.0f} %"
+        for name in ("mean", "sd")
+        if error[name] is not None
+    ]
+    return f"{'; '.join(parts)} ({coverage['rows']} series)"

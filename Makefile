@@ -1,5 +1,6 @@
 # make demo   the main job end to end, report in demo/report.html
 # make test   the default test suite (under 10 minutes on 2 cores)
+# make docs   the documentation site, tutorials executed, in docs/_build/html (extra `docs`)
 # make check  lint, types, import directions (fast)
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -19,6 +20,17 @@ $(READY): pyproject.toml
 
 demo: $(READY)
 	$(BIN)/raytwin demo -o demo
+
+DOCS_READY := $(VENV)/.docs-ready
+
+$(DOCS_READY): $(READY) pyproject.toml
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	touch $(DOCS_READY)
+
+# a warning is an error; a notebook that fails stops the build
+docs: $(DOCS_READY)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
 
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow'
@@ -95,4 +107,4 @@ format: $(READY)
 	$(BIN)/ruff format src $(ROOMS) tests validation benchmarks
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo
+	rm -rf $(VENV) build dist *.egg-info demo docs/_build docs/generated docs/jupyter_execute

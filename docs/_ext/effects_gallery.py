@@ -36,7 +36,9 @@ def example_scene(shape: tuple[int, int]) -> dict[str, np.ndarray]:
     dome = 1.0 - ((row - 0.58 * size) / (0.36 * size)) ** 2 - ((column - 0.42 * size) / (0.34 * size)) ** 2
     plate = np.clip(column - 0.80 * size - 0.08 * (row - size / 2), 0.0, 1.0)
     disc = np.clip(0.09 * size - np.hypot(row - 0.13 * size, column - 0.35 * size) + 0.5, 0.0, 1.0)
-    bone = np.clip(2.5 - np.abs(row - 0.55 * size - 0.25 * (column - 0.4 * size)), 0.0, 2.0) * (np.abs(column - 0.4 * size) < 0.16 * size)
+    bone = np.clip(2.5 - np.abs(row - 0.55 * size - 0.25 * (column - 0.4 * size)), 0.0, 2.0) * (
+        np.abs(column - 0.4 * size) < 0.16 * size
+    )
     return {
         "chicken_breast": 25.0 * np.sqrt(np.clip(dome, 0.0, None)),
         "bone_cortical_icru44": bone * (dome > 0.1),
@@ -62,7 +64,9 @@ def example_series(shape: tuple[int, int]) -> dict[str, Any]:
 
     common = {"frames": FRAMES, "frame_interval_ms": 60.0, "start_s": 540.0, "index": 9}
     settings = {
-        kV: setting_from_text(f"kv={kV},power_w={power_W},exposure_ms=50,filter=Cu:0.05,source_detector_mm={SOURCE_DETECTOR_MM:g}")
+        kV: setting_from_text(
+            f"kv={kV},power_w={power_W},exposure_ms=50,filter=Cu:0.05,source_detector_mm={SOURCE_DETECTOR_MM:g}"
+        )
         for kV, power_W in ((40, 8), (90, 1.5))
     }
     scene = {
@@ -73,9 +77,12 @@ def example_series(shape: tuple[int, int]) -> dict[str, Any]:
         "source_object_mm": SOURCE_OBJECT_MM,
         "source_detector_mm": SOURCE_DETECTOR_MM,
     }
-    lit = {kV: SeriesRequest(kind="flat", setting=setting, exposure_ms=50.0, **common) for kV, setting in settings.items()}
+    lit = {
+        kV: SeriesRequest(kind="flat", setting=setting, exposure_ms=50.0, **common) for kV, setting in settings.items()
+    }
     objects = {
-        kV: SeriesRequest(kind="object", setting=setting, exposure_ms=50.0, **common, **scene) for kV, setting in settings.items()
+        kV: SeriesRequest(kind="object", setting=setting, exposure_ms=50.0, **common, **scene)
+        for kV, setting in settings.items()
     }
     before = replace(objects[90], start_s=540.0 - 0.06 * FRAMES, index=8)
     return {
@@ -201,11 +208,18 @@ def parameter_rows(effect: Any) -> str:
     return "\n".join(rows)
 
 
+def overview_row(effect: Any) -> str:
+    """An effect in the table at the top of the page."""
+    strength = effect.strength
+    link = f"[`{effect.id}`](#effect-{effect.id})"
+    return f"| {link} | {effect.title} | {strength.unit} | {strength.low:g} to {strength.high:g} |"
+
+
 def effects_page(folder: Path) -> None:
     """Write the gallery's page and figures."""
-    from raytwin.generator.effects import EFFECTS
-
     from raytwin_pages import write_if_changed
+
+    from raytwin.generator.effects import EFFECTS
 
     laws = tomllib.loads(LAWS.read_text(encoding="utf-8"))
     twin = example_line()
@@ -213,17 +227,14 @@ def effects_page(folder: Path) -> None:
     usual = without_effects(twin, series)
     parts = [
         "# Gallery of effects",
-        "Every effect that the twin can carry and `raytwin diagnose` can name. Each is one change of the forward model at one stage of the"
-        " line. `raytwin lab --effect ID=STRENGTH` plants the same effects in virtual measurements, with other laws.",
+        "Every effect that the twin can carry and `raytwin diagnose` can name. Each is one change of the forward model at one"
+        " stage of the line. `raytwin lab --effect ID=STRENGTH` plants the same effects in virtual measurements, with other laws.",
         "The pictures show a line with pixels of 0.15 mm and a magnification of 1.5. Of six series the one is drawn that the effect"
         f" changes most. Maps show the mean of {FRAMES} frames less what the twin without the effect expects, in standard deviations"
         " of that mean, on a scale that is logarithmic beyond 3. The histogram holds differences of successive frames, which show"
         " noise and codes alone. Each picture states its strength.",
         "| effect | what it is | strength | range |\n|---|---|---|---|\n"
-        + "\n".join(
-            f"| [`{effect.id}`](#effect-{effect.id}) | {effect.title} | {effect.strength.unit} | {effect.strength.low:g} to {effect.strength.high:g} |"
-            for effect in EFFECTS.values()
-        ),
+        + "\n".join(map(overview_row, EFFECTS.values())),
     ]
     for effect in EFFECTS.values():
         words, found = signature(twin, series, usual, effect)

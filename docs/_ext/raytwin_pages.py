@@ -15,7 +15,13 @@ DOCS = Path(__file__).parents[1]
 ROOT = DOCS.parent
 GENERATED = DOCS / "generated"
 # page of the root -> its page of the site
-OF_THE_ROOT = {"LIMITS.md": "limits", "VALIDATION.md": "validation", "CHANGELOG.md": "changelog", "ARCHITECTURE.md": "architecture"}
+OF_THE_ROOT = {
+    "LIMITS.md": "limits",
+    "VALIDATION.md": "validation",
+    "CHANGELOG.md": "changelog",
+    "ARCHITECTURE.md": "architecture",
+    "CONTRIBUTING.md": "contributing",
+}
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)\s]+)\)")
 
 
@@ -59,7 +65,11 @@ def with_site_links(text: str, *, page: Path) -> str:
         label, target = match[1], match[2]
         if target.startswith(("http:", "https:", "mailto:", "#", "/")) or site_link(target, page=page) is not None:
             return match[0]
-        return label if label.startswith("`") else f"{label} (`{(page.parent / target).resolve().relative_to(ROOT).as_posix()}`)"
+        return (
+            label
+            if label.startswith("`")
+            else f"{label} (`{(page.parent / target).resolve().relative_to(ROOT).as_posix()}`)"
+        )
 
     return LINK.sub(replaced, re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", named, text))
 
@@ -77,8 +87,8 @@ def commands_page() -> None:
 
     parts = [
         "# Commands",
-        "`raytwin COMMAND --help` prints what stands here. Commands exit with 0 on success, with 2 and one line on bad input, and with 1 on"
-        " an internal failure. `--json` prints the answer as JSON on standard output.",
+        "`raytwin COMMAND --help` prints what stands here. Commands exit with 0 on success, with 2 and one line on bad input,"
+        " and with 1 on an internal failure. `--json` prints the answer as JSON on standard output.",
         "| command | does |\n|---|---|\n"
         + "\n".join(f"| [`raytwin {name}`](#raytwin-{name}) | {line} |" for name, (_, line) in COMMANDS.items()),
     ]

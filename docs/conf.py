@@ -8,10 +8,9 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 
-# the tutorials run `raytwin` as a reader does, one thread each, and without a display
+# the tutorials run `raytwin` as a reader does, one thread each
 os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["RAYTWIN_FLEXRAY"] = str(HERE.parent / "data" / "real" / "flexray")
 
 project = "raytwin"
@@ -26,6 +25,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # formulas without the internet
     "sphinx_copybutton",
     "sphinx_design",
     "raytwin_pages",
@@ -42,6 +42,7 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 
 # the API, from its docstrings
 autosummary_generate = True
@@ -65,7 +66,7 @@ html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
     "navbar_align": "left",
-    "header_links_before_dropdown": 8,
+    "header_links_before_dropdown": 9,
     "show_nav_level": 1,
     "navigation_with_keys": False,
     "show_prev_next": True,
@@ -73,7 +74,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars = {"index": [], "start": [], "limits": [], "validation": []}
+alone = ("index", "start", "physics", "generated/effects_gallery", "generated/limits", "generated/validation")
+html_sidebars = {name: [] for name in alone}  # pages without others below them
 copybutton_exclude = ".linenos, .gp, .go"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True

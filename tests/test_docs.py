@@ -36,13 +36,16 @@ def blocks(page, *kinds):
 def python_blocks(page):
     """Python of a page, without the options and shell lines of notebooks."""
     for body in blocks(page, "python", "{code-cell} python"):
-        yield "\n".join(line for line in body.splitlines() if not line.startswith((":tags:", "!")))
+        if not body.startswith("%%bash"):
+            yield "\n".join(line for line in body.splitlines() if not line.startswith((":tags:", "!")))
 
 
 def commands_in(page):
     """Words of every `raytwin ...` line of a page's shell blocks and notebook cells."""
     bodies = blocks(page, "", "sh", "bash")
-    bodies += ["\n".join(re.findall(r"^!(.*)$", body, re.MULTILINE)) for body in blocks(page, "{code-cell} python")]
+    for cell in blocks(page, "{code-cell} python"):
+        shell = cell.startswith("%%bash")
+        bodies.append(cell if shell else "\n".join(re.findall(r"^!(.*)$", cell, re.MULTILINE)))
     for body in bodies:
         for line in body.replace("\\\n", " ").splitlines():
             for part in line.split("&&"):

@@ -78,7 +78,10 @@ def pages_of_the_root() -> None:
     """LIMITS, VALIDATION and the like, with links of the site."""
     for name, target in OF_THE_ROOT.items():
         page = ROOT / name
-        write_if_changed(GENERATED / f"{target}.md", with_site_links(page.read_text(encoding="utf-8"), page=page))
+        text = with_site_links(page.read_text(encoding="utf-8"), page=page)
+        # ids of rows become anchors: generated/limits.html#weak-1
+        text = re.sub(r"^\| ([a-z]+-\d+) \|", r'| <span class="row-id" id="\1">\1</span> |', text, flags=re.MULTILINE)
+        write_if_changed(GENERATED / f"{target}.md", text)
 
 
 def commands_page() -> None:

@@ -4,6 +4,8 @@ Notebooks run when the site is built (`make docs`); the blocks of docs/python.md
 """
 
 import ast
+import importlib.util
+import json
 import re
 import shlex
 import tomllib
@@ -131,3 +133,43 @@ def test_versions_agree():
 def test_laws_of_the_gallery_belong_to_effects():
     laws = tomllib.loads((DOCS / "_ext" / "laws.toml").read_text(encoding="utf-8"))
     assert set(laws) <= set(EFFECTS)
+
+
+@pytest.fixture(scope="module")
+def schemas():
+    """The module that writes the JSON Schemas."""
+    spec = importlib.util.spec_from_file_location("schemas_of_docs", DOCS / "_ext" / "schemas.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_schemas_are_those_of_the_readers(schemas):
+    for name in schemas.SCHEMAS:
+        kept = (DOCS / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8")
+        assert kept == schemas.text_of(name), f"{name}: run python docs/_ext/schemas.py"
+
+
+def test_examples_are_valid_by_the_schemas_and_mistyped_words_are_not():
+    jsonschema = pytest.importorskip("jsonschema")
+    examples = {
+        "sidecar": [(ROOT / "data" / "real" / "flexray" / "raytwin.toml").read_text(encoding="utf-8")],
+        "materials": [(ROOT / "materials" / "library.toml").read_text(encoding="utf-8")],
+        "description": blocks(DOCS / "descriptions.md", "toml"),
+        "campaign": blocks(DOCS / "campaigns.md", "toml"),
+    }
+    examples["sidecar"] += blocks(DOCS / "importing.md", "toml")
+    wrong = {
+        "sidecar": '[[series]]\nkind = "flat"\nfiles = "*.tif"\nexposure = 20\n',
+        "materials": "[steel]\ndensity = 7.8\n",
+        "description": '[[product]]\nshape = "filet"\n',
+        "campaign": 'twin = "t.h5"\nreferences = "r.h5"\n[limits]\nmaximum_dose = 2\n',
+    }
+    for name, texts in examples.items():
+        schema = json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8"))
+        assert texts
+        for text in texts:
+            jsonschema.validate(tomllib.loads(text), schema)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(tomllib.loads(wrong[name]), schema)

@@ -51,7 +51,7 @@ def commands_in(page):
     for body in bodies:
         for line in body.replace("\\\n", " ").splitlines():
             for part in line.split("&&"):
-                words = shlex.split(part, comments=True)
+                words = shlex.split(re.sub(r"\s2?>.*$", "", part), comments=True)
                 if words[:1] == ["raytwin"] and len(words) > 1:
                     yield words[1:]
 

@@ -241,11 +241,11 @@ def effects_page(folder: Path) -> None:
         draw(found, folder / "effects" / f"{effect.id}.png")
         title = effect.title[0].upper() + effect.title[1:]
         onset = "after the calibration" if effect.after_calibration else "present when the line was calibrated"
-        law = laws.get(effect.id)
+        law = getattr(effect, "law", "") or laws.get(effect.id, "")
         isolates = isolated_by(effect)
         lines = [
             f"(effect-{effect.id})=\n## {title}",
-            f"`{effect.id}` acts {STAGE[effect.stage]}. Usual onset: {onset}.",
+            f"`{effect.id}` acts {STAGE.get(effect.stage, effect.stage)}. Usual onset: {onset}.",
             f"$$\n{law}\n$$" if law else "",
             f"![Signature of {effect.id}](effects/{effect.id}.png)",
             f"*{words[0].upper() + words[1:]}; strength {drawn_strength(effect):g} {effect.strength.unit}.*",

@@ -57,6 +57,8 @@ templates_path = ["_templates"]
 add_module_names = False
 python_use_unqualified_type_names = True
 
+highlight_language = "text"  # of blocks that do not say theirs
+
 # HTML
 html_theme = "pydata_sphinx_theme"
 html_title = f"raytwin {release}"

@@ -122,6 +122,16 @@ def test_ids_that_pages_point_to_exist():
         assert {name for name in named if name.split("-")[0] in kinds} <= ids, page.name
 
 
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_files_and_targets_that_a_page_names_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:[a-z_0-9]+/)+[a-z_0-9]+\.(?:py|toml))`", text):
+        made = name.startswith("demo/")  # by `raytwin demo`
+        assert made or (ROOT / name).is_file() or (ROOT / "src" / "raytwin" / name).is_file(), name
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(re.findall(r"`make ([a-z-]+)", text)) <= targets
+
+
 def test_versions_agree():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     citation = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)

@@ -96,7 +96,7 @@ def commands_page() -> None:
         + "\n".join(f"| [`raytwin {name}`](#raytwin-{name}) | {line} |" for name, (_, line) in COMMANDS.items()),
     ]
     width = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "96"
+    os.environ["COLUMNS"] = "84"
     try:
         for name in COMMANDS:
             said = io.StringIO()

@@ -1,5 +1,6 @@
 # make demo   the main job end to end, report in demo/report.html
 # make test   the default test suite (under 10 minutes on 2 cores)
+# make docs   the documentation site, tutorials executed, in docs/_build/html (extra `docs`)
 # make check  lint, types, import directions (fast)
 PYTHON ?= python3
 VENV ?= .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs wheel-check stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -20,6 +21,28 @@ $(READY): pyproject.toml
 
 demo: $(READY)
 	$(BIN)/raytwin demo -o demo
+
+DOCS_READY := $(VENV)/.docs-ready
+
+$(DOCS_READY): $(READY) pyproject.toml
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	touch $(DOCS_READY)
+
+# a warning is an error; a notebook that fails stops the build
+docs: $(DOCS_READY)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
+# the wheel alone, without extras, in an environment of its own: it answers, and no heavy extra came along
+wheel-check: $(READY)
+	rm -rf build/wheel && mkdir -p build/wheel
+	$(BIN)/python -m build --wheel --outdir build/wheel . > build/wheel/build.log 2>&1 || { cat build/wheel/build.log; exit 1; }
+	$(PYTHON) -m venv build/wheel/venv
+	build/wheel/venv/bin/python -m pip install --quiet build/wheel/*.whl
+	cd build/wheel && venv/bin/raytwin info
+	cd build/wheel && venv/bin/raytwin predict virtual_lab --kv 60 --filter Cu:0.1 --power-w 30 --exposure-ms 20
+	cd build/wheel && venv/bin/raytwin pod $(CURDIR)/tests/pod_examples/hdbk_ex3.csv
+	cd build/wheel && venv/bin/python -c "import importlib.util as u; assert u.find_spec('torch') is None and u.find_spec('sphinx') is None"
 
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow'
@@ -83,8 +106,8 @@ benchmark-memory: $(READY)
 
 # mypy sees the rooms as raytwin.<room> through a folder of links, without an install
 check: $(READY)
-	$(BIN)/ruff check src $(ROOMS) tests validation benchmarks
-	$(BIN)/ruff format --check src $(ROOMS) tests validation benchmarks
+	$(BIN)/ruff check src $(ROOMS) tests validation benchmarks docs/_ext docs/conf.py
+	$(BIN)/ruff format --check src $(ROOMS) tests validation benchmarks docs/_ext docs/conf.py
 	rm -rf build/types && mkdir -p build/types/raytwin
 	ln -s $(CURDIR)/src/raytwin/* build/types/raytwin/
 	for room in $(ROOMS); do ln -s $(CURDIR)/$$room build/types/raytwin/$$room; done
@@ -92,8 +115,8 @@ check: $(READY)
 	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow'
 
 format: $(READY)
-	$(BIN)/ruff check --fix src $(ROOMS) tests validation benchmarks
-	$(BIN)/ruff format src $(ROOMS) tests validation benchmarks
+	$(BIN)/ruff check --fix src $(ROOMS) tests validation benchmarks docs/_ext docs/conf.py
+	$(BIN)/ruff format src $(ROOMS) tests validation benchmarks docs/_ext docs/conf.py
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info demo
+	rm -rf $(VENV) build dist *.egg-info demo docs/_build docs/generated docs/jupyter_execute

@@ -196,7 +196,7 @@ def begin_check(folder: Path, options: BlindOptions, *, development: bool = Fals
         raise InputError(
             "--seed",
             received=options.seed,
-            expected="a seed that was not used while the diagnosis was developed (docs/development_seeds.md)",
+            expected="a seed that was not used while the diagnosis was developed (docs/notebook/development_seeds.md)",
             remedy="take another, or say --development; the report then says that it proves nothing",
         )
     if folder.exists() and not folder.is_dir():

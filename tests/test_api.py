@@ -261,22 +261,47 @@ def run_examples(thing, name):
     assert runner.failures == 0, "".join(told)
 
 
-def test_the_script_of_the_page_runs_as_written(folder, tmp_path, monkeypatch):
+def run_blocks(page):
+    """Execute the python blocks of a page in the working directory; their names."""
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL):
+        exec(compile(block, page, "exec"), names)
+    pyplot.close("all")
+    return names
+
+
+@pytest.fixture
+def as_a_user(folder, tmp_path, monkeypatch):
+    """An empty working directory with the files that the pages name."""
     monkeypatch.chdir(tmp_path)
     for name in ("session.h5", "later.h5"):
         os.link(folder / "session.h5", name)
-    os.link(folder / "other_hits.csv", "other_hits.csv")
+    for name in ("hits.csv", "other_hits.csv"):
+        os.link(folder / name, name)
+
+
+def test_the_script_of_the_page_runs_as_written(folder, as_a_user):
     Path("small.toml").write_text(SMALL_PRODUCTS)
     reference = "exposure_ms=100,filter=Cu:0.05,averaged=10"
     pair = {"low": f"kv=40,power_w=40,{reference}", "high": f"kv=90,power_w=45,{reference}"}
     rt.generate(folder / "session_twin.h5", "small.toml", n=6, seed=1, output="references.h5", **pair)
-    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-    names = {}
-    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(block, "docs/python.md", "exec"), names)
-    pyplot.close("all")
+    names = run_blocks("docs/python.md")
     assert names["pairs"].images.shape == (4, 2, 24, 24)
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     assert set(re.findall(r"`rt\.(\w+)\(", page)) == set(rt._HOME), "the page's table and the public names differ"
+
+
+def test_the_script_of_the_page_of_checks_runs_as_written(as_a_user, capsys):
+    found = run_blocks("docs/check.md")["result"].findings
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == [finding.code for finding in found]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_script_of_the_readme_runs_as_written(as_a_user):
+    names = run_blocks("README.md")
+    assert names["curve"].a90 > 0
+    assert names["found"].verdict in ("no_gap", "explained", "ambiguous", "unknown_effect")
 
 
 def test_seeds_may_be_generators_and_progress_a_function(inside, capsys):

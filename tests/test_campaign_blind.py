@@ -592,7 +592,7 @@ def test_the_documented_seeds_are_those_that_are_refused():
     import tomllib
 
     table = tomllib.loads((ROOT / "campaign" / "development_seeds.toml").read_text(encoding="utf-8"))
-    page = (ROOT / "docs" / "development_seeds.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "notebook" / "development_seeds.md").read_text(encoding="utf-8")
     for command, key in (("raytwin lab --seed", "lab"), ("raytwin blind-check --seed", "blind_check")):
         line = next(line for line in page.splitlines() if line.startswith(f"| `{command}`"))
         cell = line.split("|")[2]

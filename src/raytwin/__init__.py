@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .api.twins import read_twin as read_twin
     from .api.twins import validate as validate
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # public name -> module; imported when first asked for
 _HOME = {

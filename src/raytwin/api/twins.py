@@ -178,7 +178,7 @@ def predict(
 
     Args:
         twin: a twin, its file, or a shipped calibration's name.
-        settings, **words: see `Twin.predict`.
+        settings: see `Twin.predict`, as for all further words.
 
     Returns:
         A `Prediction`, or `Predictions` where many were asked for.

@@ -143,8 +143,8 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     ),
     FindingCode.NO_LIGHT: _Entry(
         Severity.ERROR,
-        "its level is not above the dark's ({level:.4g} against {dark:.4g} DN): the beam was off, or the"
-        " kinds are mixed up",
+        "its level is not above the dark's ({level:.4g} against {dark:.4g} DN): the beam was off"
+        " or too weak to show, or the kinds are mixed up",
     ),
     FindingCode.DARK_WITH_LIGHT: _Entry(
         Severity.ERROR,

@@ -13,7 +13,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from ..results import ByValue, Result, Table, plain
-from .effects.effect import AppliedEffect
+from .applied_effect import AppliedEffect
 from .psf import Spread
 from .spectral_signal import SpectrumCorrection
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.log_images import light_of_shares
 from ..errors import InputError
-from ..generator.effects import AppliedEffect
+from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions, with_conditions
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, spectral_sds, tails_always_there, twin_changes, with_pauses
+from .changes import Variant, always_a_little, smooth_twin, spectral_sds, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
@@ -192,10 +192,10 @@ def build_problem(
     changes += [Change.of_twin(step) for step in steps_taken]
     changes += [
         replace(model.change(variant, variant.strengths[0]), label=variant.name)
-        for variant in tails_always_there(side=side)
+        for variant in always_a_little(side=side)
     ]
     changes += without_each(model.base)
-    unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
+    unjudged = _of_quanta() if only_own_noise(session) else {}
     compared = _Compared(
         measured=measured,
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
@@ -504,6 +504,11 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}
 
 
+def _of_quanta() -> dict[str, str]:
+    """Why effects on the statistics of quanta cannot be judged from the noise that calibrates, by id."""
+    return {effect.id: _OWN_NOISE for effect in EFFECTS.values() if effect.stage == "quanta"}
+
+
 def _curves(
     blocks: Sequence[SeriesBlock],
     responses: NDArray[np.float64],
@@ -517,6 +522,7 @@ def _curves(
     base = compared.measured.expected.model.base
     readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
     for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
+        effect = EFFECTS[variant.effect]
         failed = next((compared.asked[row].failed for row in rows if compared.asked[row].failed), "")
         if failed:
             missing.setdefault(variant.effect, failed)
@@ -524,13 +530,13 @@ def _curves(
         own = responses[list(rows)]
         spread = by_chance(variant, blocks, rows[0], readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise
-        wanders = variant.effect == "output_drift" and spread is not None and bool(np.any(spread))
+        wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
         exact = None
-        if variant.effect in scales.DEFINED_BY:
-            exact = np.array([name.statistic in scales.DEFINED_BY[variant.effect] for name in names])
+        if effect.reading.probes:
+            exact = np.array([name.statistic in effect.reading.probes for name in names])
         jitter = jitter_of(variant, blocks, read_noise_DN)
         curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
         chosen.append(variant)

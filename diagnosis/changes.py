@@ -336,7 +336,9 @@ def always_a_little(*, side: int = 1) -> list[Variant]:
     result = []
     for effect in EFFECTS.values():
         little = effect.always_a_little
-        for variant in variants_of(effect, side=side) if little is not None else ():
+        if little is None:
+            continue
+        for variant in variants_of(effect, side=side):
             name = f"{little.name}, {variant.name}"
             result.append(replace(variant, name=name, since="always", strengths=(little.strength,)))
     return result

@@ -12,10 +12,10 @@ from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_
 from raytwin.errors import InputError
 from raytwin.generator._distortion import displacement_px, distorted
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter, effect_of, in_order
-from raytwin.generator.effects.effect import spread_transfer
-from raytwin.generator.effects.fluorescence import line_energy_keV
-from raytwin.generator.effects.registration import angles_of, parts_px
-from raytwin.generator.effects.sharpness import _transfer_of_spot
+from raytwin.generator.effects._light_spread import spread_transfer
+from raytwin.generator.effects.focal_spot import _transfer_of_spot
+from raytwin.generator.effects.k_fluorescence import line_energy_keV
+from raytwin.generator.effects.misregistration import angles_of, parts_px
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share

@@ -71,7 +71,7 @@ class Parameter:
 
     def pixels_per_square(self, side: int) -> float:
         """By what a number found in squares of side x side pixels is multiplied to be that of pixels."""
-        share = float(side) ** abs(self.pixel_power)
+        share: float = float(side) ** abs(self.pixel_power)
         return share if self.pixel_power >= 0.0 else 1.0 / share
 
 

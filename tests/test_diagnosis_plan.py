@@ -63,7 +63,13 @@ def problem(curves, *, factors=None, noise=1.0):
 
 def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_ones_not_at_all():
     found = distinguishability(
-        problem([curve("glare", axis(0)), curve("scatter", axis(1)), curve("drift", 2.0 * axis(0), high=1000.0)])
+        problem(
+            [
+                curve("veiling_glare", axis(0)),
+                curve("k_fluorescence", axis(1)),
+                curve("dark_drift", 2.0 * axis(0), high=1000.0),
+            ]
+        )
     )
     assert found.from_none == pytest.approx([10.0, 10.0, 2.0 * np.sqrt(1000.0)])
     assert found.between[0, 1] == pytest.approx(10.0, rel=0.01)
@@ -93,9 +99,9 @@ def test_an_effect_is_planned_with_its_usual_onset_and_middling_inner_parameters
 
 
 def test_a_nuisance_along_an_effect_takes_its_separation():
-    bare = distinguishability(problem([curve("glare", axis(0)), curve("scatter", axis(1))]))
+    bare = distinguishability(problem([curve("veiling_glare", axis(0)), curve("k_fluorescence", axis(1))]))
     held = distinguishability(
-        problem([curve("glare", axis(0)), curve("scatter", axis(1))], factors=7.0 * axis(0)[:, None])
+        problem([curve("veiling_glare", axis(0)), curve("k_fluorescence", axis(1))], factors=7.0 * axis(0)[:, None])
     )
     assert held.from_none[0] == pytest.approx(bare.from_none[0] / np.sqrt(50.0), rel=1e-6)
     assert held.from_none[1] == pytest.approx(bare.from_none[1], rel=1e-6)
@@ -469,7 +475,9 @@ def gain_found(residual, made):
     """A problem of 600 probes in twenty groups, without nuisances, and a hypothesis that a curve explains it at 10."""
     groups = np.repeat(np.arange(20), 30)
     problem = SimpleNamespace(residual=residual, factors=np.zeros((residual.size, 1)), groups=groups, blocks=groups)
-    return problem, SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+    return problem, SimpleNamespace(
+        effects=("gain_map_error",), variants={"gain_map_error": made}, strengths={"gain_map_error": (10.0, 9.0, 11.0)}
+    )
 
 
 def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was():
@@ -516,7 +524,7 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
     response = np.zeros(size)
     response[:50] = 3.0
     made = replace(
-        curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
+        curve("gain_map_error", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
     )
     residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
     found = misfit_of(*gain_found(residual, made))

@@ -33,6 +33,16 @@ SHIPPED = {"raytwin.data.calibration": "data/calibration"}  # a folder of data w
 ABOVE = {"api", "commands"}  # in src/raytwin, above every room
 COMPOSERS = {"campaign", "commands", "api"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
+NAME_THE_MAP = (
+    "calibration/calibrate.py",
+    "generator/export.py",
+    "generator/generate.py",
+    "generator/generate_described.py",
+    "generator/twin_answer.py",
+    "generator/twin_io.py",
+    "src/raytwin/api/images.py",
+    "src/raytwin/commands/calibrate.py",
+)
 HEAVY = {"torch", "matplotlib", "numpy", "scipy", "h5py", "numba", "spekpy", "xraylib", "xraydb", "dask"}
 HEAVY |= {"statsmodels", "pandas"}
 
@@ -113,6 +123,46 @@ def test_the_upward_import_check_sees_a_planted_fault(tmp_path):
     module = tmp_path / "bad.py"
     module.write_text("from ..calibration import x\nimport raytwin.pod\nfrom .. import lab\nfrom . import fine\n")
     assert sorted(imported_rooms(module, 1)) == [(1, "calibration"), (2, "raytwin"), (3, "lab")]
+
+
+def strings_of(path):
+    """(line, text) of every string of a file that is no docstring."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    told = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                told.add(first.value)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in told:
+            yield node.lineno, node.value
+
+
+def names_of_effects(files, ids):
+    """Places that name an effect: strings that are its id."""
+    return [f"{path}:{line} {text}" for path in files for line, text in strings_of(path) if text in ids]
+
+
+def test_no_code_but_the_catalogue_and_the_lab_names_an_effect():
+    from raytwin.generator.effects import OURS
+
+    files = [path for _, path in python_files() if path.relative_to(ROOT).parts[0] != "lab"]
+    files = [path for path in files if path.parent != ROOT / "generator" / "effects"]
+    named = names_of_effects(files, set(OURS))
+    # a map of the detector bears the name of an effect; so do the words of answers and options that are about this map
+    maps = {ROOT / path for path in NAME_THE_MAP}
+    assert all(any(place.startswith(str(path)) for place in named) for path in maps), (
+        "a file that names the map no more"
+    )
+    wrong = [place for place in named if not (place.endswith(" bad_pixels") and Path(place.split(":")[0]) in maps)]
+    assert not wrong, "ask the effect's declaration (generator/effects/effect.py):\n" + "\n".join(wrong)
+
+
+def test_the_check_of_effects_sees_a_planted_name_and_no_docstring(tmp_path):
+    module = tmp_path / "table.py"
+    module.write_text('"""heel"""\n\nTABLE = {"heel": 1}\n\n\ndef f(x):\n    """heel"""\n    return x == "mtf_tail"\n')
+    assert names_of_effects([module], {"heel", "mtf_tail"}) == [f"{module}:3 heel", f"{module}:8 mtf_tail"]
 
 
 def test_packages_on_disk_and_in_pyproject_agree():

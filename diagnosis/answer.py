@@ -8,11 +8,11 @@ from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.twin import Twin
 from ..results import Result, Table, axes_or_new, frame, plain
-from .assemble import Problem
 from .coarse import parameters_in_pixels, unseen_in_squares
 from .held_out import Gap
 from .inference import Hypothesis
 from .known_effects import with_found
+from .problem import Problem
 from .readings import Suspect
 
 if TYPE_CHECKING:

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
-from .assemble import Problem
 from .pairs import Doubts
 from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS, OUTLIERS_ANYWHERE
+from .problem import Problem
 from .registration import SHARP_PX
 
 

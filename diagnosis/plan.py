@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
-from .assemble import Problem
 from .curves import Curve
 from .nuisances import Nuisances
+from .problem import Problem
 from .whitening import Whitening
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm

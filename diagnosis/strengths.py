@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
-from .assemble import Problem, SeriesView, map_changes
+from .assemble import map_changes
 from .curve_fits import fit_curve
 from .even_maps import Map, mean_over
 from .inference import Hypothesis
 from .nuisances import Nuisances
 from .output_course import rms_about_mean
+from .problem import Problem, SeriesView
 
 _NODES = 800
 _BEYOND_NODES = 2.0  # times the outermost strengths asked

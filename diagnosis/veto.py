@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..generator.effects import EFFECTS
-from .assemble import Problem
 from .held_out import Gap
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
 from .local_nuisances import LocalNuisances
+from .problem import Problem
 
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 # of a probe that shows the gap: of 19 sealed effects named rightly none left more than 0.16, of 25 sessions of a second simulator

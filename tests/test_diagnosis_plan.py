@@ -8,7 +8,6 @@ import pytest
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis import veto
-from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
 from raytwin.diagnosis.doubts import _elsewhere
@@ -18,6 +17,7 @@ from raytwin.diagnosis.judgement import _threshold
 from raytwin.diagnosis.nuisances import Nuisances
 from raytwin.diagnosis.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.probes import ALONG_ROWS
+from raytwin.diagnosis.problem import Problem
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.seen import Blocks
 from raytwin.diagnosis.series_block import jitter_of

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,42 +14,8 @@ from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.effects import GROUP, OURS, Catalogue
 
-# a screen that is worn out about the middle of the field: less light there, behind whatever stands in the beam
-SCREEN = '''
-"""A worn screen: light x (1 - s exp(-r^2 / (2 w^2))), r from the middle of the field over its side."""
-
-from dataclasses import replace
-
-import numpy as np
-
-from raytwin.generator.effects.effect import LIT_SERIES, Effect, Grid, Parameter, Shows
-
-
-def _wear(state, parameters, context):
-    row, column = (np.linspace(-0.5, 0.5, side) for side in context.shape)
-    squared = row[:, None] ** 2 + column[None, :] ** 2
-    left = 1.0 - parameters["strength"] / 100.0 * np.exp(-0.5 * squared / parameters["width"] ** 2)
-    return replace(state, signal_DN=left * state.signal_DN, variance_DN2=left * state.variance_DN2)
-
-
-WORN_SCREEN = Effect(
-    id="worn_screen",
-    title="screen worn about the middle of the field",
-    law="light x (1 - s exp(-r^2 / (2 w^2)))",
-    parameters=(
-        Parameter(name="strength", unit="%", low=0.5, high=20.0, default=5.0, source="light lost in the middle", log=False),
-        Parameter(name="width", unit="", low=0.05, high=0.3, default=0.12, source="over the field's side", log=True),
-    ),
-    stage="optics",
-    reference="radiation damage of CsI screens",
-    isolated_by="a flat with the screen shifted",
-    shows=Shows(series=LIT_SERIES, axis="position"),
-    after_calibration=True,
-    absorbed="maps",
-    change=_wear,
-    grid=Grid(shares=(0.8,)),
-)
-'''
+# the example of docs/effects.md: a screen that is worn about the middle of the field
+SCREEN = (Path(__file__).parents[1] / "docs" / "examples" / "worn_screen.py").read_text(encoding="utf-8")
 ASKED = """
 import json, sys
 from dataclasses import replace

@@ -15,8 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..lab.cases import SETS, Case, draw_case
-from ..lab.effect import EffectRequest
-from ..lab.effects import EFFECTS
+from ..lab.effects import EFFECTS, EffectRequest
 from ._plain import canonical
 
 STREAMS = {"case": 0, "train": 1}

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .effect import EffectRequest
-from .effects import EFFECTS
+from .effects import EFFECTS, EffectRequest
 
 LABELS = {"none": 0.30, "single": 0.40, "pair": 0.15, "unknown": 0.15}
 # What only fine pixels, or only a wide field, can show.

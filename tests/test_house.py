@@ -125,22 +125,72 @@ def test_the_upward_import_check_sees_a_planted_fault(tmp_path):
     assert sorted(imported_rooms(module, 1)) == [(1, "calibration"), (2, "raytwin"), (3, "lab")]
 
 
+def imports_among(files):
+    """File -> files of the same set that it imports relatively, for running or for types."""
+    known = {path.resolve(): path for path in files}
+    graph = {}
+    for path in files:
+        found = graph.setdefault(path, set())
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+                places = [base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)]
+                found.update(known[place.resolve()] for place in places if place.resolve() in known)
+    return graph
+
+
+def ring_in(graph):
+    """Files that import each other in a ring, from one back to itself; empty: none."""
+    done, way = set(), []
+
+    def seek(path):
+        if path in way:
+            return [*way[way.index(path) :], path]
+        if path in done:
+            return []
+        way.append(path)
+        for target in sorted(graph[path]):
+            if found := seek(target):
+                return found
+        done.add(way.pop())
+        return []
+
+    return next((found for path in graph if (found := seek(path))), [])
+
+
+def test_no_files_import_each_other_in_a_ring():
+    ring = ring_in(imports_among([path for _, path in python_files()]))
+    assert not ring, " imports ".join(str(path.relative_to(ROOT)) for path in ring)
+
+
+def test_the_check_of_rings_sees_a_planted_one(tmp_path):
+    texts = {"a": "from .b import x\n", "b": "if x:\n    from . import c\n", "c": "def f():\n    from .a import y\n"}
+    files = [tmp_path / f"{name}.py" for name in (*texts, "d")]
+    for path in files:
+        path.write_text(texts.get(path.stem, "from .a import x\n"))
+    graph = imports_among(files)
+    assert [path.stem for path in ring_in(graph)] == ["a", "b", "c", "a"]
+    graph[files[2]] = set()
+    assert ring_in(graph) == []
+
+
 def strings_of(path):
     """(line, text) of every string of a file that is no docstring."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
     told = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
             first = node.body[0]
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 told.add(first.value)
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in told:
             yield node.lineno, node.value
 
 
 def names_of_effects(files, ids):
     """Places that name an effect: strings that are its id."""
+    files = [path for path in files if any(name in path.read_text(encoding="utf-8") for name in ids)]
     return [f"{path}:{line} {text}" for path in files for line, text in strings_of(path) if text in ids]
 
 

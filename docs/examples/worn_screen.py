@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from raytwin.generator.effects.effect import LIT_SERIES, Effect, Grid, Parameter, Shows
+from raytwin.generator.effects import LIT_SERIES, Effect, Grid, Parameter, Shows
 
 
 def _wear(state, parameters, context):

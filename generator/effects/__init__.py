@@ -14,7 +14,21 @@ from .bad_pixels import BAD_PIXELS
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
 from .dark_drift import DARK_DRIFT
-from .effect import Effect, Parameter
+from .effect import (
+    EVERY_SERIES,
+    LIT_SERIES,
+    AlwaysALittle,
+    Displacement,
+    Effect,
+    FalseEvidence,
+    Grid,
+    InImages,
+    Parameter,
+    Placement,
+    Reading,
+    Shows,
+    Variation,
+)
 from .excess_noise import EXCESS_NOISE
 from .filtration_error import FILTRATION_ERROR
 from .focal_spot import FOCAL_SPOT
@@ -63,12 +77,23 @@ EFFECTS = Catalogue(OURS)
 
 __all__ = [
     "EFFECTS",
+    "EVERY_SERIES",
     "GROUP",
+    "LIT_SERIES",
     "OURS",
+    "AlwaysALittle",
     "AppliedEffect",
     "Catalogue",
+    "Displacement",
     "Effect",
+    "FalseEvidence",
+    "Grid",
+    "InImages",
     "Parameter",
+    "Placement",
+    "Reading",
+    "Shows",
+    "Variation",
     "effect_of",
     "in_order",
 ]

@@ -4,14 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    FalseEvidence,
-    Parameter,
-    Reading,
-    Shows,
-)
+from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows
 
 
 def _spoil_pixels(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

@@ -11,15 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    Grid,
-    InImages,
-    Parameter,
-    Shows,
-    Variation,
-)
+from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Shows, Variation
 
 
 def _drift_dark(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

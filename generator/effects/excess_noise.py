@@ -6,12 +6,7 @@ from dataclasses import replace
 from ..line_state import LineContext, LineState
 from ..twin import Twin
 from ..twin_numbers import with_gain
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Parameter,
-    Shows,
-)
+from .effect import LIT_SERIES, Effect, Parameter, Shows
 
 
 def _add_excess(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

@@ -6,15 +6,7 @@ from ..line_state import LineContext, LineState
 from ..twin import Twin
 from ..twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Reading,
-    Shows,
-    Variation,
-)
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
 
 def _shift_filtration(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

@@ -7,15 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import FixedPattern, LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    FalseEvidence,
-    Parameter,
-    Reading,
-    Shows,
-    Variation,
-)
+from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows, Variation
 
 
 def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

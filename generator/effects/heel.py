@@ -9,14 +9,7 @@ import numpy as np
 from ...errors import InputError
 from ..line_state import FloatArray, LineContext, LineState
 from ..spectral_signal import OpenBeam
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Shows,
-    Variation,
-)
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows, Variation
 
 
 def _field_coordinate(shape: tuple[int, int], direction_deg: float) -> FloatArray:

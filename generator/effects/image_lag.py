@@ -14,15 +14,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LagLaw, LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    Grid,
-    InImages,
-    Parameter,
-    Reading,
-    Shows,
-)
+from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Reading, Shows
 
 _STEPS = (-1.5, -0.5, 0.5, 1.5)
 

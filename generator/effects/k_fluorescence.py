@@ -22,15 +22,7 @@ from ...materials import (
 )
 from ..line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    FalseEvidence,
-    Grid,
-    Parameter,
-    Reading,
-    Shows,
-)
+from .effect import LIT_SERIES, Effect, FalseEvidence, Grid, Parameter, Reading, Shows
 
 _USUAL_ORDER = 0.5
 

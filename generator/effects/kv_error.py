@@ -9,15 +9,7 @@ from ..line_state import LineContext, LineState
 from ..twin import Twin
 from ..twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Reading,
-    Shows,
-    Variation,
-)
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
 # the spectral model's table of tube voltage errors ends at 6 %; larger ones are counted from a voltage 5 % off
 _TABLE_END = 0.055

@@ -10,17 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import (
-    Displacement,
-    Effect,
-    FalseEvidence,
-    Grid,
-    InImages,
-    Parameter,
-    Placement,
-    Reading,
-    Shows,
-)
+from .effect import Displacement, Effect, FalseEvidence, Grid, InImages, Parameter, Placement, Reading, Shows
 
 
 def parts_px(strength_px: float, *, magnification_deg: float, rotation_deg: float) -> tuple[float, float, float]:

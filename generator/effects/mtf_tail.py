@@ -8,15 +8,7 @@ from dataclasses import replace
 
 from ..line_state import FloatArray, LineContext, LineState
 from ._light_spread import order_parameter, spread_transfer
-from .effect import (
-    LIT_SERIES,
-    AlwaysALittle,
-    Effect,
-    FalseEvidence,
-    Grid,
-    Parameter,
-    Shows,
-)
+from .effect import LIT_SERIES, AlwaysALittle, Effect, FalseEvidence, Grid, Parameter, Shows
 
 _USUAL_ORDER = 1.0  # of the tail: a Lorentzian
 

@@ -7,13 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Shows,
-)
+from .effect import EVERY_SERIES, Effect, Grid, Parameter, Shows
 
 
 def _bend(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

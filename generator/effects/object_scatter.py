@@ -35,13 +35,7 @@ from ...materials import (
 from .._fine_picture import find_borders
 from ..line_state import FloatArray, LineContext, LineState, needed
 from ..spectral_signal import mean_signal_energy_keV
-from .effect import (
-    Effect,
-    FalseEvidence,
-    Grid,
-    Parameter,
-    Shows,
-)
+from .effect import Effect, FalseEvidence, Grid, Parameter, Shows
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0

@@ -8,15 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Reading,
-    Shows,
-    Variation,
-)
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
 
 def _drift_output(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

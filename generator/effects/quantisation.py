@@ -7,15 +7,7 @@ import numpy as np
 
 from ..line_state import LineContext, LineState
 from ..rounding import variance_before_rounding
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    FalseEvidence,
-    Parameter,
-    Reading,
-    Shows,
-    Variation,
-)
+from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows, Variation
 
 
 def _lose_bits(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -36,15 +28,7 @@ QUANTISATION = Effect(
     title="ADC with lost bits",
     law="step s in place of 1 DN",
     parameters=(
-        Parameter(
-            name="strength",
-            unit="DN",
-            low=2.0,
-            high=64.0,
-            default=4.0,
-            source="step; 1-6 bits lost",
-            log=True,
-        ),
+        Parameter(name="strength", unit="DN", low=2.0, high=64.0, default=4.0, source="step; 1-6 bits lost", log=True),
     ),
     stage="readout",
     reference="uniform quantiser: Widrow (1956), doi:10.1109/TCT.1956.1086334",

@@ -7,13 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import (
-    EVERY_SERIES,
-    Effect,
-    Parameter,
-    Shows,
-    Variation,
-)
+from .effect import EVERY_SERIES, Effect, Parameter, Shows, Variation
 
 
 def _add_row_noise(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

@@ -11,13 +11,7 @@ import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
-from .effect import (
-    LIT_SERIES,
-    Effect,
-    Grid,
-    Parameter,
-    Shows,
-)
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 
 _USUAL_ORDER = 0.5
 

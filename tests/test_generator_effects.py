@@ -1003,6 +1003,8 @@ def test_effects_that_make_no_sense_are_refused():
         Variation(random="much")
     with pytest.raises(InputError, match=r"series of an effect: got .*film"):
         Shows(series=("film",), axis="level")
+    with pytest.raises(InputError, match="axis of an effect: got colour"):
+        Shows(series=("flat",), axis="colour")
 
 
 def test_beam_effects_need_a_spectrum(series_line):

@@ -20,7 +20,7 @@ def _wear(state, parameters, context):
 WORN_SCREEN = Effect(
     id="worn_screen",
     title="screen worn about the middle of the field",
-    law="light x (1 - s exp(-r^2 / (2 w^2)))",
+    law=r"P \to P\,(1 - s\,e^{-r^2 / (2 w^2)})",
     parameters=(
         Parameter(
             name="strength", unit="%", low=0.5, high=20.0, default=5.0, source="light lost in the middle", log=False

@@ -22,7 +22,7 @@ def _spoil_pixels(state: LineState, parameters: Mapping[str, float], context: Li
 BAD_PIXELS = Effect(
     id="bad_pixels",
     title="new bad pixels",
-    law="y = 0 (dead), or y + 20 read-noise sigmas (hot), of a share s of the pixels",
+    law=r"\text{a share } s \text{ of the pixels is dead or hot}",
     parameters=(
         Parameter(
             name="strength",

@@ -34,7 +34,7 @@ def _scale_attenuation(state: LineState, parameters: Mapping[str, float], contex
 COMPOSITION_ERROR = Effect(
     id="composition_error",
     title="composition or density of the object differs",
-    law="mu t (1 + d) of one material of the scene",
+    law=r"\mu\,\rho\,L \to \mu\,\rho\,L\,(1 + s)\ \text{of one material}",
     parameters=(
         Parameter(
             name="strength",

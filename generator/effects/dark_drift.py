@@ -31,7 +31,10 @@ def _drift_dark(state: LineState, parameters: Mapping[str, float], context: Line
 DARK_DRIFT = Effect(
     id="dark_drift",
     title="dark level drifts",
-    law="+ s (t_exposure / t_longest) (g(time) - g(time of calibration)), g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w))",
+    law=(
+        r"D \to D + s\,\frac{t}{t_\mathrm{longest}}\,[g(\tau) - g(\tau_\mathrm{calibration})],\quad "
+        r"g(\tau) = \frac{1 - e^{-\tau/(w\,T_\mathrm{session})}}{1 - e^{-1/w}}"
+    ),
     parameters=(
         Parameter(
             name="strength",

@@ -15,6 +15,17 @@ from ..twin import Twin
 
 EVERY_SERIES = KINDS
 LIT_SERIES = ("flat", "object")
+AXES = (
+    "level",
+    "noise",
+    "sharpness",
+    "texture",
+    "time",
+    "position",
+    "energy",
+    "tails",
+    "task",
+)  # of a diagnosis' answer
 
 ABSORBED = {
     "nothing": "a flat that calibrated shows it as any other flat does",
@@ -95,6 +106,8 @@ class Shows:
     def __post_init__(self) -> None:
         if not self.series or not set(self.series) <= set(KINDS):
             raise InputError("series of an effect", received=self.series, expected="some of " + ", ".join(KINDS))
+        if self.axis not in AXES:
+            raise InputError("axis of an effect", received=self.axis, expected="one of " + ", ".join(AXES))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +222,7 @@ class Effect:
     """An effect that a real line may have and the base model has not.
 
     Fields:
-        id, title; law: the equation, one line; reference: source of the model; isolated_by: the measurement that shows it by itself.
+        id, title; law: the equation, LaTeX; reference: source of the model; isolated_by: the measurement that shows it by itself.
         parameters: the first is the strength.
         stage: where in the line it acts, see line_state; timed: before the exposure, but it depends on how long that takes.
         change: (state, parameters, context) -> state, which is no change at strength 0.

@@ -21,7 +21,7 @@ def _in_numbers(twin: Twin, strength: float) -> tuple[Twin, list[str]]:
 EXCESS_NOISE = Effect(
     id="excess_noise",
     title="more quantum noise than calibrated",
-    law="quantum variance x (1 + e)",
+    law=r"\mathrm{Var}_\mathrm{quantum} \to (1 + s)\,\mathrm{Var}_\mathrm{quantum}",
     parameters=(
         Parameter(
             name="strength",

@@ -23,7 +23,7 @@ def _in_numbers(twin: Twin, strength: float) -> tuple[Twin, list[str]]:
 FILTRATION_ERROR = Effect(
     id="filtration_error",
     title="filtration differs from the calibrated one",
-    law="exp(-mu_Al t)",
+    law=r"N(E) \to N(E)\,e^{-\mu_\mathrm{Al}(E)\,s}",
     parameters=(
         Parameter(
             name="strength",

@@ -50,7 +50,7 @@ def _blur_by_focal_spot(state: LineState, parameters: Mapping[str, float], conte
 FOCAL_SPOT = Effect(
     id="focal_spot",
     title="focal spot larger than assumed",
-    law="width a (M - 1) at the detector, M = source-detector over source-object",
+    law=r"\sigma = \frac{s\,(M - 1)}{2\sqrt{2\ln 2}},\quad M = \frac{\text{source-detector}}{\text{source-object}}",
     parameters=(
         Parameter(
             name="strength",

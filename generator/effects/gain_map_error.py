@@ -22,7 +22,7 @@ def _change_gain(state: LineState, parameters: Mapping[str, float], context: Lin
 GAIN_MAP_ERROR = Effect(
     id="gain_map_error",
     title="per-pixel gain has changed",
-    law="y = x (1 + eta), eta fixed from frame to frame",
+    law=r"y_{ij} = x_{ij}\,(1 + \eta_{ij}),\quad \mathrm{sd}(\eta) = s\ \text{(the same in every frame)}",
     parameters=(
         Parameter(
             name="strength",

@@ -65,7 +65,7 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
 HEEL = Effect(
     id="heel",
     title="anode heel",
-    law="exp(-mu_anode tau u), u from -1/2 to 1/2 across the field",
+    law=r"N(E) \to N(E)\,e^{-\mu_\mathrm{anode}(E)\,\tau\,(u + c\,u^2)},\quad u \in [-\tfrac12, \tfrac12]\ \text{across the field}",
     parameters=(
         Parameter(
             name="strength",

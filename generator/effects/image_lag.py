@@ -41,7 +41,11 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
 IMAGE_LAG = Effect(
     id="image_lag",
     title="image lag",
-    law="y_n = (1 - phi) x_n + sum_i (1 - a_i) R_i,n,  R_i,n+1 = a_i R_i,n + phi_i x_n",
+    law=(
+        r"y_n = (1 - \sum_i \phi_i)\,x_n + \sum_i (1 - a_i)\,R_{i,n},\quad "
+        r"R_{i,n+1} = a_i R_{i,n} + \phi_i x_n,\quad "
+        r"a_i = e^{-\Delta t/\tau_i}"
+    ),
     parameters=(
         Parameter(
             name="strength",

@@ -79,7 +79,7 @@ def _spread_k_photons(state: LineState, parameters: Mapping[str, float], context
 K_FLUORESCENCE = Effect(
     id="k_fluorescence",
     title="K fluorescence caught again in the scintillator",
-    law="1 - eta + eta K(f) for the picture, 1 - nu + nu K(f) for the noise power, K(f) = 1 / sqrt(1 + (2 pi L f)^2)",
+    law=r"H(f) = 1 - \eta + \frac{\eta}{\sqrt{1 + (2\pi L f)^2}},\quad \eta = s\,\frac{\sum_{E > E_K} w_1 E_K / E}{\sum w_1}",
     parameters=(
         Parameter(
             name="strength",

@@ -54,7 +54,7 @@ def _in_numbers(twin: Twin, strength: float) -> tuple[Twin, list[str]]:
 KV_ERROR = Effect(
     id="kv_error",
     title="tube voltage differs from the calibrated one",
-    law="kV (1 + d)",
+    law=r"kV \to kV\,(1 + s)",
     parameters=(
         Parameter(
             name="strength",

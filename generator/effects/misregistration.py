@@ -77,7 +77,7 @@ def _combined(shifted: Mapping[str, float], distorted: Mapping[str, float]) -> d
 MISREGISTRATION = Effect(
     id="misregistration",
     title="object lies elsewhere than its thickness maps",
-    law="d(r) = s {cos(c) [cos(b) (cos(a), sin(a)) + sin(b) q] + sin(c) turned(q)}",
+    law=r"\mathbf r \to \mathbf r + \mathbf d(\mathbf r),\quad \sqrt{\langle d^2\rangle} = s",
     parameters=(
         Parameter(
             name="strength",

@@ -33,7 +33,7 @@ def _blur_by_motion(state: LineState, parameters: Mapping[str, float], context: 
 MOTION_BLUR = Effect(
     id="motion_blur",
     title="object moves during the exposure",
-    law="box of length v t M along the belt",
+    law=r"H(f) = \mathrm{sinc}\!\left(\ell f\right),\quad \ell = s\,\frac{t}{50\ \mathrm{ms}}\,\frac{M}{M_\mathrm{usual}}",
     parameters=(
         Parameter(
             name="strength",

@@ -28,7 +28,7 @@ def _add_tail(state: LineState, parameters: Mapping[str, float], context: LineCo
 MTF_TAIL = Effect(
     id="mtf_tail",
     title="optical spread with a long tail",
-    law="(1 - w) G(f) + w / (1 + H f^2) in place of the calibrated G(f)",
+    law=r"H(f) = (1 - s)\,G(f) + \frac{s}{1 + (2\pi L f)^2}",
     parameters=(
         Parameter(
             name="strength",

@@ -21,7 +21,7 @@ def _bend(state: LineState, parameters: Mapping[str, float], context: LineContex
 NONLINEARITY = Effect(
     id="nonlinearity",
     title="response that bends",
-    law="y = x (1 - s x / x_half)",
+    law=r"y = x\,\left(1 - s\,\frac{x}{x_\mathrm{half}}\right)",
     parameters=(
         Parameter(
             name="strength",

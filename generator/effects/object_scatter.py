@@ -228,7 +228,7 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
 OBJECT_SCATTER = Effect(
     id="object_scatter",
     title="radiation scattered by the object",
-    law="S = c (E / E0)^e [a P (-ln T)] * K,  K(R) = h / (2 pi (h^2 + R^2)^(3/2))",
+    law=r"P \to P + s\,(E/E_0)^e\,[a\,P\,(-\ln T)] * K,\quad K(R) = \frac{h}{2\pi\,(h^2 + R^2)^{3/2}}",
     parameters=(
         Parameter(
             name="strength",

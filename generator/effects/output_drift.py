@@ -23,7 +23,7 @@ def _drift_output(state: LineState, parameters: Mapping[str, float], context: Li
 OUTPUT_DRIFT = Effect(
     id="output_drift",
     title="tube output wanders from frame to frame",
-    law="x (1 + e_n), e_n of standard deviation s and correlation (1 - j) exp(-|dt| / tau)",
+    law=r"x_n \to x_n\,(1 + e_n),\quad \mathrm{sd}(e) = s,\quad \mathrm{corr}(e_n, e_m) = (1 - j)\,e^{-|\tau_n - \tau_m|/\tau_c}",
     parameters=(
         Parameter(
             name="strength",

@@ -26,7 +26,7 @@ def _lose_bits(state: LineState, parameters: Mapping[str, float], context: LineC
 QUANTISATION = Effect(
     id="quantisation",
     title="ADC with lost bits",
-    law="step s in place of 1 DN",
+    law=r"y \to s\,\lfloor y / s \rceil",
     parameters=(
         Parameter(name="strength", unit="DN", low=2.0, high=64.0, default=4.0, source="step; 1-6 bits lost", log=True),
     ),

@@ -27,7 +27,7 @@ def _add_row_noise(state: LineState, parameters: Mapping[str, float], context: L
 ROW_NOISE = Effect(
     id="row_noise",
     title="noise common to rows or columns",
-    law="+ r_i to each row (column) of a frame",
+    law=r"y_{ij} \to y_{ij} + r_i,\quad \mathrm{sd}(r) = s\,\sigma_\mathrm{read}\ \text{(new in each frame; columns alike)}",
     parameters=(
         Parameter(
             name="strength",

@@ -34,7 +34,7 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
 VEILING_GLARE = Effect(
     id="veiling_glare",
     title="veiling glare in the detector",
-    law="h = (1 - r) delta + r exp(-R / L) / (2 pi L R)",
+    law=r"H(f) = (1 - s) + \frac{s}{\sqrt{1 + (2\pi L f)^2}}",
     parameters=(
         Parameter(
             name="strength",

@@ -33,16 +33,6 @@ SHIPPED = {"raytwin.data.calibration": "data/calibration"}  # a folder of data w
 ABOVE = {"api", "commands"}  # in src/raytwin, above every room
 COMPOSERS = {"campaign", "commands", "api"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
-NAME_THE_MAP = (
-    "calibration/calibrate.py",
-    "generator/export.py",
-    "generator/generate.py",
-    "generator/generate_described.py",
-    "generator/twin_answer.py",
-    "generator/twin_io.py",
-    "src/raytwin/api/images.py",
-    "src/raytwin/commands/calibrate.py",
-)
 HEAVY = {"torch", "matplotlib", "numpy", "scipy", "h5py", "numba", "spekpy", "xraylib", "xraydb", "dask"}
 HEAVY |= {"statsmodels", "pandas"}
 
@@ -174,6 +164,19 @@ def test_the_check_of_rings_sees_a_planted_one(tmp_path):
     assert ring_in(graph) == []
 
 
+# the map of bad pixels bears the name of an effect; so do words of answers and options that are about this map
+NAME_THE_MAP = (
+    "calibration/calibrate.py",
+    "generator/export.py",
+    "generator/generate.py",
+    "generator/generate_described.py",
+    "generator/twin_answer.py",
+    "generator/twin_io.py",
+    "src/raytwin/api/images.py",
+    "src/raytwin/commands/calibrate.py",
+)
+
+
 def strings_of(path):
     """(line, text) of every string of a file that is no docstring."""
     nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
@@ -200,7 +203,6 @@ def test_no_code_but_the_catalogue_and_the_lab_names_an_effect():
     files = [path for _, path in python_files() if path.relative_to(ROOT).parts[0] != "lab"]
     files = [path for path in files if path.parent != ROOT / "generator" / "effects"]
     named = names_of_effects(files, set(OURS))
-    # a map of the detector bears the name of an effect; so do the words of answers and options that are about this map
     maps = {ROOT / path for path in NAME_THE_MAP}
     assert all(any(place.startswith(str(path)) for place in named) for path in maps), (
         "a file that names the map no more"

@@ -999,6 +999,8 @@ def test_effects_that_make_no_sense_are_refused():
         replace(heel, absorbed="some of it")
     with pytest.raises(InputError, match="variants: got tilt; expected parameters: strength, direction_deg, curvature"):
         replace(heel, grid=Grid(variants=({"tilt": 1.0},)))
+    with pytest.raises(InputError, match="random part lines: got no parameter column_share"):
+        replace(heel, variation=Variation(random="lines"))
     with pytest.raises(InputError, match="random part of an effect: got much"):
         Variation(random="much")
     with pytest.raises(InputError, match=r"series of an effect: got .*film"):

@@ -15,17 +15,8 @@ from ..twin import Twin
 
 EVERY_SERIES = KINDS
 LIT_SERIES = ("flat", "object")
-AXES = (
-    "level",
-    "noise",
-    "sharpness",
-    "texture",
-    "time",
-    "position",
-    "energy",
-    "tails",
-    "task",
-)  # of a diagnosis' answer
+# of a diagnosis' answer
+AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 
 ABSORBED = {
     "nothing": "a flat that calibrated shows it as any other flat does",
@@ -39,9 +30,10 @@ RANDOM = {
     "sides": "more of it on one side of the panel than on the other",
     "offset": "lost bits may be cut off or rounded away: half a step on every level",
     "pixels": "a pattern from pixel to pixel, a part of it smooth",
-    "lines": "means of the lines of a few frames; parameter `column_share`",
-    "output": "level and trend of each lit series; parameters `correlation_s`, `jitter_share`",
+    "lines": "means of the lines of a few frames",
+    "output": "level and trend of each lit series",
 }
+_ASKED_OF_RANDOM = {"lines": ("column_share",), "output": ("correlation_s", "jitter_share")}  # parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,7 +263,14 @@ class Effect:
             )
         if not self.parameters or self.parameters[0].name != "strength":
             raise InputError(f"effect {self.id}", received="no strength", expected="strength as first parameter")
-        known = {item.name for item in self.parameters}
+        known = [item.name for item in self.parameters]
+        missing = [name for name in _ASKED_OF_RANDOM.get(self.variation.random, ()) if name not in known]
+        if missing:
+            raise InputError(
+                f"effect {self.id}, random part {self.variation.random}",
+                received=f"no parameter {missing[0]}",
+                expected="parameters " + ", ".join(_ASKED_OF_RANDOM[self.variation.random]),
+            )
         unknown = [name for choice in self.grid.variants for name in choice if name not in known]
         if unknown:
             raise InputError(

@@ -14,19 +14,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..lab.cases import Case, draw_case
-from ..lab.effect import EffectRequest
-from ..lab.effects import EFFECTS
+from ..lab.cases import SETS, Case, draw_case
+from ..lab.effects import EFFECTS, EffectRequest
 from ._plain import canonical
 
-# effects that the wrong data cannot tell apart: confusions are pooled by these
-SETS: Mapping[str, tuple[str, ...]] = {
-    "A": ("object_scatter", "veiling_glare", "dark_drift", "nonlinearity"),
-    "B": ("kv_error", "filtration_error", "heel", "composition_error"),
-    "C": ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistration"),
-    "D": ("image_lag", "dark_drift", "output_drift"),
-    "E": ("excess_noise", "mtf_tail", "nonlinearity"),
-}
 STREAMS = {"case": 0, "train": 1}
 _DOMAIN = 0x626C696E64  # keeps these draws apart from every other use of the same seed
 _SMALLEST_SEED, _LARGEST_SEED = 10**12, 2**62

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lab.cases import SETS
 from ..lab.effects import EFFECTS as LAB_EFFECTS
-from .blind_cases import SETS
 from .blind_separation import NO_EFFECT, Separation
 
 UNKNOWN = "unknown_effect"

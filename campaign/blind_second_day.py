@@ -13,10 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
-from ..diagnosis.assemble import Problem, build_problem
+from ..diagnosis.assemble import build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
 from ..diagnosis.curves import Curve
 from ..diagnosis.held_out import folds_of, left_over, shrinkage_of
+from ..diagnosis.problem import Problem
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
 

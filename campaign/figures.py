@@ -11,7 +11,7 @@ import numpy as np
 from ..acquisition.dataset_io import read_dataset
 from ..errors import RaytwinError
 from ..generator.twin import Twin
-from ..pod.hit_miss import fit_pod
+from ..pod.repeats import fit_pod
 
 REAL, GENERATED, PUBLISHED = "#1b7f3b", "#c23b22", "#7a7a7a"
 _DPI = 110

@@ -22,6 +22,7 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
+from ..generator.effects.motion_blur import MOTION_BLUR, STATED_MS
 from ..generator.line_limits import frames_per_s
 from ..generator.predict import Prediction, predict_flatfield
 from ..generator.twin import Twin
@@ -30,8 +31,6 @@ from .sweep_file import Campaign, Limits, Pair, Timing, text_of_pair
 if TYPE_CHECKING:
     from ..generator.describe import Description
 
-_MOTION = "motion_blur"
-_MOTION_MS = 50.0  # the effect's strength is the path in this time
 _STRICTER = ("maximum_kV", "maximum_current_mA", "maximum_power_w")
 
 
@@ -208,7 +207,7 @@ def motion_strength_px(instrument: Instrument, setting: Setting) -> float | None
     if setting.belt_speed_mm_s is None or instrument.pixel_mm is None:
         return None
     magnification = instrument.magnification or 1.0
-    path = setting.belt_speed_mm_s * magnification * _MOTION_MS / 1000.0 / instrument.pixel_mm
+    path = setting.belt_speed_mm_s * magnification * STATED_MS / 1000.0 / instrument.pixel_mm
     return path / (instrument.tdi_stages or 1) if instrument.detector == "tdi" else path
 
 
@@ -223,13 +222,13 @@ def twin_at(twin: Twin, pair: Pair) -> tuple[Twin, tuple[str, ...]]:
             return twin, ("the belt's motion is not in the images: the twin does not know its pixel pitch",)
         return twin, ()
     told = []
-    own = [item for item in twin.effects if item.id == _MOTION]
+    own = [item for item in twin.effects if item.id == MOTION_BLUR.id]
     if own:
         told.append("the twin's own motion blur gives way to that of the setting's belt speed")
     if twin.instrument.belt_axis is None:
         told.append("the belt is taken to move along the rows' index: the twin's belt_axis is not declared")
-    motion = AppliedEffect(id=_MOTION, parameters={"strength": strength}, since="calibration")
-    rest = tuple(item for item in twin.effects if item.id != _MOTION)
+    motion = AppliedEffect(id=MOTION_BLUR.id, parameters={"strength": strength}, since="calibration")
+    rest = tuple(item for item in twin.effects if item.id != MOTION_BLUR.id)
     return replace(twin, effects=(*rest, motion)), tuple(told)
 
 
@@ -237,7 +236,7 @@ def _motion_px(instrument: Instrument, pair: Pair) -> float | None:
     """Longest path (px) of the object's image in one exposure; None where no belt moves."""
     strengths = [motion_strength_px(instrument, one) for one in pair]
     paths = [
-        strength * one.exposure_ms / _MOTION_MS
+        strength * one.exposure_ms / STATED_MS
         for strength, one in zip(strengths, pair, strict=True)
         if strength is not None
     ]

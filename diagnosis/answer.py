@@ -8,11 +8,11 @@ from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.twin import Twin
 from ..results import Result, Table, axes_or_new, frame, plain
-from .assemble import Problem
-from .coarse import UNSEEN, parameters_in_pixels, pixels_in_square
+from .coarse import parameters_in_pixels, unseen_in_squares
 from .held_out import Gap
 from .inference import Hypothesis
 from .known_effects import with_found
+from .problem import Problem
 from .readings import Suspect
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
     )
     causes = []
     for cause in diagnosis.causes:
-        share = pixels_in_square(cause.effect, "strength", factor)
+        share = EFFECTS[cause.effect].strength.pixels_per_square(factor)
         value, low, high = cause.strength
         causes.append(
             replace(
@@ -209,7 +209,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
         added=added,
         causes=tuple(causes),
         twin=replace(twin, effects=with_found(twin.effects, added)),
-        not_tested={**diagnosis.not_tested, **UNSEEN},
+        not_tested={**diagnosis.not_tested, **unseen_in_squares()},
         notes=(*diagnosis.notes, text),
     )
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.log_images import light_of_shares
 from ..errors import InputError
-from ..generator.effects import AppliedEffect
-from ..generator.series import ExpectedSeries, beam_conditions, expected_series, session_conditions, with_conditions
+from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.series import beam_conditions, expected_series, session_conditions, with_conditions
 from ..generator.twin import Twin
 from . import changes as scales
 from .calibrated_maps import calibrated_maps, exposure_of
-from .changes import Variant, smooth_twin, spectral_sds, tails_always_there, twin_changes, with_pauses
+from .changes import Variant, always_a_little, smooth_twin, spectral_sds, twin_changes, with_pauses
 from .curves import LEAST_RESPONSE, Curve
 from .defects import memory_of, new_outliers
 from .even_maps import Map
@@ -28,8 +28,8 @@ from .model_scalars import expected_scalars
 from .nuisance_columns import Columns
 from .placing import place_scenes
 from .probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
+from .problem import Problem, SeriesView
 from .responses import Asked, Moved, SeriesModel, SessionModel, session_model
-from .seen import Blocks, Responder
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
 from .session import SessionSeries, only_own_noise, read_session
@@ -41,101 +41,6 @@ _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance i
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
 _NEAR_A_POINT = 0.2
 _PLACES = "places of scenes"
-_WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesView:
-    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
-
-    session: SessionSeries
-    summary: SeriesSummary
-    expected: ExpectedSeries
-    signal_DN: Map
-    residual_DN: Map
-    noise_DN: Map
-    mask: NDArray[np.bool_]
-    floor_rms: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """Everything that inference needs; probes are standardised.
-
-    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
-    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
-    noise's share of each probe's standard deviation; blocks (probe,):
-    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
-    part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
-    calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
-    cannot be judged here and why; conditions of the session that effects know; respond asks the forward model for further
-    variants; side of the squares of the panel's pixels that stand for pixels.
-    """
-
-    residual: NDArray[np.float64]
-    factors: NDArray[np.float64]
-    factor_names: tuple[str, ...]
-    curves: tuple[Curve, ...]
-    variants: tuple[Variant, ...]
-    names: tuple[ProbeName, ...]
-    series_of: NDArray[np.intp]
-    sd: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    groups: NDArray[np.intp]
-    group_names: tuple[str, ...]
-    parts: NDArray[np.intp]
-    part_names: tuple[str, ...]
-    blocks: NDArray[np.intp]
-    views: tuple[SeriesView, ...]
-    base: Twin
-    gain_shares: dict[str, float]
-    dark_weights: dict[float, dict[str, float]]
-    skipped: tuple[str, ...]
-    missing_effects: dict[str, str]
-    conditions: dict[str, float]
-    respond: Responder
-    side: int = 1
-
-    @property
-    def places(self) -> NDArray[np.intp]:
-        """Place of each probe (probe,): one axis of one series."""
-        axes = {axis: number for number, axis in enumerate(dict.fromkeys(name.axis for name in self.names))}
-        return np.array(
-            [
-                int(series) * len(axes) + axes[name.axis]
-                for series, name in zip(self.series_of, self.names, strict=True)
-            ],
-            dtype=np.intp,
-        )
-
-    @property
-    def asked_in_blocks(self) -> Blocks:
-        """Series that share local nuisances, and what it costs to ask the forward model for them."""
-        costs = np.zeros(int(self.blocks.max()) + 1)
-        for number, first in zip(*np.unique(self.series_of, return_index=True), strict=True):
-            scene = self.views[number].session.series.kind == "object"
-            costs[self.blocks[first]] += 1.0 if scene else _WITHOUT_SCENE
-        return Blocks(of=self.blocks, costs=costs)
-
-    def released(self) -> "Problem":
-        """Without the frames' projections that `respond` holds."""
-
-        def spent(asked: Sequence[Variant], wanted: NDArray[np.bool_] | None = None) -> dict[int, NDArray[np.float64]]:
-            raise RuntimeError(f"{len(asked)} variants asked of a problem whose projections were released")
-
-        return replace(self, respond=spent)
-
-    def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
-        """With further variants and their responses (strength, probe)."""
-        curves = []
-        for variant, responses in more:
-            # what an effect does by chance depends on its onset (lost bits lower later levels only), and on the direction of a heel
-            alike = [item for item in self.curves if (item.effect, item.since) == (variant.effect, variant.since)]
-            like = next((item for item in alike if item.variant == variant.refined_from), alike[0])
-            curves.append(variant.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact))
-        return replace(
-            self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
-        )
 
 
 def build_problem(
@@ -192,10 +97,10 @@ def build_problem(
     changes += [Change.of_twin(step) for step in steps_taken]
     changes += [
         replace(model.change(variant, variant.strengths[0]), label=variant.name)
-        for variant in tails_always_there(side=side)
+        for variant in always_a_little(side=side)
     ]
     changes += without_each(model.base)
-    unjudged = {"excess_noise": _OWN_NOISE} if only_own_noise(session) else {}
+    unjudged = _of_quanta() if only_own_noise(session) else {}
     compared = _Compared(
         measured=measured,
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
@@ -504,6 +409,11 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}
 
 
+def _of_quanta() -> dict[str, str]:
+    """Why effects on the statistics of quanta cannot be judged from the noise that calibrates, by id."""
+    return {effect.id: _OWN_NOISE for effect in EFFECTS.values() if effect.stage == "quanta"}
+
+
 def _curves(
     blocks: Sequence[SeriesBlock],
     responses: NDArray[np.float64],
@@ -517,6 +427,7 @@ def _curves(
     base = compared.measured.expected.model.base
     readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
     for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
+        effect = EFFECTS[variant.effect]
         failed = next((compared.asked[row].failed for row in rows if compared.asked[row].failed), "")
         if failed:
             missing.setdefault(variant.effect, failed)
@@ -524,13 +435,13 @@ def _curves(
         own = responses[list(rows)]
         spread = by_chance(variant, blocks, rows[0], readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise
-        wanders = variant.effect == "output_drift" and spread is not None and bool(np.any(spread))
+        wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):
             missing.setdefault(variant.effect, "nothing in this session responds to it")
             continue
         exact = None
-        if variant.effect in scales.DEFINED_BY:
-            exact = np.array([name.statistic in scales.DEFINED_BY[variant.effect] for name in names])
+        if effect.reading.probes:
+            exact = np.array([name.statistic in effect.reading.probes for name in names])
         jitter = jitter_of(variant, blocks, read_noise_DN)
         curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
         chosen.append(variant)

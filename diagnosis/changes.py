@@ -16,96 +16,10 @@ from ..calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLAR
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.effects.effect import Parameter
 from ..generator.twin import Estimate, SpectralPosterior, Twin
-from .coarse import in_squares, pixels_in_square
+from .coarse import in_squares
 from .curves import Curve
-from .probes import ALONG_COLUMNS, ALONG_ROWS, OUTLIERS_ANYWHERE
 
-STRENGTH_SHARES = (0.2, 0.7, 1.0)  # of the way up the plausible range (logarithm) at which responses are computed
-# where the mean is linear in the strength one is enough, where it nearly is two
-ONE_STRENGTH = frozenset(
-    (
-        "object_scatter",
-        "veiling_glare",
-        "mtf_tail",
-        "k_fluorescence",
-        "image_lag",
-        "dark_drift",
-        "nonlinearity",
-        "heel",
-    )
-)
-_ONE_SHARE = (0.8,)
-_TWO_SHARES = (0.6, 1.0)
-_SHARES_OF = {
-    **dict.fromkeys(ONE_STRENGTH, _ONE_SHARE),
-    "focal_spot": (0.25, 0.5, 0.75, 1.0),
-    "motion_blur": (0.0, 0.25, 0.5, 0.75, 1.0),
-    **dict.fromkeys(("composition_error", "kv_error", "filtration_error", "misregistration"), _TWO_SHARES),
-}
 _MOST_VARIANTS = 4
-_PAUSE = next(item for item in EFFECTS["image_lag"].parameters if item.name == "idle_s")
-# what besides is open where an effect came after the calibration
-_IF_LATER = {
-    effect: tuple(item for item in EFFECTS[effect].parameters if item.name in names)
-    for effect, names in {"image_lag": ("before_share",)}.items()
-}
-_PAUSES_S = (1.0, 20.0)  # in which quick traps still hold charge, and in which slow ones have lost most
-_CHOICES: Mapping[str, Sequence[Mapping[str, float]]] = {
-    "misregistration": [
-        *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
-        *(
-            {"direction_deg": 0.0, name: sign * 90.0}
-            for name in ("magnification_deg", "rotation_deg")
-            for sign in (1, -1)
-        ),
-    ],
-    "output_drift": [{"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)],
-    "focal_spot": [{"aspect": aspect, "flatness": 0.3} for aspect in (0.707, 1.414)],
-    "veiling_glare": [{"length_mm": 2.1}, {"length_mm": 9.5}],
-    "mtf_tail": [{"reach_px": 0.84}, {"reach_px": 2.4}],
-    "k_fluorescence": [{"range_mm": 0.15}, {"range_mm": 0.33}],
-    "image_lag": [
-        *({"release_s": time_s, "pause_share": share} for time_s in (0.316, 3.16) for share in (0.0, 1.0)),
-        {"release_s": 0.3, "pause_share": 0.0, "spread": 1.3},  # one kind of traps
-    ],
-    "object_scatter": [
-        {"width_mm": 25.0},
-        {"width_mm": 70.0},
-        {"width_mm": 200.0},
-        {"width_mm": 400.0, "own_directions": 1.0, "energy_exponent": -0.25},
-        {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
-    ],
-}
-# probes that a strength is defined by: there no law can be far off
-DEFINED_BY: Mapping[str, tuple[str, ...]] = {
-    "gain_map_error": ("fixed_pattern",),
-    "image_lag": ("afterglow frames 0-0",),
-    "quantisation": ("codes",),
-    "bad_pixels": (OUTLIERS_ANYWHERE,),
-    "misregistration": (ALONG_ROWS, ALONG_COLUMNS),  # where scenes lie is its shift
-}
-# relative, of a strength read from that probe alone; a gain map's holds only what differs from pixel to pixel
-DEFINED_SD: Mapping[str, float] = {
-    "gain_map_error": 0.12,
-    "image_lag": 0.08,
-    "quantisation": 0.06,
-    "output_drift": 0.12,  # of frames' levels, which calibration has taken in by beam
-}
-# what these do by chance hangs on their inner parameters: they stay those of the grid
-KEPT_AS_THEY_ARE = frozenset(("output_drift",))
-_BOTH_ONSETS = frozenset(
-    (
-        "veiling_glare",
-        "k_fluorescence",
-        "image_lag",
-        "nonlinearity",
-        "dark_drift",
-        "output_drift",
-        "row_noise",
-        "quantisation",
-        "heel",
-    )
-)
 
 # scales of the session that any repeat shows; relative standard deviations unless the name says otherwise
 THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
@@ -128,8 +42,6 @@ EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
 EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again those at one distance
 ROUGH_FIELDS = 24
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
-# of a tail that was always there, which calibration takes for a part of the spread: screens have up to 20 % of their light there
-TAIL_SD_PERCENT = 10.0
 TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
 READ_NOISE_SD = 0.01  # rows and columns of a tenth each add 2 % to the variance, and calibration may leave them out
@@ -147,8 +59,7 @@ FEW_BAD_PIXELS, FEW_BAD_SHARE = 2, 2e-4  # pixels that turn bad in a session: tw
 # of level and gradient where frames were divided by an open field of another time: output, kV, filters and heel may differ
 DIVIDED_LEVEL_SD, DIVIDED_TILT_SD = 0.3, 0.1
 KURTOSIS_SD = 0.04  # of the excess kurtosis that all series have in common
-UNEVEN = frozenset(("dark_drift", "heel"))
-UNEVEN_SHARE = 0.3  # of such an effect: how much more of it there may be on one side of the panel
+UNEVEN_SHARE = 0.3  # of an effect that may be uneven: how much more of it there may be on one side of the panel
 CUT_OFF_SHARE = 0.5  # of a step by which lost bits may lower a level
 PATTERN_WAVES = 8  # cosine waves along each side of a gain map's smooth change, the long ones the larger
 PATTERN_SMOOTH_SHARE = 0.5  # of that change's variance
@@ -229,7 +140,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
     What calibration takes in whole (a constant kV offset, filtration, gain map, more noise) is no gap and is tried as setting in
     after it; what acts on objects alone is the same either way; the rest is tried both ways.
     """
-    strength, *others = (in_squares(effect.id, item, side) for item in effect.parameters)
+    strength, *others = (in_squares(item, side) for item in effect.parameters)
     inner = [item for item in others if item.fitted]
     choices: list[dict[str, float]] = [{}]
     for item in inner:
@@ -250,26 +161,25 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
             )
         grown = [{**choice, item.name: value} for choice in choices for value in values]
         choices = grown if len(grown) <= _MOST_VARIANTS else [{**c, item.name: item.default} for c in choices]
-    if effect.id in _CHOICES:
+    if effect.grid.variants:
         choices = [
             {item.name: item.default for item in inner}
-            | {name: value / pixels_in_square(effect.id, name, side) for name, value in choice.items()}
-            for choice in _CHOICES[effect.id]
+            | {name: value / effect.pixels_per_square(name, side) for name, value in choice.items()}
+            for choice in effect.grid.variants
         ]
     signs = (1.0, -1.0) if strength.signed else (1.0,)
     low, high = strength.low, strength.high
-    shares = _SHARES_OF.get(effect.id, STRENGTH_SHARES)
-    nodes = tuple(low * (high / low) ** share for share in shares)
-    usual = "calibration" if effect.after_calibration else "always"
-    onsets = ("always", "calibration") if effect.id in _BOTH_ONSETS else (usual,)
+    nodes = tuple(low * (high / low) ** share for share in effect.grid.shares)
+    usual = effect.usual_onset
+    open_if_later = tuple(item for item in effect.parameters if item.fitted_if_later)
     result = []
-    for choice, sign, since in product(choices, signs, onsets):
+    for choice, sign, since in product(choices, signs, effect.onsets):
         label = ", ".join(f"{name} {value:.3g}" for name, value in choice.items())
         if sign < 0:
             label = f"{label}, negative".strip(", ")
         if since != usual:
             label = f"{label}, {'always' if since == 'always' else 'since the calibration'}".strip(", ")
-        later = _IF_LATER.get(effect.id, ()) if since == "calibration" else ()
+        later = open_if_later if since == "calibration" else ()
         result.append(
             Variant(
                 effect=effect.id,
@@ -292,14 +202,22 @@ def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
         return list(variants)
     result = []
     for variant in variants:
-        if variant.effect != "image_lag" or _PAUSE.name in variant.parameters:
-            result.append(variant)
-            continue
-        for idle_s in _PAUSES_S:
-            known = {**variant.parameters, _PAUSE.name: idle_s}
-            name = f"{variant.name}, {_PAUSE.name} {idle_s:g}"
-            result.append(replace(variant, name=name, parameters=known, fitted=(*variant.fitted, _PAUSE)))
+        grown = [variant]
+        for item in EFFECTS[variant.effect].parameters:
+            if item.tried_without_times and item.name not in variant.parameters:
+                grown = [_with_tried(one, item, value) for one in grown for value in item.tried_without_times]
+        result += grown
     return result
+
+
+def _with_tried(variant: Variant, item: Parameter, value: float) -> Variant:
+    """The variant with one more inner parameter, from a value."""
+    return replace(
+        variant,
+        name=f"{variant.name}, {item.name} {value:g}",
+        parameters={**variant.parameters, item.name: value},
+        fitted=(*variant.fitted, item),
+    )
 
 
 def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Variant]:
@@ -413,12 +331,16 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
     return result
 
 
-def tails_always_there(*, side: int = 1) -> list[Variant]:
-    """Tails of the spread that are no effect, at one prior standard deviation: short and long ones, always there."""
+def always_a_little(*, side: int = 1) -> list[Variant]:
+    """What most lines have of some effects, at one prior standard deviation: tails of the spread, short and long ones."""
     result = []
-    for variant in variants_of(EFFECTS["mtf_tail"], side=side):
-        name = f"tail of the spread, {variant.name}"
-        result.append(replace(variant, name=name, since="always", strengths=(TAIL_SD_PERCENT,)))
+    for effect in EFFECTS.values():
+        little = effect.always_a_little
+        if little is None:
+            continue
+        for variant in variants_of(effect, side=side):
+            name = f"{little.name}, {variant.name}"
+            result.append(replace(variant, name=name, since="always", strengths=(little.strength,)))
     return result
 
 

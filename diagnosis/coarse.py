@@ -8,11 +8,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..generator.effects.effect import Parameter
+from ..generator.effects import EFFECTS, Parameter
 
 LEAST_SIDE = 16  # rows and columns below which pictures say nothing
 LARGEST_PIXELS = 2**15  # of a frame that is diagnosed as it is
-UNSEEN = {"quantisation": "codes are lost where frames are averaged"}
 
 
 def coarse_factor(shape: tuple[int, int]) -> int:
@@ -26,27 +25,17 @@ def coarse_factor(shape: tuple[int, int]) -> int:
     return max(1, min(factor, min(shape) // LEAST_SIDE))
 
 
-def pixels_in_square(effect: str, name: str, factor: int) -> float:
-    """By what a parameter that was found in squares is multiplied to mean pixels."""
-    if (effect, name) in (("motion_blur", "strength"), ("misregistration", "strength"), ("mtf_tail", "reach_px")):
-        return float(factor)  # lengths
-    if name != "strength":
-        return 1.0
-    if effect == "bad_pixels":
-        return 1.0 / factor**2  # a bad pixel spoils its square
-    if effect == "row_noise":
-        return 1.0 / math.sqrt(factor)  # over the read noise, which falls with the side, the line's with its root
-    if effect == "gain_map_error":
-        return float(factor)  # of a pattern from pixel to pixel
-    return 1.0
+def unseen_in_squares() -> dict[str, str]:
+    """Why effects cannot be seen in squares of pixels, by id."""
+    return {effect.id: effect.lost_in_squares for effect in EFFECTS.values() if effect.lost_in_squares}
 
 
-def in_squares(effect: str, parameter: Parameter, factor: int) -> Parameter:
+def in_squares(parameter: Parameter, factor: int) -> Parameter:
     """A parameter with its range as it is where squares stand for pixels."""
-    share = pixels_in_square(effect, parameter.name, factor)
+    share = parameter.pixels_per_square(factor)
     return replace(parameter, low=parameter.low / share, high=parameter.high / share, default=parameter.default / share)
 
 
 def parameters_in_pixels(effect: str, parameters: Mapping[str, float], factor: int) -> dict[str, float]:
     """Parameters of an effect, strength with them, that were found with squares of pixels."""
-    return {name: value * pixels_in_square(effect, name, factor) for name, value in parameters.items()}
+    return {name: value * EFFECTS[effect].pixels_per_square(name, factor) for name, value in parameters.items()}

@@ -5,7 +5,6 @@ square. Numbers are not whole any more.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from ..acquisition.coarser import means_of_squares
 from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.psf import blur_variance_share
 from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpectralPosterior, Twin, gaussian_spread
-from .coarse import pixels_in_square
 
 _MODEL = "sampled"
 _WIDEST = 8.0  # squares that light may spread over
@@ -125,12 +123,11 @@ def _effect(item: AppliedEffect, factor: int) -> AppliedEffect:
     """An effect that the twin has, with lengths in squares; what it does not state has its default, in pixels."""
     if item.id not in EFFECTS:
         return item
-    values: Mapping[str, float] = EFFECTS[item.id].values(item.parameters)
+    effect = EFFECTS[item.id]
+    values = effect.values(item.parameters)
     found = dict(item.parameters)
-    for name, value in values.items():
-        share = pixels_in_square(item.id, name, factor)
+    for parameter in effect.parameters:
+        share = parameter.pixels_per_square(factor)
         if share != 1.0:
-            found[name] = value / share
-    if item.id == "bad_pixels":
-        found["strength"] = min(found["strength"], 100.0)
+            found[parameter.name] = min(values[parameter.name] / share, parameter.most)
     return replace(item, parameters=found)

@@ -11,7 +11,7 @@ from ..generator.twin import Twin
 from .answer import Diagnosis, in_pixels
 from .assemble import build_problem
 from .changes import catalogue_variants
-from .coarse import UNSEEN
+from .coarse import unseen_in_squares
 from .inference import UNKNOWN, Hypothesis, Priors
 from .judgement import judge
 from .known_effects import already_there, lasting
@@ -46,7 +46,7 @@ def diagnose(
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
     had = {} if twin is None else already_there(twin.effects)
-    unseen = UNSEEN if session.factor > 1 else ()
+    unseen = unseen_in_squares() if session.factor > 1 else {}
 
     def judged(with_effects: Twin, left_out: Sequence[str]) -> Diagnosis:
         problem = build_problem(

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .answer import Diagnosis
-from .assemble import SeriesView
 from .inference import UNKNOWN
+from .problem import SeriesView
 
 _BEFORE, _AFTER, _FLOOR = "#b3402a", "#2a6fb3", "#777777"
 _DEPTH_TICKS = (

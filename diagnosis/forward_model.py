@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..generator.effects import EFFECTS, AppliedEffect
-from ..generator.effects.registration import angles_of, parts_px
+from ..generator.effects.effect import Displacement, Placement
 from ..generator.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
 from ..generator.twin import Twin
 from .changes import OF_BEAMS_GROWS, TwinChange, Variant, departures_found
@@ -18,18 +18,9 @@ from .registration import SHARP_PX
 from .session import SessionSeries
 
 _CACHE_BYTES = 200_000_000
-_KNOW_WHEN = frozenset(
-    ("heel", "bad_pixels", "gain_map_error")
-)  # effects that look otherwise where calibration has seen them
-_TAKEN_IN = frozenset(("heel",))  # the twin's own maps hold what was always there of these, beam by beam
-_ON_OBJECTS_ALONE = frozenset(
-    {item.id for item in EFFECTS.values() if item.stage == "object_blur"}
-    | {"misregistration", "object_scatter", "composition_error"}
-)
-# beside blurs: effects that make edges look as if they lay elsewhere
-_RESHAPES = frozenset(("misregistration", "object_scatter", "composition_error"))
-# what singles pixels out
-_STANDS_OUT = frozenset(("bad_pixels", "gain_map_error"))
+_IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
+_IN_MAPS_OF_BEAMS = "maps of beams"  # the twin's own maps hold what was always there of these
+_OBJECTS_ALONE = ("object",)
 _ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 
@@ -71,47 +62,49 @@ class Change:
         for effect in self.effects:
             if effect.since == "calibration" and not request.after_calibration:
                 continue
-            if can_show(effect.id, request) and not (effect.id in _ON_OBJECTS_ALONE and self.only_displaces):
+            series = EFFECTS[effect.id].shows.series
+            if request.kind in series and not (series == _OBJECTS_ALONE and self.only_displaces):
                 return True
         return False
 
     @property
     def only_displaces(self) -> bool:
         """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
-        misplaced = self._misplaced
-        return misplaced is not None and math.hypot(misplaced.radial, misplaced.turn) <= _ALL_SHIFT * misplaced.size
+        if self._misplaced is None:
+            return False
+        lies = self._misplaced.lies
+        return math.hypot(lies.radial_px, lies.turn_px) <= _ALL_SHIFT * lies.size_px
 
     @property
     def displacement(self) -> dict[str, float]:
         """Displacement (px) that the change brings to a scene's picture, by probe; empty: none."""
-        misplaced = self._misplaced
-        if misplaced is None:
+        if self._misplaced is None:
             return {}
-        angle = math.radians(misplaced.effect.parameters.get("direction_deg", 0.0))
-        return {ALONG_ROWS: misplaced.shift * math.cos(angle), ALONG_COLUMNS: misplaced.shift * math.sin(angle)}
+        lies = self._misplaced.lies
+        angle = math.radians(lies.direction_deg)
+        return {ALONG_ROWS: lies.shift_px * math.cos(angle), ALONG_COLUMNS: lies.shift_px * math.sin(angle)}
 
     def found_in_place(self) -> "Change":
         """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
         misplaced = self._misplaced
         if misplaced is None or self.only_displaces:
             return self
-        rest = {**angles_of(0.0, misplaced.radial, misplaced.turn), "direction_deg": 0.0}
         effect = misplaced.effect
         others = (item for item in self.effects if item is not effect)
-        return replace(self, effects=(*others, replace(effect, parameters={**effect.parameters, **rest})))
+        rest = misplaced.placement.without_shift(effect.parameters)
+        return replace(self, effects=(*others, replace(effect, parameters=rest)))
 
     @property
     def _misplaced(self) -> "_Misplaced | None":
         for effect in self.effects:
-            if effect.id == "misregistration":
-                size = effect.parameters["strength"]
-                angles = {name: effect.parameters.get(name, 0.0) for name in ("magnification_deg", "rotation_deg")}
-                return _Misplaced(effect, abs(size), *parts_px(size, **angles))
+            placement = EFFECTS[effect.id].placement
+            if placement is not None:
+                return _Misplaced(effect, placement, placement.parts(effect.parameters))
         return None
 
     def whenever_it_began(self, request: SeriesRequest) -> object | None:
         """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
-        if len(self.effects) != 1 or self.effects[0].id in _KNOW_WHEN or not self.touches(request):
+        if len(self.effects) != 1 or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS or not self.touches(request):
             return None
         effect = self.effects[0]
         if effect.since == "always" and any(not item.after_calibration for item in request.previous):
@@ -121,32 +114,11 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class _Misplaced:
-    """A misregistration in px: its rms size, and the parts of it that shift, enlarge and turn."""
+    """An effect that displaces scenes, and how they lie with it."""
 
     effect: AppliedEffect
-    size: float
-    shift: float
-    radial: float
-    turn: float
-
-
-def can_show(effect: str, request: SeriesRequest) -> bool:
-    """Whether an effect of the catalogue can move a series at all, whatever its law."""
-    if effect in _ON_OBJECTS_ALONE:
-        return request.kind == "object"
-    if EFFECTS[effect].stage in ("beam", "arrivals", "quanta", "optics", "exposure"):
-        return request.beam_on
-    return True
-
-
-def can_displace(effect: str) -> bool:
-    """Whether an effect of the catalogue, or what is wrong with its law, can seem to move a scene's picture."""
-    return effect in _RESHAPES or EFFECTS[effect].stage in ("object_blur", "optics")
-
-
-def can_stand_out(effect: str) -> bool:
-    """Whether an effect of the catalogue, or what is wrong with its law, can make single pixels stand out of their neighbours."""
-    return effect in _STANDS_OUT
+    placement: Placement
+    lies: Displacement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,9 +179,10 @@ class ForwardModel:
 
     def _asked(self, request: SeriesRequest, change: Change) -> ExpectedSeries:
         effects = (*change.twin.effects, *change.effects)
-        if self.own_maps and any(item.id in _TAKEN_IN and item.since == "always" for item in effects):
+        in_maps = {item.id for item in effects if EFFECTS[item.id].absorbed == _IN_MAPS_OF_BEAMS}
+        if self.own_maps and any(item.id in in_maps and item.since == "always" for item in effects):
             acting = (item for item in effects if item.since == "always" or request.after_calibration)
-            effects = tuple(replace(item, since="calibration") if item.id in _TAKEN_IN else item for item in acting)
+            effects = tuple(replace(item, since="calibration") if item.id in in_maps else item for item in acting)
             request = replace(request, after_calibration=True)
         return expected_series(
             change.twin,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .assemble import Problem, SeriesView
 from .curves import Curve
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
 from .local_nuisances import LocalNuisances
+from .problem import Problem, SeriesView
 from .strengths import strengths_on
 
 _SHOWN = 5.0  # standard deviations from which a probe shows it

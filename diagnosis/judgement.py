@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.twin import Twin
 from .answer import Cause, Diagnosis, Place
-from .assemble import Problem
 from .curve_fits import CurveFit, fit_curve
 from .curves import Curve
 from .doubts import doubts_of
@@ -23,6 +22,7 @@ from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
 from .plan import WORTH_IT, best_repeat, repeat_text
+from .problem import Problem
 from .refine import refine
 from .strengths import applied_at_best, strength_of
 from .unknown import unknown_evidence

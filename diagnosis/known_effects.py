@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from ..generator.effects import EFFECTS, AppliedEffect
+from ..generator.effects import EFFECTS, AppliedEffect, effect_of
 
 # what these do to mean frames by chance is in no law: they are sought again, and take the place of those the twin has
-_BY_CHANCE = frozenset(("output_drift", "gain_map_error", "row_noise", "quantisation"))
+_IN_NO_LAW = ("output", "pixels", "lines", "offset")
 
 
 def already_there(effects: Sequence[AppliedEffect]) -> dict[str, str]:
@@ -20,7 +20,7 @@ def already_there(effects: Sequence[AppliedEffect]) -> dict[str, str]:
 
 def lasting(effects: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:
     """Effects of a twin that are part of what is expected of a session."""
-    return tuple(item for item in effects if item.id not in _BY_CHANCE)
+    return tuple(item for item in effects if effect_of(item).variation.random not in _IN_NO_LAW)
 
 
 def with_found(effects: Sequence[AppliedEffect], added: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:

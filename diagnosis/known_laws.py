@@ -6,7 +6,6 @@ A session may also show that such an effect is no longer there, or of another st
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from .changes import Variant
 from .forward_model import Change
 from .inexact_laws import LAW_ERRORS, LAW_PROBE_SHARE, group_factors
 from .local_nuisances import LocalNuisances
-
-if TYPE_CHECKING:
-    from .assemble import Problem
+from .problem import Problem
 
 _LAW_ERROR = LAW_ERRORS[0][0]
 _STRENGTH_SD = 0.12  # relative: as far as intervals of strengths are widened
@@ -40,7 +37,7 @@ def without_each(base: Twin) -> list[Change]:
     ]
 
 
-def beside_known(problem: "Problem", responses: NDArray[np.float64], effects: Sequence[str]) -> "Problem":
+def beside_known(problem: Problem, responses: NDArray[np.float64], effects: Sequence[str]) -> Problem:
     """The problem with what the laws of effects in its base leave open: strength, a share in each group of probes and in each probe.
 
     Args:
@@ -124,7 +121,7 @@ def changed_effect(location: str) -> str | None:
 
 
 def known_strengths(
-    problem: "Problem", nuisances: LocalNuisances, *, of: Sequence[str] | None = None, sd: float = _STRENGTH_SD
+    problem: Problem, nuisances: LocalNuisances, *, of: Sequence[str] | None = None, sd: float = _STRENGTH_SD
 ) -> tuple[KnownStrength, ...]:
     """How strong a session shows each effect that its base has, where any strength is possible, the likeliest change first.
 
@@ -158,7 +155,7 @@ def known_strengths(
     return tuple(sorted(found, key=lambda item: -item.log_evidence))
 
 
-def with_any_strength(problem: "Problem", effects: Sequence[str]) -> "Problem":
+def with_any_strength(problem: Problem, effects: Sequence[str]) -> Problem:
     """The problem with these effects of its base as strong as the session shows them, 0 among that."""
     names = {_STRENGTH_OF.format(effect) for effect in effects}
     scale = np.array([CHANGED_SD / _STRENGTH_SD if name in names else 1.0 for name in problem.factor_names])

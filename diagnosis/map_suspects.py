@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.effects import EFFECTS
 from .label_model import DEEPEST, INHERENT_MM_AL, LabelModel, measured_depth
 from .readings import FloatArray, Reading, Suspect
 
@@ -17,7 +18,6 @@ _INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
 _FITS_BETTER = 0.3  # share of what is missing from 1 that another map may leave
 _SCALE_OFF = 0.22  # logarithm of a map's scale that no composition explains
-_LIKE_SHORTER_PATHS = ("object_scatter", "veiling_glare")  # light behind an object that did not come straight
 _SCALE_AGREES = 0.07  # scatter takes more from thick parts, and not the same at every voltage
 _LOG_FACTORS = tuple(round(0.02 * step, 2) for step in range(-40, 41))
 _SHIFTS_PX = (-4, -2, 0, 2, 4)
@@ -227,7 +227,9 @@ def _scaled(
                     text=f"the thickness maps of {scene} fit its frames only if all path lengths are {math.exp(middle):.2f}"
                     " times as long",
                     evidence=100.0,
-                    or_effects=_LIKE_SHORTER_PATHS if middle < 0.0 else (),
+                    or_effects=tuple(
+                        name for name, effect in EFFECTS.items() if middle < 0.0 and effect.shows.like_thinner
+                    ),
                 )
             )
     return found

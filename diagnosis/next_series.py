@@ -24,10 +24,11 @@ from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError, RaytwinError
 from ..generator.series import SeriesRequest, expected_series, sample_series, with_conditions
 from ..generator.twin import Twin
-from .assemble import Problem, build_problem
+from .assemble import build_problem
 from .changes import Variant
 from .curves import Curve
 from .nuisances import Nuisances
+from .problem import Problem
 from .whitening import Whitening
 
 FRAMES = 20  # of each series that is planned

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..generator.effects import EFFECTS
-from .assemble import Problem
 from .curves import Curve
 from .nuisances import Nuisances
+from .problem import Problem
 from .whitening import Whitening
 
 _GRID = 41  # strengths of a competitor, evenly in the logarithm
@@ -23,30 +23,6 @@ CLEAR = 5.0  # standard deviations
 _REPEATS = 4  # times as many frames
 _CANDIDATES = 4
 WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
-
-# what shows an effect by itself; also what a session has to hold for it to be told from its like
-ISOLATED_BY = {
-    "object_scatter": "a slab at two gaps to the detector, or a beam stop",
-    "veiling_glare": "opaque discs of several sizes",
-    "focal_spot": "an edge at two magnifications",
-    "mtf_tail": "an edge close to the detector, with flats",
-    "k_fluorescence": "the same at a tube voltage below the scintillator's K edge (30 kV) and above it (60 kV)",
-    "image_lag": "frames with the beam off straight after an exposure",
-    "nonlinearity": "flats at several exposure times and one current",
-    "dark_drift": "darks in between, at the longest exposure time",
-    "output_drift": "frames with an open field beside the object",
-    "kv_error": "flats and two materials of known thickness at several tube voltages",
-    "filtration_error": "flats at two tube voltages with and without a known filter",
-    "heel": "a flat with the panel turned by 180 degrees, and a wedge at two places",
-    "row_noise": "darks",
-    "bad_pixels": "darks and flats",
-    "excess_noise": "flats of many frames at several levels",
-    "quantisation": "darks and flats at finely spaced levels",
-    "motion_blur": "an edge at several exposure times of equal charge",
-    "misregistration": "a grid of balls, or an edge in two directions",
-    "gain_map_error": "flats repeated, and behind a filter",
-    "composition_error": "a certified wedge of the product's material",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,8 +110,8 @@ def _usual(
     lengths: of a curve (number) at strengths (strength,), standard deviations.
     """
     own = [number for number, curve in enumerate(curves) if curve.effect == effect]
-    after = effect in EFFECTS and EFFECTS[effect].after_calibration
-    usual = [number for number in own if curves[number].since == ("calibration" if after else "always")] or own
+    onset = EFFECTS[effect].usual_onset
+    usual = [number for number in own if curves[number].since == onset] or own
     ranked = sorted(usual, key=lambda number: float(lengths(number, np.array([_middle(curves[number])]))[0]))
     return ranked[(len(ranked) - 1) // 2]
 
@@ -165,9 +141,9 @@ def repeat_text(
             f" {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
         )
     isolating = "; ".join(
-        f"{effect} by {ISOLATED_BY[effect]}"
+        f"{effect} by {EFFECTS[effect].isolated_by}"
         for effect in (*first, *second)
-        if effect in ISOLATED_BY and (effect in first) != (effect in second)
+        if effect in EFFECTS and (effect in first) != (effect in second)
     )
     too_little = (
         f"no series of this session will do: {repeat.times} times as many frames of the best one, {repeat.series}, tell"

@@ -12,7 +12,7 @@ from ..generator.twin import Twin
 from ..results import Result, Table, axes_or_new, frame, plain
 from .assemble import build_problem
 from .changes import catalogue_variants
-from .coarse import UNSEEN, pixels_in_square
+from .coarse import unseen_in_squares
 from .known_effects import already_there
 from .plan import Distinguishability, distinguishability
 from .preparation import mislabelled, prepare_session
@@ -106,7 +106,10 @@ def plan_session(
     suspects = tuple(item for item in session.suspects if not item.or_effects)
     if suspects:
         raise mislabelled(acquisition, suspects)
-    unseen = {**({} if twin is None else already_there(twin.effects)), **(UNSEEN if session.factor > 1 else {})}
+    unseen = {
+        **({} if twin is None else already_there(twin.effects)),
+        **(unseen_in_squares() if session.factor > 1 else {}),
+    }
     problem = build_problem(
         session.acquisition,
         session.twin,
@@ -117,7 +120,7 @@ def plan_session(
         progress=progress,
     )
     found = distinguishability(problem)
-    shares = [pixels_in_square(effect, "strength", session.factor) for effect in found.effects]
+    shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
         cannot_be_judged={**problem.missing_effects, **unseen},

@@ -10,7 +10,6 @@ frames, lines, blocks, the common factor, codes, fixed pattern and outliers.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
 ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"  # of a scene

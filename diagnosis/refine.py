@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..generator.effects.registration import angles_of, parts_px
+from ..generator.effects import EFFECTS
+from ..generator.effects.effect import Placement
 from .changes import Variant
 from .curve_fits import CurveFit
 from .curves import Curve
@@ -94,8 +95,9 @@ class _Refinement:
                 (self._variants[task.effect, fit.curve.variant], fit)
                 for fit in _starts_of(clear, task.leads or task.beside is None)
             ]
-            if task.effect == "misregistration":
-                starts += _displaced_and_distorted(clear, self._variants)
+            placement = EFFECTS[task.effect].placement
+            if placement is not None:
+                starts += _displaced_and_distorted(clear, self._variants, placement)
         best: _Closer | None = None
         for variant, fit in starts:
             found = searched(variant, fit, seen)
@@ -140,31 +142,25 @@ def _separation(fit: CurveFit, seen: "Seen") -> float:
 
 
 def _displaced_and_distorted(
-    fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant]
+    fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant], placement: Placement
 ) -> list[tuple[Variant, CurveFit]]:
-    """A misregistration that shifts as the best mere shift does, and enlarges or turns as the best that does so.
+    """A displacement that shifts as the best mere shift does, and enlarges or turns as the best that does so.
 
     From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
     """
-    best: dict[bool, CurveFit] = {}
+    best: dict[bool, tuple[CurveFit, dict[str, float]]] = {}
     for fit in sorted(fits, key=lambda item: item.log_evidence):
-        shift, *_ = _parts_of(variants[fit.curve.effect, fit.curve.variant], fit.best)
-        best[abs(shift) > 0.5 * fit.best] = fit
+        known = variants[fit.curve.effect, fit.curve.variant].parameters
+        parameters = {**known, "strength": fit.best}
+        best[abs(placement.parts(parameters).shift_px) > 0.5 * fit.best] = fit, parameters
     if len(best) < 2:
         return []
-    variant = variants[best[True].curve.effect, best[True].curve.variant]
-    shift, *_ = _parts_of(variant, best[True].best)
-    _, radial, turn = _parts_of(variants[best[False].curve.effect, best[False].curve.variant], best[False].best)
-    angles = angles_of(abs(shift), radial, turn)
-    strength = min(max(angles.pop("strength"), variant.low), variant.high)
-    found = replace(best[True], strengths=np.array([strength]), log_likelihood=np.zeros(1))
-    return [(replace(variant, parameters={**variant.parameters, **angles}, name=f"{variant.name}, distorted"), found)]
-
-
-def _parts_of(variant: Variant, strength: float) -> tuple[float, float, float]:
-    """Shift, enlargement and turn (px) of a misregistration."""
-    angles = {name: variant.parameters.get(name, 0.0) for name in ("magnification_deg", "rotation_deg")}
-    return parts_px(strength, **angles)
+    shift, shifted = best[True]
+    variant = variants[shift.curve.effect, shift.curve.variant]
+    parameters = placement.combined(shifted, best[False][1])
+    strength = min(max(parameters.pop("strength"), variant.low), variant.high)
+    found = replace(shift, strengths=np.array([strength]), log_likelihood=np.zeros(1))
+    return [(replace(variant, parameters=parameters, name=f"{variant.name}, distorted"), found)]
 
 
 def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..generator.effects.effect import Parameter
-from .changes import KEPT_AS_THEY_ARE, ONE_STRENGTH, Variant
+from ..generator.effects import EFFECTS, Parameter
+from .changes import Variant
 from .curve_fits import CurveFit
 from .curves import Curve
 from .seen import Seen
@@ -26,9 +26,8 @@ _UP_TO = (0.75, 1.0)  # where more cannot be asked: the spectrum ends a tenth ab
 
 def searched(variant: Variant, fit: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
     """A variant brought to where the probes want it, with its responses (strength, probe) to all; None: it cannot be asked."""
-    inner = [
-        item for item in variant.fitted if item.name in variant.parameters and variant.effect not in KEPT_AS_THEY_ARE
-    ]
+    refined = EFFECTS[variant.effect].grid.refined
+    inner = [item for item in variant.fitted if refined and item.name in variant.parameters]
     some = seen.where_told(fit)
     found: _Found | None = _Search(variant, fit.curve, some).run(fit.best, _in_turn(inner))
     if found is not None and some is not seen:
@@ -88,7 +87,7 @@ class _Search:
         self._like = seen.cut(like)
         self._seen = seen
         # one strength tells the others where the response grows in proportion
-        self._in_proportion = variant.effect in ONE_STRENGTH
+        self._in_proportion = len(EFFECTS[variant.effect].grid.shares) == 1
 
     def run(self, strength: float, parts: Sequence[Sequence[Parameter]], *, rounds: int | None = None) -> _Found | None:
         """Parts of the inner parameters, one after the other, from a strength; None: it cannot be asked."""

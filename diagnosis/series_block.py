@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.effects import EFFECTS
 from . import changes as scales
 from .changes import Variant
 from .nuisance_columns import (
@@ -83,7 +84,7 @@ def series_block(
     pattern, jitter = changed_gain_pattern(probes, signal)
     by_side = uneven(
         probes,
-        {number: found[0] for number, found in known if asked[number].change.label in scales.UNEVEN},
+        {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
         signal.shape,
     )
     return SeriesBlock(
@@ -102,6 +103,11 @@ def series_block(
     )
 
 
+def _random_of(label: str) -> str:
+    """What is random of a change; nothing of a nuisance."""
+    return EFFECTS[label].variation.random if label in EFFECTS else ""
+
+
 def _places(blocks: Sequence[SeriesBlock]) -> list[slice]:
     """Where each series' probes lie among those of all."""
     stops = np.cumsum([len(block) for block in blocks])
@@ -116,18 +122,19 @@ def by_chance(
     A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
     a part of a gain map's change is smooth; bits that are cut off lower every level. row: number of the variant's first change.
     """
-    if variant.effect in scales.UNEVEN:
+    random = EFFECTS[variant.effect].variation.random
+    if random == "sides":
         sides = np.zeros((sum(map(len, blocks)), 2))
         for block, place in zip(blocks, _places(blocks), strict=True):
             if row in block.uneven:
                 sides[place] = block.uneven[row].T
         return sides * (scales.UNEVEN_SHARE / variant.strengths[0])
-    if variant.effect == "quantisation" and variant.since == "calibration":
+    if random == "offset" and variant.since == "calibration":
         # lost bits may be cut off or rounded away: half a step between the two
         return np.concatenate([block.offset for block in blocks])[:, None] * scales.CUT_OFF_SHARE
-    if variant.effect == "gain_map_error":
+    if random == "pixels":
         return np.concatenate([block.pattern for block in blocks])
-    return _of_output(variant, blocks, readout_ms) if variant.effect == "output_drift" else None
+    return _of_output(variant, blocks, readout_ms) if random == "output" else None
 
 
 def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
@@ -135,9 +142,10 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
 
     A gain map changes from pixel to pixel; lines of a few frames differ by chance in their means.
     """
-    if variant.effect == "gain_map_error":
+    random = EFFECTS[variant.effect].variation.random
+    if random == "pixels":
         return np.concatenate([block.pattern_jitter for block in blocks])
-    if variant.effect == "row_noise":
+    if random == "lines":
         columns = variant.parameters["column_share"]
         shares = read_noise_DN**2 * np.array([1.0 - columns, columns])
         every = variant.since == "always"

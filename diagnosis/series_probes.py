@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..generator.effects import EFFECTS
 from . import changes as scales
 from .calibrated_maps import CalibratedMaps
 from .changes import Variant
@@ -22,22 +23,6 @@ from .summaries import LEAST_NOISE_DN2, SeriesSummary
 
 _NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
-_AXIS_OF_EFFECT = {
-    "object_scatter": "level",
-    "veiling_glare": "sharpness",
-    "focal_spot": "sharpness",
-    "mtf_tail": "sharpness",
-    "k_fluorescence": "sharpness",
-    "motion_blur": "sharpness",
-    "misregistration": "sharpness",
-    "image_lag": "time",
-    "dark_drift": "level",
-    "nonlinearity": "level",
-    "kv_error": "energy",
-    "filtration_error": "energy",
-    "composition_error": "energy",
-    "heel": "position",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,7 +247,7 @@ def _templates(
         templates += _ghost_templates(one, session.series, signal.shape)
     templates += [
         Template(
-            axis=_AXIS_OF_EFFECT.get(variant.effect, "position"),
+            axis=EFFECTS[variant.effect].shows.axis,
             name=f"like {variant.effect} {variant.name}".strip(),
             unit="1",
             image=image,

@@ -7,20 +7,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..generator.effects import AppliedEffect
+from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
-from .assemble import Problem, SeriesView, map_changes
-from .changes import DEFINED_SD
+from .assemble import map_changes
 from .curve_fits import fit_curve
 from .even_maps import Map, mean_over
 from .inference import Hypothesis
 from .nuisances import Nuisances
 from .output_course import rms_about_mean
+from .problem import Problem, SeriesView
 
-_LAW_SD = 0.12  # relative, of a strength as real effects have it
-# the same where it is known better or worse: 34 sealed voltages and filters were off by 2 % rms; a K photon's reach stands for how
-# many there are: eleven shares were off by 25 %
-_LAW_SDS = {"kv_error": 0.05, "filtration_error": 0.05, "k_fluorescence": 0.25}
 _NODES = 800
 _BEYOND_NODES = 2.0  # times the outermost strengths asked
 _MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
@@ -37,7 +33,7 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
 
     A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
     """
-    if effect == "output_drift":
+    if EFFECTS[effect].reading.frame_levels:
         return _applied(problem, hypothesis, effect, strength_of(problem, hypothesis, effect)[0])
     return _applied(problem, hypothesis, effect, hypothesis.strengths[effect][0])
 
@@ -53,14 +49,14 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
 
     Where the session shows what the strength means, it is read from there, whatever the rest of the law asks for.
     """
-    curve = hypothesis.variants[effect]
+    curve, reading = hypothesis.variants[effect], EFFECTS[effect].reading
     found = None
-    if effect == "output_drift":
-        found = _output_rms(problem, hypothesis)
-    elif effect in DEFINED_SD and curve.exact is not None and bool(curve.exact.any()):
+    if reading.frame_levels:
+        found = _output_rms(problem, hypothesis, effect)
+    elif reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
-    sd = _LAW_SDS.get(effect, _LAW_SD) if found is None else DEFINED_SD[effect]
+    sd = reading.law_sd if found is None or reading.sd is None else reading.sd
     below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
     return value, value * math.exp(-below), value * math.exp(above)
 
@@ -88,14 +84,14 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
 
 
-def _output_rms(problem: Problem, hypothesis: Hypothesis) -> tuple[float, float, float] | None:
+def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[float, float, float] | None:
     """Rms of the output over the lit frames, %, about their mean; None: beside another effect hardly any level is known.
 
     Slow and fast parts of an output that wanders are no one law, but every frame tells its own level. Levels of the calibrating
     series went into the twin, so the mean over the session says nothing of the output.
     """
-    others = [effect for effect in hypothesis.effects if effect != "output_drift"]
-    since = hypothesis.variants["output_drift"].since == "calibration"
+    others = [effect for effect in hypothesis.effects if effect != output]
+    since = hypothesis.variants[output].since == "calibration"
     signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
     noises = [_noise_of_a_frame(view) for view in problem.views]
     fields = [_open_field(view) for view in problem.views]

@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .assemble import Problem
+from ..generator.effects import EFFECTS
 from .held_out import Gap
 from .inexact_laws import law_terms
 from .inference import UNKNOWN, Hypothesis
 from .local_nuisances import LocalNuisances
+from .problem import Problem
 
 _MOST_LEFT = 0.45  # of the held-out gap that an explanation may leave
 # of a probe that shows the gap: of 19 sealed effects named rightly none left more than 0.16, of 25 sessions of a second simulator
 # one 0.22; of eleven taken for another name once their own was withheld seven left 0.34 to 1
 _MOST_LEFT_TYPICALLY = 0.3
-# a voltage and a filter act as physics has it, whoever simulates them: six right ones left nothing of the gap, of seven named for
-# the other five 0.39 to 0.44
-_ACTS_EXACTLY = frozenset(("kv_error", "filtration_error"))
+# where all effects act as physics has it, whoever simulates them: of voltages and filters six right ones left nothing of the gap,
+# of seven named for the other five 0.39 to 0.44
 _MOST_LEFT_EXACTLY = 0.25
 # of the gap's sum of squares: right explanations of twelve sessions had less than 0.001, lost bits 0.103, off-focal radiation
 # named glare 0.27 to 0.42 in three
@@ -33,8 +33,6 @@ _USUALLY_LEFT = 0.6  # of a probe's square where nothing is wrong: floors make i
 # what an effect does by chance, rms over what is expected: right gain maps and output drifts 0.4 to 0.8, tiles and their seams
 # named gain map 3.4 to 8.7
 _MOST_PULLED = 2.0
-# times the strength that the rest shows, which what it does by chance may have: slow and fast parts of a drift are not one law
-_LOOSELY_TIED = {"output_drift": 3.0}
 _LEAST_CHANCES = 5  # parts of what an effect does by chance that must show
 _LEAST_UNFIT = 0.1  # of the probes' number: what is usually left is no better known
 # share of an explanation's probability: 48 of 49 sealed cases stated as certain were exactly right, and 112 of 122 of two runs
@@ -66,7 +64,7 @@ def leaves_too_much(gap: Gap, leading: Hypothesis) -> bool:
     if gap.contradicted > _MOST_CONTRADICTED:
         return True
     left = math.sqrt(max(gap.after**2 - null**2, 0.0)) / math.sqrt(gap.before**2 - null**2)
-    if _ACTS_EXACTLY.issuperset(leading.effects):
+    if all(EFFECTS[effect].variation.exact for effect in leading.effects):
         return left > _MOST_LEFT_EXACTLY
     return left > _MOST_LEFT and (gap.left is None or not _plausible(leading))
 
@@ -107,7 +105,7 @@ def misfit_of(problem: Problem, leading: Hypothesis) -> Misfit:
         if curve.jitter is not None:
             own = own + strength**2 * curve.jitter
         if curve.spread is not None:
-            factors.append(strength * _LOOSELY_TIED.get(effect, 1.0) * curve.spread)
+            factors.append(strength * EFFECTS[effect].variation.loosely_tied * curve.spread)
             chances.append(slice(width, width + curve.spread.shape[1]))
             width += curve.spread.shape[1]
         factors.append(of_law)

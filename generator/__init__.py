@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     )
     from .predict import (
         Prediction,
+        Predictions,
         predict_flatfield,
         predict_flatfields,
         slope_share,
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
         Levels,
         predict_levels,
     )
+    from .predict_settings import asked_settings, predict_words
     from .projection import (
         project_polychromatic,
     )
@@ -127,10 +129,12 @@ if TYPE_CHECKING:
         estimate_from_sd,
         gaussian_spread,
     )
+    from .twin_answer import calibration_answer, tube_table, twin_table
     from .twin_io import (
         read_twin,
         write_twin,
     )
+    from .twin_plot import plot_levels
     from .two_material import (
         TwoMaterialSolution,
         TwoMaterialTables,
@@ -164,8 +168,9 @@ _LAZY = {
     "PairTransfer": "generate",
     "Parameter": "effects",
     "Prediction": "predict",
+    "Predictions": "predict",
     "Scene": "describe",
-    "SeriesRequest": "series",
+    "SeriesRequest": "series_request",
     "SpectralModel": "spectral_signal",
     "SpectralPosterior": "twin",
     "TopUp": "topup",
@@ -224,6 +229,12 @@ _LAZY = {
     "transfer_pair": "transfer",
     "with_conditions": "series",
     "write_twin": "twin_io",
+    "asked_settings": "predict_settings",
+    "calibration_answer": "twin_answer",
+    "plot_levels": "twin_plot",
+    "predict_words": "predict_settings",
+    "tube_table": "twin_answer",
+    "twin_table": "twin_answer",
 }
 
 __all__ = [
@@ -252,6 +263,7 @@ __all__ = [
     "PairTransfer",
     "Parameter",
     "Prediction",
+    "Predictions",
     "Scene",
     "SeriesRequest",
     "SpectralModel",
@@ -265,8 +277,10 @@ __all__ = [
     "TwoMaterialTables",
     "UncalibratedLine",
     "apply_top_up",
+    "asked_settings",
     "beam_conditions",
     "blur_variance_share",
+    "calibration_answer",
     "compute_contrast_map",
     "deposit_spread_from_photons",
     "digitise",
@@ -284,10 +298,12 @@ __all__ = [
     "noise_kernel_1d",
     "optical_kernel_1d",
     "plan_top_up",
+    "plot_levels",
     "predict_contrast",
     "predict_flatfield",
     "predict_flatfields",
     "predict_levels",
+    "predict_words",
     "project_polychromatic",
     "published_delta_r",
     "published_parameters",
@@ -310,6 +326,8 @@ __all__ = [
     "spectral_model_of",
     "tabulate_two_materials",
     "transfer_pair",
+    "tube_table",
+    "twin_table",
     "with_conditions",
     "write_twin",
 ]

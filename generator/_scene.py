@@ -24,7 +24,7 @@ from .twin import Level, Twin
 from .twin_spectrum import gain_of_slope, spectral_model_of, white_gain_DN
 
 if TYPE_CHECKING:
-    from .series import SeriesRequest
+    from .series_request import SeriesRequest
 
 _SCALES = (
     "log_output",

@@ -8,12 +8,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ._frames import Frames
 from ._noise_constants import (
     EXPANSION_FROM,
     MIX_64,
@@ -26,9 +27,6 @@ from ._noise_constants import (
     STEP_64,
     STRIDE,
 )
-
-if TYPE_CHECKING:
-    from .kernels import _Frames
 
 _SUMMANDS_AT_ONCE = 2**26  # pixels times energies of a projection: 0.25 GB
 _PIXELS_AT_ONCE = 2**24  # frames of a stack are taken together up to this many: some 60 bytes a pixel
@@ -226,7 +224,7 @@ def _spread_both(image: Any, taps: tuple[float, ...], rows: int, columns: int) -
     return image
 
 
-def sample(request: "_Frames", *, device: str | None, fused: bool = False) -> Any:
+def sample(request: Frames, *, device: str | None, fused: bool = False) -> Any:
     """Frames (frame, row, column) float32 on the device; `fused` lets torch's compiler join the steps."""
     import torch
 
@@ -247,7 +245,7 @@ def sample(request: "_Frames", *, device: str | None, fused: bool = False) -> An
     return result
 
 
-def _sample_piece(request: "_Frames", maps: dict[str, Any], frames: Any, *, fused: bool) -> Any:
+def _sample_piece(request: Frames, maps: dict[str, Any], frames: Any, *, fused: bool) -> Any:
     import torch
 
     def step_of(name: str) -> Any:

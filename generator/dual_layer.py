@@ -9,10 +9,9 @@ from ..acquisition.setting import Setting
 from ..errors import InputError
 from ..materials import transmission
 from ..spectra import BIN_WIDTH_KEV, detector_response
-from .predict import estimate_from_log_draws
 from .present_line import present_line
 from .spectral_signal import OpenBeam
-from .twin import Estimate, Twin
+from .twin import Estimate, Twin, estimate_from_log_draws
 from .twin_spectrum import spectral_model_of
 
 

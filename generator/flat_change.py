@@ -14,23 +14,11 @@ import numpy as np
 from ..acquisition.setting import Setting
 from ..errors import InputError
 from .effects import AppliedEffect, effect_of
-from .series import ExpectedSeries, ModelCache, SeriesRequest, expected_series
+from .series import ExpectedSeries, ModelCache, expected_series
+from .series_request import SeriesRequest
 from .twin import Twin
 
 _STEADY_S = 3600.0  # of beam before the frames that are predicted
-# they need an object, leave the mean above dark alone, or move single pixels only
-_NOTHING_IN_FLATS = (
-    "object_scatter",
-    "focal_spot",
-    "motion_blur",
-    "misregistration",
-    "composition_error",
-    "dark_drift",
-    "bad_pixels",
-    "gain_map_error",
-)
-# calibration takes these in as a whole
-ABSORBED = ("mtf_tail", "veiling_glare", "k_fluorescence", "image_lag", "row_noise", "quantisation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +59,7 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
     cache = ModelCache()
     usable: list[AppliedEffect] = []
     for item in effects:
-        if item.id in _NOTHING_IN_FLATS or (item.since == "always" and item.id in ABSORBED):
+        if not effect_of(item).shows.flats or is_in_noise(item):
             continue
         try:
             _flat(twin, (item,), setting, cache)
@@ -79,7 +67,7 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
         except InputError as error:
             warnings.append(f"effect {item.id} is left out: {error}")
     found = _change(twin, usable, setting, cache)
-    bent = [item for item in usable if item.id == "nonlinearity" and item.since == "always"]
+    bent = [item for item in usable if has_always_bent(item)]
     calibrated_DN = _calibrated_signal_DN(twin, setting)
     if bent and calibrated_DN is not None:
         there = _change(twin, bent, _at_signal(setting, calibrated_DN / _level(_flat(twin, (), setting, cache))), cache)
@@ -87,6 +75,16 @@ def flat_change(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting) 
     elif bent:
         found = _change(twin, [item for item in usable if item not in bent], setting, cache)
     return replace(found, warnings=tuple(warnings))
+
+
+def is_in_noise(item: AppliedEffect) -> bool:
+    """Whether the calibrated spread, slope and read noise hold the effect: flats stay as calibrated."""
+    return item.since == "always" and effect_of(item).absorbed == "noise"
+
+
+def has_always_bent(item: AppliedEffect) -> bool:
+    """Whether the effect acts on the response and was there when levels were calibrated."""
+    return item.since == "always" and effect_of(item).stage == "response"
 
 
 def _at_signal(setting: Setting, factor: float) -> Setting:

@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..files import sha256_of_file
 from .as_published import published_parameters, sample_as_published
 from .binning import refuse_binning
-from .effects import AppliedEffect
+from .effects import AppliedEffect, effect_of
 from .image_effects import ImageEffects
 from .predict import predict_flatfield
 from .present_line import present_line
@@ -538,7 +538,8 @@ class ReferenceImages:
         self._settings = [reference_settings(reference.rows[number], reference_setting) for number in self.numbers]
         # a beam that is another one since calibration is reached as another setting is
         other_beam = now.spectral is not None and any(
-            item.since == "calibration" and item.id in ("kv_error", "filtration_error") for item in twin.effects
+            item.since == "calibration" and effect.stage == "beam" and effect.worked_in is not None
+            for item, effect in zip(twin.effects, map(effect_of, twin.effects), strict=True)
         )
         self._needs_transfer = {
             pair: (other_beam and recipe == "raytwin")
@@ -637,8 +638,9 @@ def effect_warnings(channels: Sequence[ChannelModel], *, references: bool) -> li
         if channel.image_effects is None:
             continue
         found.update(dict.fromkeys(channel.image_effects.warnings))
-        if references and any(item.id == "composition_error" for item in channel.image_effects.effects):
-            found["effect composition_error is not in the images: references show the product as it is"] = None
+        for effect in map(effect_of, channel.image_effects.effects if references else ()):
+            if effect.images.not_in_references:
+                found[f"effect {effect.id} is not in the images: {effect.images.not_in_references}"] = None
     return list(found)
 
 

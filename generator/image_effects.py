@@ -20,19 +20,14 @@ from ._fine_picture import FineCells, pixel_means
 from ._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
 from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, effect_of, in_order
-from .flat_change import ABSORBED
+from .flat_change import has_always_bent, is_in_noise
 from .line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
 from .projection import project_polychromatic
-from .series import SeriesRequest
+from .series_request import SeriesRequest
 from .spectral_signal import OpenBeam, SpectralModel
 from .twin import Twin
 from .twin_spectrum import spectral_model_of
 
-NOT_IN_IMAGES = {
-    "image_lag": "what was exposed before an image is not known",
-    "dark_drift": "it depends on the time in a session",
-    "misregistration": "picture and masks stay together",
-}
 _PICTURE = ("arrivals", "object_blur", "optics")
 _HOT_SIGMAS = 20.0  # of the read noise, as in series of frames
 
@@ -104,7 +99,7 @@ class ImageEffects:
         self._end = open_beam
         self.pattern = noise_pattern(self.twin.noise.spread.value, open_beam)
         self.open_charge_DN = self._unbent(self.open_signal_DN)
-        spread = [item for item in self.effects if item.id in ABSORBED and item.since == "always"]
+        spread = [item for item in self.effects if is_in_noise(item)]
         base = self.twin.noise.spread.value
         left = noise_pattern(base, self._through(self._open_state(), spread, None)).share
         self.gain_factor = noise_pattern(base, self._open_state()).share / left
@@ -116,9 +111,10 @@ class ImageEffects:
         usable, told = [], []
         slab = {self.product_material: np.full(self.twin.maps.shape, 10.0)}
         for item in self.effects:
-            if item.id in NOT_IN_IMAGES:
-                told.append(f"effect {item.id} is not in the images: {NOT_IN_IMAGES[item.id]}")
-            elif self._model is None and "spectral" in effect_of(item).needs:
+            effect = effect_of(item)
+            if effect.images.left_out:
+                told.append(f"effect {item.id} is not in the images: {effect.images.left_out}")
+            elif self._model is None and "spectral" in effect.needs:
                 told.append(f"effect {item.id} is not in the images: the twin has no spectral part")
             else:
                 try:
@@ -130,7 +126,7 @@ class ImageEffects:
 
     def _unbent(self, measured_DN: FloatArray) -> FloatArray:
         """Charge that a response that was always bent shows as `measured_DN`."""
-        always = [item for item in self.effects if item.id == "nonlinearity" and item.since == "always"]
+        always = [item for item in self.effects if has_always_bent(item)]
         if not always:
             return measured_DN
         bend = self._through(self._open_state(), always, None).bend_per_DN
@@ -249,7 +245,7 @@ class ImageEffects:
             state = replace(state, picture=FinePicture(fine=FineCells(cells), scale=level, signal_DN=means))
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
         state = self._through(state, later, thickness_mm)
-        if focal_blur_px > 0 and all(item.id != "focal_spot" for item in self.effects):
+        if focal_blur_px > 0 and not any(effect_of(item).images.spot for item in self.effects):
             state = replace(state, object_transfers=(*state.object_transfers, _gaussian(focal_blur_px)))
         return self._image_of(state)
 

@@ -6,18 +6,17 @@ whatever the number of threads and however a stack is cut into pieces.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ._frames import FloatMap, Frames
 from ._noise_constants import LARGEST_INVERTED, TAPS_TOGETHER
 
 BACKENDS = ("cpu", "torch", "torch_compiled")
 _HIGHEST = 1e15  # DN: products of two of them still fit single precision
-_FloatMap = NDArray[np.float32]
 
 
 def draw_key(rng: np.random.Generator) -> int:
@@ -48,39 +47,6 @@ def deposit_spread_from_photons(
     number, signal, gain = (np.asarray(one, dtype=np.float64) for one in (photons, signal_DN, gain_DN))
     second = number * gain / (1.0 + white_fraction) / np.where(signal > 0, signal, np.inf)
     return np.asarray(np.clip(second - 1.0, 0.0, None))
-
-
-@dataclass(frozen=True, slots=True)
-class _Frames:
-    """What both ways of computing take: checked maps (frame or 1, row or 1, column or 1), float32, and numbers.
-
-    The maps are arrays, or all of them torch tensors.
-    """
-
-    signal: Any
-    relative: Any
-    slope: Any  # quantum variance per signal
-    step: Any  # third cumulant over variance
-    excess: Any  # squared coefficient of variation of the deposits
-    read_variance: Any
-    dark: Any
-    white_fraction: float
-    kernel: _FloatMap
-    signal_kernel: _FloatMap  # empty: the signal is not spread
-    reach: int
-    electronics: bool
-    steps_a_DN: float
-    lowest: float
-    highest: float
-    signal_share: float  # 1, or 0 for noise alone
-    key: int
-    first_frame: int
-    frames: int
-
-    def of(self, name: str, frame: int) -> _FloatMap:
-        """One frame's map of `name` (row or 1, column or 1)."""
-        values: _FloatMap = getattr(self, name)
-        return np.asarray(values[frame if len(values) > 1 else 0])
 
 
 def is_tensor(values: object) -> bool:
@@ -122,7 +88,7 @@ def _map(name: str, values: Any, shape: tuple[int, int, int], *, low: float, uni
     return _single(full)
 
 
-def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> _FloatMap:
+def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> FloatMap:
     if values is None:
         return np.ones(1, dtype=np.float32)
     kernel = np.asarray(values, dtype=np.float64)
@@ -135,7 +101,7 @@ def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> _F
     return np.asarray(kernel[cut : len(kernel) - cut], dtype=np.float32)
 
 
-def _with_reach(kernel: _FloatMap, reach: int) -> _FloatMap:
+def _with_reach(kernel: FloatMap, reach: int) -> FloatMap:
     """The kernel with zeros up to `reach` on both sides, and at the end up to a multiple of the taps taken together."""
     missing = reach - len(kernel) // 2
     length = 2 * reach + 1
@@ -167,7 +133,7 @@ def _prepare(
     first_frame: int,
     frames: int | None,
     with_signal: bool = True,
-) -> _Frames:
+) -> Frames:
     given: Any = signal_DN if is_tensor(signal_DN) else np.asarray(signal_DN)
     if given.ndim not in (2, 3):
         raise InputError(
@@ -216,7 +182,7 @@ def _prepare(
     if quantised:
         # each of the averaged frames was rounded; rounding their mean to 1 / averaged DN gives 1 / averaged^2 of it
         read = read + (1.0 / averaged - 1.0 / averaged**2) / 12.0
-    return _Frames(
+    return Frames(
         signal=maps["signal"],
         relative=maps["relative"],
         slope=_single(slope / averaged),
@@ -358,7 +324,7 @@ def _check_backend(backend: str) -> None:
 
 
 def _sample(
-    request: _Frames,
+    request: Frames,
     stuck: tuple[tuple[Any, ...], NDArray[np.float32]] | None,
     *,
     single: bool,
@@ -439,7 +405,7 @@ def sample_quanta(
     return _sample(request, None, single=np.ndim(signal_DN) == 2 and frames is None, backend=backend, device=device)
 
 
-def _sample_compiled(request: _Frames) -> NDArray[np.float32]:
+def _sample_compiled(request: Frames) -> NDArray[np.float32]:
     from ._numba_kernels import fill_frame, fill_quanta
 
     rows, columns = request.signal.shape[-2:]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from ._fine_picture import FineCells
-    from .series import SeriesRequest
+    from .series_request import SeriesRequest
     from .spectral_signal import SpectralModel
     from .twin import Twin
 

@@ -1,8 +1,8 @@
 """Flatfield of a twin at a setting, measured or not: mean, noise, gain, photons and dose, with 95 % intervals."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
 from ..errors import InputError
-from ..results import Result, Table, interval_text
+from ..results import Result, Table, axes_or_new, frame, interval_text
 from ..spectra import checked_kV
 from .binning import binned_pixel
 from .line_limits import check_count_rate, check_limits
 from .present_line import PresentLine, present_line
 from .spectral_signal import OpenBeam
-from .twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_sd
+from .twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
 from .twin_spectrum import slope_over_gain, slope_share, spectral_model_of
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Prediction",
     "binned_over_single",
-    "estimate_from_log_draws",
     "predict_flatfield",
     "predict_flatfields",
     "slope_share",
     "spectral_model_of",
 ]
 
+WORDS = ("filter", *(field.name for field in fields(Setting) if field.name != "filters"))  # of a setting
 # what a prediction holds, and in which unit
 UNITS = {
     "mean_DN": "DN above dark",
@@ -92,8 +92,6 @@ class Prediction(Result):
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """One row: the words of the setting, then every quantity with the ends of its interval."""
-        from .predict_settings import Predictions
-
         return Predictions(predictions=(self,)).to_dataframe()
 
     def _table(self) -> Table:
@@ -102,6 +100,79 @@ class Prediction(Result):
         notes = [f"warning: {text}" for text in self.warnings]
         title = f"{self.setting}{' (extrapolated)' if self.extrapolated else ''}"
         return Table(title=title, header=("", "value", "95 % interval", "unit"), rows=tuple(rows), notes=tuple(notes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Predictions(Result):
+    """Flatfields at several settings, in the order asked for."""
+
+    predictions: tuple[Prediction, ...]
+
+    def __len__(self) -> int:
+        return len(self.predictions)
+
+    def __iter__(self) -> Iterator[Prediction]:
+        return iter(self.predictions)
+
+    def __getitem__(self, number: int) -> Prediction:
+        return self.predictions[number]
+
+    def to_dict(self) -> dict[str, Any]:
+        """`{"predictions": [...]}`, each as `raytwin predict --json` prints it."""
+        return {"predictions": [item.to_dict() for item in self.predictions]}
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row a setting: its words (kV, filter, ...), then every quantity with the ends of its interval."""
+        return frame([{**_words_of(item.setting), **item.to_dict()} for item in self.predictions])
+
+    def plot(self, ax: Any = None, *, what: str = "mean_DN", against: str = "kV") -> Any:
+        """A quantity with its 95 % interval against a word of the settings; returns the axes.
+
+        Args:
+            ax: matplotlib axes; None: of a new figure.
+            what: `mean_DN`, `sd_DN`, `gain_DN`, `photons_absorbed` or `air_kerma_uGy`.
+            against: kV, exposure_ms, power_W, current_mA, averaged, binning or source_detector_mm.
+
+        Raises:
+            InputError: another quantity, or a word that some setting leaves open.
+        """
+        if what not in UNITS:
+            raise InputError("what", received=repr(what), expected="one of " + ", ".join(UNITS))
+        places = [_words_of(item.setting).get(against) for item in self.predictions]
+        if not all(isinstance(place, int | float) for place in places):
+            raise InputError("against", received=repr(against), expected="a number that every setting states")
+        known = [
+            (place, getattr(item, what))
+            for place, item in zip(places, self.predictions, strict=True)
+            if getattr(item, what) is not None
+        ]
+        axes = axes_or_new(ax)
+        values = [item.value for _, item in known]
+        ends = [[item.value - item.low for _, item in known], [item.high - item.value for _, item in known]]
+        axes.errorbar([place for place, _ in known], values, yerr=ends, fmt="o", capsize=3)
+        axes.set(xlabel=against, ylabel=f"{what} ({UNITS[what]})")
+        return axes
+
+    def _table(self) -> Table:
+        names = ("mean_DN", "sd_DN", "gain_DN")
+        rows = []
+        for item in self.predictions:
+            answer = item.to_dict()
+            cells = [" (".join(filter(None, interval_text(answer[name]))) for name in names]
+            closed = [f"{cell})" if "(" in cell else cell for cell in cells]
+            rows.append((str(item.setting), *closed, "yes" if item.extrapolated else ""))
+        title = f"{len(rows)} predictions, value (95 % interval)"
+        return Table(title=title, header=("setting", *names, "extrapolated"), rows=tuple(rows))
+
+
+def _words_of(setting: Setting) -> dict[str, Any]:
+    """The words of a setting that are stated, by name."""
+    words: dict[str, Any] = {}
+    for name in WORDS:
+        value = text_from_filters(setting.filters) if name == "filter" else getattr(setting, name)
+        if value is not None:
+            words[name] = value
+    return words
 
 
 def binned_over_single(twin: Twin, binning: int) -> float:
@@ -130,15 +201,6 @@ def _relative_sd(estimate: Estimate) -> float:
 
 def _estimate_from_draws(draws: NDArray[np.float64], relative_sd: float) -> Estimate:
     return estimate_from_log_draws(np.log(draws), relative_sd)
-
-
-def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) -> Estimate:
-    """Median and 95 % interval of exp(logarithm) (draw,) times a lognormal of `relative_sd`, in the draws' unit."""
-    middle = float(np.median(logarithm))
-    low, high = np.quantile(logarithm, [0.025, 0.975])
-    below = math.hypot(middle - min(low, middle), 1.959964 * relative_sd)
-    above = math.hypot(max(high, middle) - middle, 1.959964 * relative_sd)
-    return Estimate(value=math.exp(middle), low=math.exp(middle - below), high=math.exp(middle + above))
 
 
 def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:

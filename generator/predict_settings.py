@@ -1,95 +1,19 @@
 """Predictions for people: settings as objects, texts or words, one or many."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ..acquisition.setting import Filter, Setting, filters_from_text, setting_from_text, text_from_filters
+from ..acquisition.setting import Filter, Setting, filters_from_text, setting_from_text
 from ..errors import InputError
 from ..materials import material_from_name
-from ..results import Result, Table, axes_or_new, frame, interval_text
 from .dual_layer import predict_back_layer
 from .line_limits import frames_per_s
-from .predict import UNITS, Prediction, predict_flatfield
+from .predict import WORDS, Prediction, Predictions, predict_flatfield
 from .twin import Twin
 
 if TYPE_CHECKING:
-    import pandas
-
-_WORDS = ("filter", *(field.name for field in fields(Setting) if field.name != "filters"))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class Predictions(Result):
-    """Flatfields at several settings, in the order asked for."""
-
-    predictions: tuple[Prediction, ...]
-
-    def __len__(self) -> int:
-        return len(self.predictions)
-
-    def __iter__(self) -> Iterator[Prediction]:
-        return iter(self.predictions)
-
-    def __getitem__(self, number: int) -> Prediction:
-        return self.predictions[number]
-
-    def to_dict(self) -> dict[str, Any]:
-        """`{"predictions": [...]}`, each as `raytwin predict --json` prints it."""
-        return {"predictions": [item.to_dict() for item in self.predictions]}
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """A row a setting: its words (kV, filter, ...), then every quantity with the ends of its interval."""
-        return frame([{**_words_of(item.setting), **item.to_dict()} for item in self.predictions])
-
-    def plot(self, ax: Any = None, *, what: str = "mean_DN", against: str = "kV") -> Any:
-        """A quantity with its 95 % interval against a word of the settings; returns the axes.
-
-        Args:
-            ax: matplotlib axes; None: of a new figure.
-            what: `mean_DN`, `sd_DN`, `gain_DN`, `photons_absorbed` or `air_kerma_uGy`.
-            against: kV, exposure_ms, power_W, current_mA, averaged, binning or source_detector_mm.
-
-        Raises:
-            InputError: another quantity, or a word that some setting leaves open.
-        """
-        if what not in UNITS:
-            raise InputError("what", received=repr(what), expected="one of " + ", ".join(UNITS))
-        places = [_words_of(item.setting).get(against) for item in self.predictions]
-        if not all(isinstance(place, int | float) for place in places):
-            raise InputError("against", received=repr(against), expected="a number that every setting states")
-        known = [
-            (place, getattr(item, what))
-            for place, item in zip(places, self.predictions, strict=True)
-            if getattr(item, what) is not None
-        ]
-        axes = axes_or_new(ax)
-        values = [item.value for _, item in known]
-        ends = [[item.value - item.low for _, item in known], [item.high - item.value for _, item in known]]
-        axes.errorbar([place for place, _ in known], values, yerr=ends, fmt="o", capsize=3)
-        axes.set(xlabel=against, ylabel=f"{what} ({UNITS[what]})")
-        return axes
-
-    def _table(self) -> Table:
-        names = ("mean_DN", "sd_DN", "gain_DN")
-        rows = []
-        for item in self.predictions:
-            answer = item.to_dict()
-            cells = [" (".join(filter(None, interval_text(answer[name]))) for name in names]
-            closed = [f"{cell})" if "(" in cell else cell for cell in cells]
-            rows.append((str(item.setting), *closed, "yes" if item.extrapolated else ""))
-        title = f"{len(rows)} predictions, value (95 % interval)"
-        return Table(title=title, header=("setting", *names, "extrapolated"), rows=tuple(rows))
-
-
-def _words_of(setting: Setting) -> dict[str, Any]:
-    """The words of a setting that are stated, by name."""
-    words: dict[str, Any] = {}
-    for name in _WORDS:
-        value = text_from_filters(setting.filters) if name == "filter" else getattr(setting, name)
-        if value is not None:
-            words[name] = value
-    return words
+    pass
 
 
 def as_filters(value: str | Filter | Sequence[str | Filter]) -> tuple[Filter, ...]:
@@ -120,9 +44,9 @@ def as_setting(value: Setting | str | Mapping[str, Any]) -> Setting:
         return value
     if isinstance(value, str):
         return as_setting(setting_from_text(value))
-    unknown = [name for name in value if name not in _WORDS]
+    unknown = [name for name in value if name not in WORDS]
     if unknown:
-        raise InputError("setting", received=unknown[0], expected="words among " + ", ".join(_WORDS))
+        raise InputError("setting", received=unknown[0], expected="words among " + ", ".join(WORDS))
     for name in ("kV", "exposure_ms"):
         if value.get(name) is None:
             raise InputError("setting", received=f"no {name}", expected="kV and exposure_ms, and power_W or current_mA")

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..acquisition.setting import Setting
 from ..errors import InputError
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
 from .defects import gain_pattern, new_bad_pixels
 from .effects import AppliedEffect, Effect, effect_of, in_order
-from .effects.scatter import mean_signal_energy_keV
 from .line_state import FloatArray, LagLaw, LineContext, LineState
 from .rounding import rounded_variance
+from .series_request import SeriesRequest
+from .spectral_signal import mean_signal_energy_keV
 from .twin import Twin
 
 __all__ = [
@@ -41,7 +41,6 @@ __all__ = [
     "with_conditions",
 ]
 
-KINDS = ("dark", "flat", "object", "afterglow")
 _LAGS = 3
 _FOLLOWED = 2  # pictures exposed before a series' own, the last ones, whose fading is followed one by one
 _BEFORE_EXPOSURE = frozenset(("beam", "arrivals", "object_blur", "quanta", "optics"))
@@ -56,77 +55,9 @@ _OF_THE_SPREAD = (
     "panel_rotation_deg",
 )
 _OF_THE_LIGHT = (*_OF_THE_SPREAD, "open_signal_DN", "product_material", "scene_kind", "displacement_px")
-_TIMED = frozenset(("motion_blur",))  # of the effects before the exposure, those that depend on how long it takes
 _HARMONICS = 6  # of the ADC's staircase; needed only where the noise is below half a step
 _ROUNDED_SD = 0.7  # of noise, in steps of the ADC: from there on the staircase's first harmonic is below 1e-4 of a step
 _HOT_SIGMAS = 20.0  # of the read noise: offset of a new hot pixel in the samples
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeriesRequest:
-    """What one series of an acquisition states; None where unknown.
-
-    Fields: kind (`dark`, `flat`, `object`, `afterglow`); setting (kV, filters, load, exposure, averaged, distance);
-    frames; exposure_ms; frame_interval_ms (from the begin of a stored frame to the next one's); start_s (since the
-    session's begin); index; thickness_mm: material of the scene -> (row, column); source_object_mm, source_detector_mm;
-    belt_speed_mm_s, belt_axis (`row` or `column`: the axis along which the object moves); panel_rotation_deg;
-    after_calibration (later than the series that calibrated the twin); previous: exposures before this one that lag may
-    remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
-    open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
-    material of the scene that is the product; scene_kind (`wedge`, `slab`, `edge`, `disc`, `product`);
-    displacement_px: how far along rows and columns the scene is known to lie from where its thickness maps have it;
-    pause_stated: start_s says how long nothing was exposed before the series.
-    """
-
-    kind: str
-    setting: Setting | None
-    frames: int
-    exposure_ms: float
-    frame_interval_ms: float | None = None
-    start_s: float = 0.0
-    index: int = 0
-    thickness_mm: Mapping[str, NDArray[np.floating]] | None = None
-    source_object_mm: float | None = None
-    source_detector_mm: float | None = None
-    belt_speed_mm_s: float | None = None
-    belt_axis: str = "row"
-    panel_rotation_deg: float = 0.0
-    after_calibration: bool = True
-    previous: tuple["SeriesRequest", ...] = ()
-    averaged: int = 1
-    open_signal_DN: float | None = None
-    product_material: str | None = None
-    scene_kind: str | None = None
-    displacement_px: tuple[float, float] = (0.0, 0.0)
-    pause_stated: bool = True
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError("kind of series", received=self.kind, expected="one of " + ", ".join(KINDS))
-        if self.frames < 1 or self.averaged < 1:
-            raise InputError("frames of a series", received=min(self.frames, self.averaged), expected="1 or more")
-        if not (math.isfinite(self.exposure_ms) and self.exposure_ms >= 0 and math.isfinite(self.start_s)):
-            raise InputError("exposure_ms", received=self.exposure_ms, expected="a finite exposure of 0 ms or more")
-        if not all(math.isfinite(value) for value in self.displacement_px):
-            raise InputError("displacement_px", received=self.displacement_px, expected="two finite numbers, px")
-        if self.belt_axis not in ("row", "column"):
-            raise InputError("belt_axis", received=self.belt_axis, expected="row or column")
-
-    @property
-    def beam_on(self) -> bool:
-        """Whether photons arrive."""
-        return self.kind in ("flat", "object")
-
-    @property
-    def exposures_per_frame(self) -> int:
-        """Exposures averaged into one stored frame."""
-        return self.averaged if self.setting is None else max(self.setting.averaged, self.averaged)
-
-    def interval_s(self, readout_ms: float | None) -> float:
-        """Time from the begin of one exposure to the next one's, s."""
-        if self.frame_interval_ms is not None and self.frame_interval_ms > 0:
-            return self.frame_interval_ms / 1000.0 / self.exposures_per_frame
-        return max(self.exposure_ms + (readout_ms or 0.0), 1e-6) / 1000.0
 
 
 def session_conditions(requests: Sequence[SeriesRequest], *, readout_ms: float | None = None) -> dict[str, float]:
@@ -439,7 +370,7 @@ def _lit(twin: Twin, request: SeriesRequest, choice: "_Choice", cache: ModelCach
 
     found = known(request)
     if found is None:
-        timed = any(effect.id in _TIMED for _, effect, _ in early)
+        timed = any(effect.timed for _, effect, _ in early)
         once, load_mAs = cache.made_of(request, ("once", timed), lambda: _at_unit_load(request, timed=timed))
         found = known(once) or keep(once, _drawn(twin, once, choice, cache, values, early))
         if load_mAs != 1.0:

@@ -843,3 +843,8 @@ def gain_behind_object(
         rates.append(float(behind.rate_DN_per_mAs[0] / open_beam.rate_DN_per_mAs[0]))
         gains.append(float(behind.gain_DN[0] / open_beam.gain_DN[0]))
     return np.array(rates), np.array(gains)
+
+
+def mean_signal_energy_keV(weights: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> float:
+    """Mean energy of a beam's signal, keV; weights (energy,) of the signal."""
+    return float(weights @ energies_keV[: weights.size] / weights.sum())

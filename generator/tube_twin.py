@@ -16,9 +16,9 @@ from ..materials import material_from_name, mu_per_mm
 from ..results import Result, Table, interval_text, plain
 from ..spectra import BIN_WIDTH_KEV, Response, Spectrum, checked_kV, half_value_layer_mm, mean_energy_keV
 from .line_limits import check_limits
-from .predict import estimate_from_log_draws, spectrum_outside
+from .predict import spectrum_outside
 from .spectral_signal import KERMA_OUTPUT, OpenBeam
-from .twin import Estimate, SpectralPosterior, Twin
+from .twin import Estimate, SpectralPosterior, Twin, estimate_from_log_draws
 from .twin_spectrum import model_of_posterior
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +48,7 @@ class TubeTwin(Result):
         Raises:
             InputError: an unknown word or material, no tube load, or a setting that the tube cannot have.
         """
-        from .predict_settings import asked_settings
+        from . import asked_settings
 
         asked = asked_settings(settings, words)
         if isinstance(asked, Setting):
@@ -57,19 +57,19 @@ class TubeTwin(Result):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the twin to a file (HDF5), whole or not at all; `raytwin.read_twin` reads it."""
-        from .twin_io import write_twin
+        from . import write_twin
 
         write_twin(path, self)
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin calibrate --json` prints."""
-        from .twin_answer import calibration_answer
+        from . import calibration_answer
 
         found: dict[str, Any] = plain(calibration_answer(self))
         return found
 
     def _table(self) -> Table:
-        from .twin_answer import tube_table
+        from . import tube_table
 
         return tube_table(self)
 

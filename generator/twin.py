@@ -13,15 +13,14 @@ from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, Setting, text_from_filters
 from ..errors import InputError
 from ..results import ByValue, Result, Table, plain
-from .effects.effect import AppliedEffect
+from .applied_effect import AppliedEffect
 from .psf import Spread
 from .spectral_signal import SpectrumCorrection
 
 if TYPE_CHECKING:
     import pandas
 
-    from .predict import Prediction
-    from .predict_settings import Predictions
+    from . import Prediction, Predictions
 
 # reason codes of bad pixels; a pixel carries the first that applies
 BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
@@ -56,6 +55,15 @@ def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf) -> E
     """Gaussian 95 % interval about `value`, cut at `lowest`."""
     half = 1.959964 * sd
     return Estimate(value=value, low=min(max(value - half, lowest), value), high=value + half)
+
+
+def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) -> Estimate:
+    """Median and 95 % interval of exp(logarithm) (draw,) times a lognormal of `relative_sd`, in the draws' unit."""
+    middle = float(np.median(logarithm))
+    low, high = np.quantile(logarithm, [0.025, 0.975])
+    below = math.hypot(middle - min(low, middle), 1.959964 * relative_sd)
+    above = math.hypot(max(high, middle) - middle, 1.959964 * relative_sd)
+    return Estimate(value=math.exp(middle), low=math.exp(middle - below), high=math.exp(middle + above))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -281,7 +289,7 @@ class Twin(Result):
             >>> list(twin.predict(kV=[50, 60], power_W=30, exposure_ms=20).to_dataframe()["kV"])
             [50.0, 60.0]
         """
-        from .predict_settings import predict_words
+        from . import predict_words
 
         return predict_words(self, settings, words)
 
@@ -291,13 +299,13 @@ class Twin(Result):
         Raises:
             InputError: a place where nothing can be written.
         """
-        from .twin_io import write_twin
+        from . import write_twin
 
         write_twin(path, self)
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin calibrate --json` prints."""
-        from .twin_answer import calibration_answer
+        from . import calibration_answer
 
         found: dict[str, Any] = plain(calibration_answer(self))
         return found
@@ -310,11 +318,11 @@ class Twin(Result):
 
     def plot(self, ax: Any = None, *, what: str = "gain_DN") -> Any:
         """Gain (`gain_DN`) or rate (`rate_DN_per_mAs`) of the measured levels against kV, with 95 % intervals; returns the axes."""
-        from .twin_plot import plot_levels
+        from . import plot_levels
 
         return plot_levels(self, ax=ax, what=what)
 
     def _table(self) -> Table:
-        from .twin_answer import twin_table
+        from . import twin_table
 
         return twin_table(self)

@@ -8,7 +8,7 @@ _PLACES = {
     "Bone": "objects",
     "Case": "cases",
     "EFFECTS": "effects",
-    "EffectRequest": "effect",
+    "EffectRequest": "effects",
     "FAMILIES": "families",
     "Family": "families",
     "Fillet": "objects",
@@ -29,7 +29,7 @@ _PLACES = {
     "draw_case": "cases",
     "request_from_text": "effects",
     "run_protocol": "protocols",
-    "sample_system": "system",
+    "sample_system": "families",
     "sample_unkindness": "unkindness",
     "system_of_seed": "protocols",
 }

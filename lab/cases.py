@@ -6,13 +6,13 @@ above it. One case in five lacks a part of the measurement set.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .effect import EffectRequest
-from .effects import EFFECTS
+from .effects import EFFECTS, EffectRequest
 
 LABELS = {"none": 0.30, "single": 0.40, "pair": 0.15, "unknown": 0.15}
 # What only fine pixels, or only a wide field, can show.
@@ -20,6 +20,14 @@ FINE = ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistrat
 COARSE = ("object_scatter", "veiling_glare", "heel", "unknown:off_focal")
 # There all the time as a rule, but now and then they come later; what calibration would take in never comes before.
 MAY_COME_LATER = ("veiling_glare", "image_lag", "nonlinearity", "row_noise", "quantisation")
+# effects that the wrong data cannot tell apart: confusions are pooled by these
+SETS: Mapping[str, tuple[str, ...]] = {
+    "A": ("object_scatter", "veiling_glare", "dark_drift", "nonlinearity"),
+    "B": ("kv_error", "filtration_error", "heel", "composition_error"),
+    "C": ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistration"),
+    "D": ("image_lag", "dark_drift", "output_drift"),
+    "E": ("excess_noise", "mtf_tail", "nonlinearity"),
+}
 REDUCED = 0.20
 REMOVABLE = ("afterglow", "wedge", "slab", "edge", "disc", "product", "turned", "near", "open_flats", "low_kV")
 

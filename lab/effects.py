@@ -4,18 +4,48 @@ Each law is made to give the strength that was asked for, as the column `strengt
 of another form than the catalogue's formula wherever nature allows.
 """
 
+import difflib
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import InputError
-from .effect import FORM, EffectLaw, EffectRequest, Site
+from .effect import FORM, SINCE, Asked, EffectLaw, Site
 from .effects_beam import BEAM_LAWS
 from .effects_detector import DETECTOR_LAWS
 from .effects_unknown import UNKNOWN_LAWS
 from .line import Planted
 
 EFFECTS: Mapping[str, EffectLaw] = {law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS, *UNKNOWN_LAWS)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffectRequest(Asked):
+    """An effect that is asked for, of those that there are and of a strength that makes sense.
+
+    Raises:
+        InputError: an unknown id or onset, or a strength far out of range.
+    """
+
+    def __post_init__(self) -> None:
+        law = EFFECTS.get(self.id)
+        if law is None:
+            near = difflib.get_close_matches(self.id, EFFECTS, n=3, cutoff=0.4) or list(EFFECTS)
+            raise InputError("effect", received=repr(self.id), expected="an effect's id, such as " + ", ".join(near))
+        if self.since is not None and self.since not in SINCE:
+            raise InputError(
+                f"onset of {self.id}", received=repr(self.since), expected="always or calibration", remedy=FORM
+            )
+        low = -law.high if law.signed else 0.0
+        # Ten times beyond the plausible range a law need not make sense any more.
+        if not (math.isfinite(self.strength) and 10.0 * low <= self.strength <= 10.0 * law.high):
+            raise InputError(
+                f"strength of {self.id}",
+                received=f"{self.strength:g} {law.unit}",
+                expected=f"{'-' if law.signed else ''}{law.low:g} to {law.high:g} {law.unit}",
+            )
 
 
 def request_from_text(text: str) -> EffectRequest:

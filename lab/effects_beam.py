@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter
 from .attenuation import mu_per_mm
 from .chain import SUBPIXELS, margin_px
-from .effect import EffectLaw, EffectRequest, Site
+from .effect import Asked, EffectLaw, Site
 from .effects_detector import planted
 from .line import MINERAL, Exposure, FineMap, FineRates, Planted, rates_of_map
 from .objects import PRODUCT_MATERIAL, fine_shape
@@ -24,7 +24,7 @@ from .system import LabSystem
 Array = NDArray[np.float64]
 
 
-def _kv_error(request: EffectRequest, site: Site) -> Planted:
+def _kv_error(request: Asked, site: Site) -> Planted:
     def change(system: LabSystem) -> LabSystem:
         true = (1.0 + system.kV_offset_percent / 100.0) * (1.0 + request.strength / 100.0)
         return replace(system, kV_offset_percent=100.0 * (true - 1.0))
@@ -32,7 +32,7 @@ def _kv_error(request: EffectRequest, site: Site) -> Planted:
     return _told(request, "the tube's true voltage over the set one", {}, system=change)
 
 
-def _filtration_error(request: EffectRequest, site: Site) -> Planted:
+def _filtration_error(request: Asked, site: Site) -> Planted:
     layer = Filter(material="Al", thickness_mm=request.strength)
 
     def change(system: LabSystem) -> LabSystem:
@@ -41,7 +41,7 @@ def _filtration_error(request: EffectRequest, site: Site) -> Planted:
     return _told(request, "one more layer of aluminium", {}, system=change)
 
 
-def _output_drift(request: EffectRequest, site: Site) -> Planted:
+def _output_drift(request: Asked, site: Site) -> Planted:
     rng = site.rng
     duration_s = site.plan.duration_s(site.system.readout_ms)
     slow_s, quick_s = duration_s * float(rng.uniform(0.3, 1.2)), float(np.exp(rng.uniform(math.log(3), math.log(40))))
@@ -110,7 +110,7 @@ def _anode_path_mm(incidence: Incidence, change: float) -> float:
     return 0.5 * (low + high)
 
 
-def _heel(request: EffectRequest, site: Site) -> Planted:
+def _heel(request: Asked, site: Site) -> Planted:
     degrees = 90.0 * float(site.rng.integers(4)) + float(site.rng.uniform(-5.0, 5.0))
     angle = math.radians(degrees)
 
@@ -173,7 +173,7 @@ def _blurred(rates: FineRates, kernels: tuple[Array | None, Array | None]) -> Fi
     return rates_of_map(spelled, rates)
 
 
-def _focal_spot(request: EffectRequest, site: Site) -> Planted:
+def _focal_spot(request: Asked, site: Site) -> Planted:
     # Points of a source whose brightness rises and falls in straight lines: its half width is that of the request.
     points = np.linspace(-1.0, 1.0, 801)[1:-1]
     brightness = 1.0 - np.abs(points)
@@ -189,7 +189,7 @@ def _focal_spot(request: EffectRequest, site: Site) -> Planted:
     return _told(request, "source points of triangular brightness in both directions", {}, rates=blur)
 
 
-def _motion_blur(request: EffectRequest, site: Site) -> Planted:
+def _motion_blur(request: Asked, site: Site) -> Planted:
     nominal = site.system.magnification
     ripple, phase = 0.15, float(site.rng.uniform(0.0, 2.0 * math.pi))
     cycle_ms = float(site.rng.uniform(20.0, 60.0))
@@ -214,7 +214,7 @@ def _motion_blur(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _misregistration(request: EffectRequest, site: Site) -> Planted:
+def _misregistration(request: Asked, site: Site) -> Planted:
     rng, system = site.rng, site.system
     share = float(rng.uniform(0.7, 1.0))
     direction = float(rng.uniform(0.0, 2.0 * math.pi))
@@ -242,7 +242,7 @@ def _misregistration(request: EffectRequest, site: Site) -> Planted:
 # --- the object -------------------------------------------------------------------------------------------------------
 
 
-def _composition_error(request: EffectRequest, site: Site) -> Planted:
+def _composition_error(request: Asked, site: Site) -> Planted:
     by_mineral = 0.15
     middle_keV = np.array([0.6 * float(np.mean(site.geometry.kVs))])
     of_product, of_mineral = (float(mu_per_mm(name, middle_keV)[0]) for name in (PRODUCT_MATERIAL, MINERAL))
@@ -269,7 +269,7 @@ def _composition_error(request: EffectRequest, site: Site) -> Planted:
 WATER_MM = 20.0
 
 
-def _object_scatter(request: EffectRequest, site: Site) -> Planted:
+def _object_scatter(request: Asked, site: Site) -> Planted:
     system, seed = site.system, int(site.rng.integers(2**62))
     margin = margin_px(max(system.core_px)) * SUBPIXELS
 
@@ -333,11 +333,11 @@ def _object_scatter(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _told(request: EffectRequest, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     return planted(request, BEAM_UNITS[request.id], law, parameters, **hooks)
 
 
-_Build = Callable[[EffectRequest, Site], Planted]
+_Build = Callable[[Asked, Site], Planted]
 
 
 def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, **more: Any) -> EffectLaw:

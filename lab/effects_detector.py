@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chain import SUBPIXELS, FrameContext, Stage
-from .effect import EffectLaw, EffectRequest, Site
+from .effect import Asked, EffectLaw, Site
 from .line import Exposure, FineRates, Planted, fine_rates, light_of_arrivals
 from .system import DetectorMaps, LabSystem
 
@@ -68,7 +68,7 @@ def mixed_gaussians(image: Map, parts: tuple[tuple[float, float], ...]) -> Map:
 GLARE_PARTS = ((0.35, 0.25), (0.40, 0.75), (0.25, 1.64))
 
 
-def _veiling_glare(request: EffectRequest, site: Site) -> Planted:
+def _veiling_glare(request: Asked, site: Site) -> Planted:
     share, width_mm = request.strength / 100.0, float(np.exp(site.rng.uniform(math.log(2.0), math.log(12.0))))
     pixel_mm = site.system.pixel_mm
     parts = tuple((share * weight, scale * width_mm / pixel_mm) for weight, scale in GLARE_PARTS)
@@ -85,7 +85,7 @@ def _veiling_glare(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _mtf_tail(request: EffectRequest, site: Site) -> Planted:
+def _mtf_tail(request: Asked, site: Site) -> Planted:
     weight = request.strength / 100.0
     inner_px = site.rng.uniform(1.2, 2.4)
     outer_px = inner_px * site.rng.uniform(2.0, 3.0)
@@ -111,7 +111,7 @@ K_LINE_KEV = 29.8
 RINGS = ((0.55, 0.5, 0.0), (0.45, 1.6, 0.5))
 
 
-def _k_fluorescence(request: EffectRequest, site: Site) -> Planted:
+def _k_fluorescence(request: Asked, site: Site) -> Planted:
     share = request.strength / 100.0
     range_mm = float(site.rng.uniform(0.12, 0.4))
     fine_mm = site.system.pixel_mm / SUBPIXELS
@@ -223,7 +223,7 @@ def _session_signals(site: Site, *, since: str | None) -> tuple[Array, Array, in
     return np.array(signals), np.array(intervals), len(signals) - 1
 
 
-def _image_lag(request: EffectRequest, site: Site) -> Planted:
+def _image_lag(request: Asked, site: Site) -> Planted:
     power = float(site.rng.uniform(0.2, 0.8))
     times = np.asarray(TRAP_TIMES_S)
     share = times**-power / (times**-power).sum()
@@ -258,7 +258,7 @@ def _image_lag(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _nonlinearity(request: EffectRequest, site: Site) -> Planted:
+def _nonlinearity(request: Asked, site: Site) -> Planted:
     system = site.system
     highest_DN = system.saturation_DN - system.dark_DN
     departure = request.strength / 100.0
@@ -289,7 +289,7 @@ def _nonlinearity(request: EffectRequest, site: Site) -> Planted:
 # --- drift ------------------------------------------------------------------------------------------------------------
 
 
-def _dark_drift(request: EffectRequest, site: Site) -> Planted:
+def _dark_drift(request: Asked, site: Site) -> Planted:
     duration_s = site.plan.duration_s(site.system.readout_ms)
     settle_s = duration_s * float(site.rng.uniform(0.2, 0.9))
     longest_ms = max(take.setting.exposure_ms for take in site.plan.takes)
@@ -318,7 +318,7 @@ def _dark_drift(request: EffectRequest, site: Site) -> Planted:
 # --- fixed patterns, noises, codes ------------------------------------------------------------------------------------
 
 
-def _gain_map_error(request: EffectRequest, site: Site) -> Planted:
+def _gain_map_error(request: Asked, site: Site) -> Planted:
     rng, shape = site.rng, (site.system.rows, site.system.columns)
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] / max(shape)
     smooth = np.zeros(shape)
@@ -336,7 +336,7 @@ def _gain_map_error(request: EffectRequest, site: Site) -> Planted:
     return _told(request, "a new pattern: a fifth of its variance smooth, the rest pixel by pixel", {}, maps=change)
 
 
-def _bad_pixels(request: EffectRequest, site: Site) -> Planted:
+def _bad_pixels(request: Asked, site: Site) -> Planted:
     rng, rows, columns = site.rng, site.system.rows, site.system.columns
     wanted = max(1, round(request.strength / 100.0 * rows * columns))
     kinds: dict[tuple[int, int], str] = {}
@@ -382,7 +382,7 @@ def _bad_pixels(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _excess_noise(request: EffectRequest, site: Site) -> Planted:
+def _excess_noise(request: Asked, site: Site) -> Planted:
     def change(system: LabSystem) -> LabSystem:
         return replace(system, light_swank=system.light_swank / (1.0 + request.strength / 100.0))
 
@@ -391,7 +391,7 @@ def _excess_noise(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _row_noise(request: EffectRequest, site: Site) -> Planted:
+def _row_noise(request: Asked, site: Site) -> Planted:
     along_rows = bool(site.rng.random() < 0.7)
     degrees = 6.0
     scale_DN = request.strength * site.system.read_noise_DN / math.sqrt(degrees / (degrees - 2.0))
@@ -412,7 +412,7 @@ def _row_noise(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _quantisation(request: EffectRequest, site: Site) -> Planted:
+def _quantisation(request: Asked, site: Site) -> Planted:
     step = np.float32(request.strength)
 
     def truncate(level_DN: Map, context: FrameContext) -> NDArray[Any]:
@@ -428,11 +428,11 @@ def _quantisation(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _told(request: EffectRequest, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     return planted(request, DETECTOR_UNITS[request.id], law, parameters, **hooks)
 
 
-def planted(request: EffectRequest, unit: str, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+def planted(request: Asked, unit: str, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     """An effect as it acts, with the words of its request."""
     return Planted(
         id=request.id,
@@ -445,7 +445,7 @@ def planted(request: EffectRequest, unit: str, law: str, parameters: dict[str, A
     )
 
 
-_Build = Callable[[EffectRequest, Site], Planted]
+_Build = Callable[[Asked, Site], Planted]
 
 
 def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, **more: Any) -> EffectLaw:

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chain import SUBPIXELS, FrameContext, Stage
-from .effect import EffectLaw, EffectRequest, Site
+from .effect import Asked, EffectLaw, Site
 from .effects_detector import Map, frame_rng, mixed_gaussians, planted
 from .line import Exposure, FineRates, Planted, rates_of_map
 from .system import DetectorMaps
 
 
-def _off_focal(request: EffectRequest, site: Site) -> Planted:
+def _off_focal(request: Asked, site: Site) -> Planted:
     share, radius_mm = request.strength / 100.0, float(site.rng.uniform(5.0, 12.0))
 
     def second_source(rates: FineRates, exposure: Exposure) -> FineRates:
@@ -41,7 +41,7 @@ def _off_focal(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _tile_seams(request: EffectRequest, site: Site) -> Planted:
+def _tile_seams(request: Asked, site: Site) -> Planted:
     rng, shape = site.rng, (site.system.rows, site.system.columns)
     tile = int(rng.choice([32, 48, 64]))
     row_of, column_of = np.arange(shape[0]) // tile, np.arange(shape[1]) // tile
@@ -73,7 +73,7 @@ def _tile_seams(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _rts_pixels(request: EffectRequest, site: Site) -> Planted:
+def _rts_pixels(request: Asked, site: Site) -> Planted:
     rng, shape = site.rng, (site.system.rows, site.system.columns)
     count = max(1, round(request.strength / 100.0 * shape[0] * shape[1]))
     places = rng.choice(shape[0] * shape[1], size=count, replace=False)
@@ -102,7 +102,7 @@ def _digitised(level: NDArray[Any], context: FrameContext) -> NDArray[np.uint16]
     return numbers
 
 
-def _sharpening(request: EffectRequest, site: Site) -> Planted:
+def _sharpening(request: Asked, site: Site) -> Planted:
     amount, sigma_px = request.strength / 100.0, float(site.rng.uniform(0.8, 2.0))
 
     def sharpen(numbers: NDArray[Any], context: FrameContext) -> NDArray[Any]:
@@ -117,7 +117,7 @@ def _sharpening(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _compression(request: EffectRequest, site: Site) -> Planted:
+def _compression(request: Asked, site: Site) -> Planted:
     step = request.strength
     # Fine detail is stored coarser, as in picture formats.
     frequency = np.arange(8)
@@ -142,11 +142,11 @@ def _compression(request: EffectRequest, site: Site) -> Planted:
     )
 
 
-def _told(request: EffectRequest, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
+def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     return planted(request, UNKNOWN_UNITS[request.id], law, parameters, **hooks)
 
 
-_Build = Callable[[EffectRequest, Site], Planted]
+_Build = Callable[[Asked, Site], Planted]
 
 
 def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Build, since: str) -> EffectLaw:

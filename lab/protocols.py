@@ -16,6 +16,7 @@ from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..files import sha256_of_file, whole_file
 from .bench import Bench, RenderedScene, render
+from .families import sample_system
 from .objects import (
     BONE_MATERIAL,
     TURN_DEGREES,
@@ -30,12 +31,12 @@ from .objects import (
     sample_fillet,
 )
 from .session import GEOMETRIES, SESSIONS, make_session, measure_session, session_system
-from .system import LabSystem, sample_system
+from .system import LabSystem
 from .truth import compute_truth, flat_truth
 from .unkindness import Unkindness
 
 if TYPE_CHECKING:
-    from .effect import EffectRequest
+    from .effects import EffectRequest
 
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)
 FLAT_POWERS_W = (1.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0)

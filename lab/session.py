@@ -23,6 +23,7 @@ from ..acquisition.acquisition_io import write_acquisition
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..files import sha256_of_file, whole_file
+from .families import sample_system
 from .line import Line, Planted
 from .objects import (
     BONE_MATERIAL,
@@ -39,7 +40,7 @@ from .objects import (
     thickness_on_fine_grid,
 )
 from .phantoms import Disc, Edge, Posed, Wedge
-from .system import LabSystem, sample_system
+from .system import LabSystem
 from .truth import compute_truth, flat_truth
 
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)

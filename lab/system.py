@@ -1,7 +1,6 @@
 """The system that stands in the virtual lab: its true parameters, fixed or drawn, and its per-pixel maps."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter
 from ..errors import InputError
-from .unkindness import NONE, Unkindness, sample_unkindness
+from .unkindness import NONE, Unkindness
 
 PAPER_PIXEL_MM = 0.15
 PAPER_SOURCE_OBJECT_MM = 990.0
@@ -225,46 +224,6 @@ class LabSystem:
             maximum_power_w=self.maximum_power_W,
             readout_ms=self.readout_ms,
         )
-
-
-def sample_system(rng: np.random.Generator, *, families: Sequence[str] | None = None) -> LabSystem:
-    """A hidden system: tube, scintillator, light, electronics, maps and unkindness drawn around the paper's line.
-
-    Args:
-        rng: draws it. Every family has random numbers of its own, so that leaving one out changes nothing else.
-        families: of departures to draw from, of `families.FAMILIES`; None: all of them.
-
-    Ranges: voltage +-1 % (standard deviation, cut at 2.5 %), inherent filtration 0.4-1.4 mm Al, tube output +-10 %,
-    scintillator 0.40-0.60 mm, light Swank factor 0.88-0.98, light spread 0.35-1.0 px, 10-25 electrons per keV,
-    conversion +-15 %, read noise +-15 %, dark level 1100-1400 DN, 0-6 dead and hot pixels.
-    """
-    from .families import with_families
-
-    base = LabSystem()
-    electrons_per_keV = rng.uniform(10.0, 25.0)
-    DN_per_keV = base.electrons_per_keV * base.DN_per_electron * math.exp(0.15 * rng.standard_normal())
-    usual = replace(
-        base,
-        # In steps of a quarter per cent: spectra take a second each and are kept by voltage.
-        kV_offset_percent=round(4.0 * float(np.clip(rng.standard_normal(), -2.5, 2.5))) / 4.0,
-        tube_output=math.exp(0.10 * rng.standard_normal()),
-        inherent_filtration=(Filter(material="Al", thickness_mm=round(rng.uniform(0.4, 1.4), 3)),),
-        scintillator_mm=rng.uniform(0.40, 0.60),
-        light_swank=rng.uniform(0.88, 0.98),
-        electrons_per_keV=electrons_per_keV,
-        DN_per_electron=DN_per_keV / electrons_per_keV,
-        gain_spread_percent=rng.uniform(0.8, 2.0),
-        psf_sigma_px=rng.uniform(0.35, 1.0),
-        read_noise_DN=base.read_noise_DN * math.exp(0.15 * rng.standard_normal()),
-        dark_DN=rng.uniform(1100.0, 1400.0),
-        dark_current_DN_per_ms=rng.uniform(0.01, 0.1),
-        dead_pixels=int(rng.integers(0, 7)),
-        hot_pixels=int(rng.integers(0, 7)),
-        maps_seed=int(rng.integers(2**62)),
-    )
-    seeds = rng.integers(2**62, size=2)
-    kind = replace(usual, unkindness=sample_unkindness(np.random.default_rng(int(seeds[0]))))
-    return with_families(kind, families, seed=int(seeds[1]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

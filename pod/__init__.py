@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from .hit_miss import Bounds as Bounds
     from .hit_miss import CrossedEffects as CrossedEffects
     from .hit_miss import PodFit as PodFit
-    from .hit_miss import fit_pod as fit_pod
     from .lapse import LapseFit as LapseFit
     from .lapse import fit_lapse_pod as fit_lapse_pod
     from .likelihood import joint_region as joint_region
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from .planning import expected_precision as expected_precision
     from .planning import plan_pod as plan_pod
     from .planning import recommended_sizes as recommended_sizes
+    from .repeats import fit_pod as fit_pod
     from .response import ResponseFit as ResponseFit
     from .response import fit_response_pod as fit_response_pod
     from .roc import Roc as Roc
@@ -87,7 +87,7 @@ _HOME = {
     "fit_covariates": "covariates",
     "fit_lapse_pod": "lapse",
     "fit_many": "bootstrap",
-    "fit_pod": "hit_miss",
+    "fit_pod": "repeats",
     "fit_response_pod": "response",
     "joint_region": "likelihood",
     "plan_pod": "planning",

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._laplace import Laplace
-from .crossed import Codes, MixedFit, averaged_eta, minimise, second_differences
 from .links import Link
+from .mixed import Codes, MixedFit, averaged_eta, minimise, second_differences
 from .trials import Trials
 
 Array = NDArray[np.float64]

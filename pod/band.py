@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FitError
 from ..files import whole_file
-from .crossed import averaged_pod
 from .hit_miss import PodFit
 from .likelihood import eta_band
 from .links import link_from_name
+from .mixed import averaged_pod
 
 Array = NDArray[np.float64]
 

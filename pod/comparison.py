@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
-from .crossed import fit_mixed, usable_factors
-from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, PodFit, fit_trials
+from .crossed import usable_factors
+from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, PodFit
 from .likelihood import Curve
 from .links import LINKS
+from .mixed import fit_mixed
+from .repeats import fit_trials
 from .robust import bread, clustered_covariance, clustered_meat, few_clusters_factor, score_rows
 from .solver import fit_batch
 from .trials import Trials

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
 from .covariates import CovariateFit, fit_covariates
-from .hit_miss import PodFit, fit_pod
+from .hit_miss import PodFit
 from .links import Link, link_from_name
+from .repeats import fit_pod
 from .solver import fit_batch
 from .trials import Trials
 

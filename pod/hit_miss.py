@@ -14,16 +14,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..errors import FitError, InputError
+from ..errors import FitError
 from ..results import ByValue
 from .likelihood import Curve, size_bound
-from .links import Link, link_from_name
+from .links import Link
 from .modified import modified_bound
 from .separation import check_separation
 from .solver import fit_batch
-from .trials import Trials, check_trials, group_by_size
+from .trials import Trials, group_by_size
 
 Array = NDArray[np.float64]
 
@@ -105,57 +105,6 @@ class PodFit(ByValue):
     crossed: CrossedEffects | None = None
     few_clusters: float = 1.0
     naive: "PodFit | None" = field(default=None, repr=False)
-
-
-def fit_pod(
-    size: ArrayLike,
-    hits: ArrayLike,
-    *,
-    trials: ArrayLike | None = None,
-    link: str = "cloglog",
-    log_size: bool = False,
-    method: str = "auto",
-    repeats: str = "pooled",
-    network: ArrayLike | None = None,
-    image: ArrayLike | None = None,
-    site: ArrayLike | None = None,
-) -> PodFit:
-    """Fit a POD curve; sizes in the unit of `size`.
-
-    g(POD) = c0 + c1 x by maximum likelihood (statsmodels), or with Firth's mean-bias reduction. `auto` is maximum
-    likelihood, and the bias-reduced fit where hits and misses do not overlap (said in `warnings`).
-
-    Args:
-        size: (row,), finite, in any unit; above 0 with `log_size`.
-        hits: (row,), 0 or 1, or counts where `trials` is given.
-        trials: (row,), number of trials of each row.
-        link: `cloglog`, `loglog`, `logit` or `probit`.
-        log_size: fit on the natural logarithm of the size.
-        method: `auto`, `ml` or `firth`.
-        repeats: `pooled` (independent trials), `crossed` (random effects of network and image), `scaled` (the
-            handbook's division by the number of inspections of a site), `cluster` (robust to repeats of networks and
-            images).
-        network, image, site: (row,), labels of who looked and at what; `site` defaults to `image`.
-
-    Returns:
-        The fit. Sizes that the data cannot support are None, with the reason in `warnings`.
-
-    Raises:
-        InputError: an unknown option, or columns that do not fit together (see `check_trials`).
-    """
-    if method not in METHODS:
-        raise InputError("method", received=repr(method), expected="one of " + ", ".join(METHODS))
-    table = check_trials(size, hits, trials=trials, network=network, image=image, site=site, log_size=log_size)
-    return fit_trials(table, link=link, log_size=log_size, method=method, repeats=repeats)
-
-
-def fit_trials(table: Trials, *, link: str, log_size: bool, method: str = "auto", repeats: str = "pooled") -> PodFit:
-    """`fit_pod` on checked trials."""
-    from .repeats import REPEATS
-
-    if repeats not in REPEATS:
-        raise InputError("repeats", received=repr(repeats), expected="one of " + ", ".join(REPEATS))
-    return REPEATS[repeats](table, link=link_from_name(link), log_size=log_size, method=method)
 
 
 def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, divisor: float = 1.0) -> PodFit:

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from .crossed import averaged_eta, averaged_pod
 from .links import Link, link_from_name
+from .mixed import averaged_eta, averaged_pod
 
 Array = NDArray[np.float64]
 

@@ -4,14 +4,17 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from ..errors import InputError
-from .crossed import LARGEST_SD, fit_crossed
-from .hit_miss import PodFit, fit_pooled, sizes_from_curve
-from .links import Link
-from .robust import clustered_covariance, few_clusters_factor
-from .trials import Trials
+from numpy.typing import ArrayLike
 
-__all__ = ["REPEATS", "fit_cluster", "fit_crossed_where_finite", "fit_scaled"]
+from ..errors import InputError
+from .crossed import fit_crossed
+from .hit_miss import METHODS, PodFit, fit_pooled, sizes_from_curve
+from .links import Link, link_from_name
+from .mixed import LARGEST_SD
+from .robust import clustered_covariance, few_clusters_factor
+from .trials import Trials, check_trials
+
+__all__ = ["REPEATS", "fit_cluster", "fit_crossed_where_finite", "fit_pod", "fit_scaled", "fit_trials"]
 
 
 def fit_scaled(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
@@ -123,3 +126,52 @@ REPEATS: dict[str, Callable[..., PodFit]] = {
     "scaled": fit_scaled,
     "cluster": fit_cluster,
 }
+
+
+def fit_pod(
+    size: ArrayLike,
+    hits: ArrayLike,
+    *,
+    trials: ArrayLike | None = None,
+    link: str = "cloglog",
+    log_size: bool = False,
+    method: str = "auto",
+    repeats: str = "pooled",
+    network: ArrayLike | None = None,
+    image: ArrayLike | None = None,
+    site: ArrayLike | None = None,
+) -> PodFit:
+    """Fit a POD curve; sizes in the unit of `size`.
+
+    g(POD) = c0 + c1 x by maximum likelihood (statsmodels), or with Firth's mean-bias reduction. `auto` is maximum
+    likelihood, and the bias-reduced fit where hits and misses do not overlap (said in `warnings`).
+
+    Args:
+        size: (row,), finite, in any unit; above 0 with `log_size`.
+        hits: (row,), 0 or 1, or counts where `trials` is given.
+        trials: (row,), number of trials of each row.
+        link: `cloglog`, `loglog`, `logit` or `probit`.
+        log_size: fit on the natural logarithm of the size.
+        method: `auto`, `ml` or `firth`.
+        repeats: `pooled` (independent trials), `crossed` (random effects of network and image), `scaled` (the
+            handbook's division by the number of inspections of a site), `cluster` (robust to repeats of networks and
+            images).
+        network, image, site: (row,), labels of who looked and at what; `site` defaults to `image`.
+
+    Returns:
+        The fit. Sizes that the data cannot support are None, with the reason in `warnings`.
+
+    Raises:
+        InputError: an unknown option, or columns that do not fit together (see `check_trials`).
+    """
+    if method not in METHODS:
+        raise InputError("method", received=repr(method), expected="one of " + ", ".join(METHODS))
+    table = check_trials(size, hits, trials=trials, network=network, image=image, site=site, log_size=log_size)
+    return fit_trials(table, link=link, log_size=log_size, method=method, repeats=repeats)
+
+
+def fit_trials(table: Trials, *, link: str, log_size: bool, method: str = "auto", repeats: str = "pooled") -> PodFit:
+    """`fit_pod` on checked trials."""
+    if repeats not in REPEATS:
+        raise InputError("repeats", received=repr(repeats), expected="one of " + ", ".join(REPEATS))
+    return REPEATS[repeats](table, link=link_from_name(link), log_size=log_size, method=method)

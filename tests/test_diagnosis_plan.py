@@ -8,24 +8,23 @@ import pytest
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis import veto
-from raytwin.diagnosis.assemble import Problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.curves import Curve, node_weights
 from raytwin.diagnosis.doubts import _elsewhere
-from raytwin.diagnosis.forward_model import can_displace, can_show
 from raytwin.diagnosis.held_out import Gap, contradicted_share
 from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
 from raytwin.diagnosis.judgement import _threshold
 from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.plan import ISOLATED_BY, Repeat, best_repeat, distinguishability, repeat_text, table_text
+from raytwin.diagnosis.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
 from raytwin.diagnosis.probes import ALONG_ROWS
+from raytwin.diagnosis.problem import Problem
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.seen import Blocks
 from raytwin.diagnosis.series_block import jitter_of
 from raytwin.diagnosis.veto import Misfit, is_refused, leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.effects.effect import spread_transfer
-from raytwin.generator.effects.registration import parts_px
+from raytwin.generator.effects._light_spread import spread_transfer
+from raytwin.generator.effects.misregistration import parts_px
 from raytwin.generator.series import SeriesRequest, expected_series
 
 PROBES = 60
@@ -64,7 +63,13 @@ def problem(curves, *, factors=None, noise=1.0):
 
 def test_effects_at_right_angles_lie_as_far_apart_as_from_nothing_and_parallel_ones_not_at_all():
     found = distinguishability(
-        problem([curve("glare", axis(0)), curve("scatter", axis(1)), curve("drift", 2.0 * axis(0), high=1000.0)])
+        problem(
+            [
+                curve("veiling_glare", axis(0)),
+                curve("k_fluorescence", axis(1)),
+                curve("dark_drift", 2.0 * axis(0), high=1000.0),
+            ]
+        )
     )
     assert found.from_none == pytest.approx([10.0, 10.0, 2.0 * np.sqrt(1000.0)])
     assert found.between[0, 1] == pytest.approx(10.0, rel=0.01)
@@ -94,9 +99,9 @@ def test_an_effect_is_planned_with_its_usual_onset_and_middling_inner_parameters
 
 
 def test_a_nuisance_along_an_effect_takes_its_separation():
-    bare = distinguishability(problem([curve("glare", axis(0)), curve("scatter", axis(1))]))
+    bare = distinguishability(problem([curve("veiling_glare", axis(0)), curve("k_fluorescence", axis(1))]))
     held = distinguishability(
-        problem([curve("glare", axis(0)), curve("scatter", axis(1))], factors=7.0 * axis(0)[:, None])
+        problem([curve("veiling_glare", axis(0)), curve("k_fluorescence", axis(1))], factors=7.0 * axis(0)[:, None])
     )
     assert held.from_none[0] == pytest.approx(bare.from_none[0] / np.sqrt(50.0), rel=1e-6)
     assert held.from_none[1] == pytest.approx(bare.from_none[1], rel=1e-6)
@@ -275,16 +280,15 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         onsets.setdefault(variant.effect, set()).add(variant.since)
     # a tail that was always there is a part of the spread
     taken_in_whole = {"kv_error", "filtration_error", "gain_map_error", "excess_noise", "bad_pixels", "mtf_tail"}
-    flat = SeriesRequest(kind="flat", setting=None, frames=5, exposure_ms=50.0)
-    for name in EFFECTS:
-        if not can_show(name, flat):
+    for name, effect in EFFECTS.items():
+        if "flat" not in effect.shows.series:
             assert onsets[name] == {"always"}  # objects alone: they calibrate nothing
         else:
             assert onsets[name] == ({"calibration"} if name in taken_in_whole else {"always", "calibration"})
 
 
 def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_electronic_cannot():
-    displacing = {effect for effect in EFFECTS if can_displace(effect)}
+    displacing = {name for name, effect in EFFECTS.items() if effect.shows.places}
     assert displacing == {
         "object_scatter",
         "veiling_glare",
@@ -392,13 +396,9 @@ def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_giv
     poor = Repeat(series="flat_90kV", times=4, separation=1.6, separation_then=1.7)
     text = repeat_text(poor, ["filtration_error", "row_noise"], ["kv_error", "row_noise"])
     assert text.startswith("no series of this session will do")
-    assert ISOLATED_BY["kv_error"] in text
-    assert ISOLATED_BY["filtration_error"] in text
-    assert ISOLATED_BY["row_noise"] + ";" not in text
-
-
-def test_every_effect_of_the_catalogue_has_a_measurement_that_isolates_it():
-    assert set(ISOLATED_BY) == set(EFFECTS)
+    assert EFFECTS["kv_error"].isolated_by in text
+    assert EFFECTS["filtration_error"].isolated_by in text
+    assert EFFECTS["row_noise"].isolated_by + ";" not in text
 
 
 @pytest.mark.parametrize(("since", "calibrating"), [("always", 1.0), ("calibration", 0.0)])
@@ -461,21 +461,23 @@ def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(
     asked = [flat, dark, replace(dark, kind="afterglow"), scene]
     for request in asked:
         applied = AppliedEffect(id=effect, parameters={"strength": strong}, since="always")
-        if can_show(effect, request):
+        if request.kind in EFFECTS[effect].shows.series:
             continue
         with_it = expected_series(twin, request, effects=(applied,), use_measured_level=False)
         without = expected_series(twin, request, effects=(), use_measured_level=False)
         for name in ("mean_DN", "quantum_variance_DN2", "white_variance_DN2", "row_variance_DN2", "frame_factor_rms"):
             assert np.array_equal(getattr(with_it, name), getattr(without, name)), (request.kind, name)
     # objects show whatever there is
-    assert can_show(effect, scene)
+    assert scene.kind in EFFECTS[effect].shows.series
 
 
 def gain_found(residual, made):
     """A problem of 600 probes in twenty groups, without nuisances, and a hypothesis that a curve explains it at 10."""
     groups = np.repeat(np.arange(20), 30)
     problem = SimpleNamespace(residual=residual, factors=np.zeros((residual.size, 1)), groups=groups, blocks=groups)
-    return problem, SimpleNamespace(effects=("gain",), variants={"gain": made}, strengths={"gain": (10.0, 9.0, 11.0)})
+    return problem, SimpleNamespace(
+        effects=("gain_map_error",), variants={"gain_map_error": made}, strengths={"gain_map_error": (10.0, 9.0, 11.0)}
+    )
 
 
 def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was():
@@ -522,7 +524,7 @@ def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_
     response = np.zeros(size)
     response[:50] = 3.0
     made = replace(
-        curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
+        curve("gain_map_error", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
     )
     residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
     found = misfit_of(*gain_found(residual, made))

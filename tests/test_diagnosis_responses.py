@@ -21,7 +21,7 @@ from raytwin.diagnosis.placing import inside
 from raytwin.diagnosis.registration import Placement
 from raytwin.diagnosis.series_probes import variance_of_what_came
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.effects.registration import parts_px
+from raytwin.generator.effects.misregistration import parts_px
 from raytwin.generator.series import SeriesRequest
 
 SHAPE = (12, 16)

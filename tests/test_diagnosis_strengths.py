@@ -34,7 +34,7 @@ def found(views, *, effects=("output_drift",), since="always"):
         variants={name: SimpleNamespace(since=since) for name in effects},
         strengths=dict.fromkeys(effects, (1.0, 0.9, 1.1)),
     )
-    return strengths._output_rms(problem, hypothesis)
+    return strengths._output_rms(problem, hypothesis, "output_drift")
 
 
 def lit_series(**more):

@@ -15,7 +15,6 @@ import pytest
 
 import raytwin as rt
 from raytwin.cli import COMMANDS, _parser
-from raytwin.generator.effects import EFFECTS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -138,11 +137,6 @@ def test_versions_agree():
     newest = re.search(r"^## (\d\S*)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert citation is not None and newest is not None
     assert project == rt.__version__ == citation[1] == newest[1]
-
-
-def test_laws_of_the_gallery_belong_to_effects():
-    laws = tomllib.loads((DOCS / "_ext" / "laws.toml").read_text(encoding="utf-8"))
-    assert set(laws) <= set(EFFECTS)
 
 
 @pytest.fixture(scope="module")

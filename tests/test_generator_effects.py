@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
 from raytwin.errors import InputError
 from raytwin.generator._distortion import displacement_px, distorted
-from raytwin.generator.effects import EFFECTS, AppliedEffect, Effect, Parameter, effect_of, in_order
-from raytwin.generator.effects.effect import spread_transfer
-from raytwin.generator.effects.fluorescence import line_energy_keV
-from raytwin.generator.effects.registration import angles_of, parts_px
-from raytwin.generator.effects.sharpness import _transfer_of_spot
+from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter, effect_of, in_order
+from raytwin.generator.effects._light_spread import spread_transfer
+from raytwin.generator.effects.effect import Grid, Shows, Variation
+from raytwin.generator.effects.focal_spot import _transfer_of_spot
+from raytwin.generator.effects.k_fluorescence import line_energy_keV
+from raytwin.generator.effects.misregistration import angles_of, parts_px
 from raytwin.generator.line_state import STAGES
 from raytwin.generator.predict import spectral_model_of
 from raytwin.generator.psf import blur_variance_share
@@ -989,11 +990,23 @@ def test_effects_that_make_no_sense_are_refused():
         Parameter(**{**good, "default": 3.0})
     with pytest.raises(InputError, match="above 0 and unsigned"):
         Parameter(**{**good, "log": True, "signed": True})
-    entry = {"id": "x", "title": "x", "reference": "x", "after_calibration": False, "change": EFFECTS["heel"].change}
+    heel = EFFECTS["heel"]
     with pytest.raises(InputError, match="stage: got nowhere"):
-        Effect(**entry, parameters=(Parameter(**good),), stage="nowhere")
+        replace(heel, stage="nowhere")
     with pytest.raises(InputError, match="no strength"):
-        Effect(**entry, parameters=(Parameter(**{**good, "name": "size"}),), stage="beam")
+        replace(heel, parameters=(Parameter(**{**good, "name": "size"}),))
+    with pytest.raises(InputError, match="absorbed: got some of it"):
+        replace(heel, absorbed="some of it")
+    with pytest.raises(InputError, match="variants: got tilt; expected parameters: strength, direction_deg, curvature"):
+        replace(heel, grid=Grid(variants=({"tilt": 1.0},)))
+    with pytest.raises(InputError, match="random part lines: got no parameter column_share"):
+        replace(heel, variation=Variation(random="lines"))
+    with pytest.raises(InputError, match="random part of an effect: got much"):
+        Variation(random="much")
+    with pytest.raises(InputError, match=r"series of an effect: got .*film"):
+        Shows(series=("film",), axis="level")
+    with pytest.raises(InputError, match="axis of an effect: got colour"):
+        Shows(series=("flat",), axis="colour")
 
 
 def test_beam_effects_need_a_spectrum(series_line):

@@ -14,11 +14,11 @@ from raytwin.generator.effects import EFFECTS, AppliedEffect, effect_of
 from raytwin.generator.fresh import FreshReferences
 from raytwin.generator.generate import ChannelModel, ReferenceImages, generate_dataset
 from raytwin.generator.generate_described import DescribedScenes
-from raytwin.generator.image_effects import NOT_IN_IMAGES
 from raytwin.generator.render import render_expected
 from raytwin.generator.series import SeriesRequest, expected_series, sample_series
 from raytwin.generator.twin_io import write_twin
 
+NOT_IN_IMAGES = {name: effect.images.left_out for name, effect in EFFECTS.items() if effect.images.left_out}
 COPPER = "exposure_ms=20,filter=Cu:0.05"
 LOW = setting_from_text(f"kv=40,power_w=40,{COPPER}")
 HIGH = setting_from_text(f"kv=90,power_w=45,{COPPER}")

@@ -115,6 +115,108 @@ def test_the_upward_import_check_sees_a_planted_fault(tmp_path):
     assert sorted(imported_rooms(module, 1)) == [(1, "calibration"), (2, "raytwin"), (3, "lab")]
 
 
+def imports_among(files):
+    """File -> files of the same set that it imports relatively, for running or for types."""
+    known = {path.resolve(): path for path in files}
+    graph = {}
+    for path in files:
+        found = graph.setdefault(path, set())
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+                places = [base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)]
+                found.update(known[place.resolve()] for place in places if place.resolve() in known)
+    return graph
+
+
+def ring_in(graph):
+    """Files that import each other in a ring, from one back to itself; empty: none."""
+    done, way = set(), []
+
+    def seek(path):
+        if path in way:
+            return [*way[way.index(path) :], path]
+        if path in done:
+            return []
+        way.append(path)
+        for target in sorted(graph[path]):
+            if found := seek(target):
+                return found
+        done.add(way.pop())
+        return []
+
+    return next((found for path in graph if (found := seek(path))), [])
+
+
+def test_no_files_import_each_other_in_a_ring():
+    ring = ring_in(imports_among([path for _, path in python_files()]))
+    assert not ring, " imports ".join(str(path.relative_to(ROOT)) for path in ring)
+
+
+def test_the_check_of_rings_sees_a_planted_one(tmp_path):
+    texts = {"a": "from .b import x\n", "b": "if x:\n    from . import c\n", "c": "def f():\n    from .a import y\n"}
+    files = [tmp_path / f"{name}.py" for name in (*texts, "d")]
+    for path in files:
+        path.write_text(texts.get(path.stem, "from .a import x\n"))
+    graph = imports_among(files)
+    assert [path.stem for path in ring_in(graph)] == ["a", "b", "c", "a"]
+    graph[files[2]] = set()
+    assert ring_in(graph) == []
+
+
+# the map of bad pixels bears the name of an effect; so do words of answers and options that are about this map
+NAME_THE_MAP = (
+    "calibration/calibrate.py",
+    "generator/export.py",
+    "generator/generate.py",
+    "generator/generate_described.py",
+    "generator/twin_answer.py",
+    "generator/twin_io.py",
+    "src/raytwin/api/images.py",
+    "src/raytwin/commands/calibrate.py",
+)
+
+
+def strings_of(path):
+    """(line, text) of every string of a file that is no docstring."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    told = set()
+    for node in nodes:
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                told.add(first.value)
+    for node in nodes:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in told:
+            yield node.lineno, node.value
+
+
+def names_of_effects(files, ids):
+    """Places that name an effect: strings that are its id."""
+    files = [path for path in files if any(name in path.read_text(encoding="utf-8") for name in ids)]
+    return [f"{path}:{line} {text}" for path in files for line, text in strings_of(path) if text in ids]
+
+
+def test_no_code_but_the_catalogue_and_the_lab_names_an_effect():
+    from raytwin.generator.effects import OURS
+
+    files = [path for _, path in python_files() if path.relative_to(ROOT).parts[0] != "lab"]
+    files = [path for path in files if path.parent != ROOT / "generator" / "effects"]
+    named = names_of_effects(files, set(OURS))
+    maps = {ROOT / path for path in NAME_THE_MAP}
+    assert all(any(place.startswith(str(path)) for place in named) for path in maps), (
+        "a file that names the map no more"
+    )
+    wrong = [place for place in named if not (place.endswith(" bad_pixels") and Path(place.split(":")[0]) in maps)]
+    assert not wrong, "ask the effect's declaration (generator/effects/effect.py):\n" + "\n".join(wrong)
+
+
+def test_the_check_of_effects_sees_a_planted_name_and_no_docstring(tmp_path):
+    module = tmp_path / "table.py"
+    module.write_text('"""heel"""\n\nTABLE = {"heel": 1}\n\n\ndef f(x):\n    """heel"""\n    return x == "mtf_tail"\n')
+    assert names_of_effects([module], {"heel", "mtf_tail"}) == [f"{module}:3 heel", f"{module}:8 mtf_tail"]
+
+
 def test_packages_on_disk_and_in_pyproject_agree():
     setuptools = project()["tool"]["setuptools"]
     listed = set(setuptools["packages"])

@@ -10,7 +10,7 @@ from raytwin.errors import FitError, InputError
 from raytwin.pod import LINKS, PodFit, bootstrap_pod, check_trials, curve_with_band, false_alarm_rate, fit_many, fit_pod
 from raytwin.pod._laplace import Laplace
 from raytwin.pod.bootstrap import bootstrap_weights
-from raytwin.pod.crossed import averaged_eta, averaged_pod, fit_mixed
+from raytwin.pod.mixed import averaged_eta, averaged_pod, fit_mixed
 from raytwin.pod.robust import clustered_meat
 
 

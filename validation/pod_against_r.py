@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from raytwin.pod import LINKS, fit_pod
-from raytwin.pod.crossed import fit_mixed
+from raytwin.pod.mixed import fit_mixed
 
 R_PROGRAM = r"""
 suppressMessages({library(brglm2); library(lme4)})

@@ -16,8 +16,9 @@ import sys
 import numpy as np
 
 from raytwin.pod import LINKS, check_trials
-from raytwin.pod.crossed import averaged_eta, fit_crossed
+from raytwin.pod.crossed import fit_crossed
 from raytwin.pod.hit_miss import PodFit, fit_pooled
+from raytwin.pod.mixed import averaged_eta
 from raytwin.pod.repeats import fit_cluster
 
 A50, A90 = 0.1, 0.2

@@ -60,8 +60,9 @@ from raytwin.generator.predict import predict_flatfield
 from raytwin.generator.twin import Twin
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.lab.bench import Bench
+from raytwin.lab.families import sample_system
 from raytwin.lab.response import Deposits, beam_of, compute_deposits
-from raytwin.lab.system import LabSystem, detector_maps, sample_system
+from raytwin.lab.system import LabSystem, detector_maps
 from raytwin.lab.truth import flat_truth
 from raytwin.lab.unkindness import NONE
 from raytwin.spectra import light_per_keV

@@ -5,7 +5,6 @@ series (dark, flats, objects, beam off) the one that the effect changes most is 
 """
 
 import math
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 
 FRAMES = 16
 PIXEL_MM, SOURCE_OBJECT_MM, SOURCE_DETECTOR_MM = 0.15, 300.0, 450.0
-LAWS = Path(__file__).with_name("laws.toml")
 STAGE = {
     "beam": "in the beam, before the object is projected",
     "arrivals": "on the field that reaches the scintillator",
@@ -186,16 +184,6 @@ def draw(found: dict[str, Any], path: Path) -> None:
         pyplot.close(figure)
 
 
-def isolated_by(effect: Any) -> str:
-    """The measurement that shows an effect by itself."""
-    own = getattr(effect, "isolated_by", None)
-    if own:
-        return str(own)
-    from raytwin.diagnosis.plan import ISOLATED_BY
-
-    return ISOLATED_BY.get(effect.id, "")
-
-
 def parameter_rows(effect: Any) -> str:
     """Parameters with units and ranges, as a table."""
     rows = ["| parameter | unit | plausible range | usual | meaning or source of the range |", "|---|---|---|---|---|"]
@@ -221,7 +209,6 @@ def effects_page(folder: Path) -> None:
 
     from raytwin.generator.effects import EFFECTS
 
-    laws = tomllib.loads(LAWS.read_text(encoding="utf-8"))
     twin = example_line()
     series = example_series(twin.maps.shape)
     usual = without_effects(twin, series)
@@ -241,17 +228,15 @@ def effects_page(folder: Path) -> None:
         draw(found, folder / "effects" / f"{effect.id}.png")
         title = effect.title[0].upper() + effect.title[1:]
         onset = "after the calibration" if effect.after_calibration else "present when the line was calibrated"
-        law = getattr(effect, "law", "") or laws.get(effect.id, "")
-        isolates = isolated_by(effect)
         lines = [
             f"(effect-{effect.id})=\n## {title}",
             f"`{effect.id}` acts {STAGE.get(effect.stage, effect.stage)}. Usual onset: {onset}.",
-            f"$$\n{law}\n$$" if law else "",
+            f"$$\n{effect.law}\n$$",
             f"![Signature of {effect.id}](effects/{effect.id}.png)",
             f"*{words[0].upper() + words[1:]}; strength {drawn_strength(effect):g} {effect.strength.unit}.*",
             parameter_rows(effect),
-            f"**Isolated by** {isolates}." if isolates else "",
+            f"**Isolated by** {effect.isolated_by}.",
             f"**Source** {effect.reference}.",
         ]
-        parts += [line for line in lines if line]
+        parts += lines
     write_if_changed(folder / "effects_gallery.md", "\n\n".join(parts) + "\n")

@@ -1,25 +1,54 @@
-"""The catalogue of effects: each is a change of the forward model at one stage, with parameters and a strength.
+"""The catalogue of effects: each is a change of the forward model at one stage, with all that others need to know of it.
 
-A new effect is one definition in one of these files and one line in `EFFECTS`.
+A new effect is one file here and one line in `OURS`; or, in another package, an `Effect` under an entry point of the group
+`raytwin.effects`.
 """
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 
+from ...errors import InputError
+from ..applied_effect import AppliedEffect
 from ..line_state import STAGES
-from .beam import COMPOSITION_ERROR, FILTRATION_ERROR, HEEL, KV_ERROR
-from .drift import DARK_DRIFT, OUTPUT_DRIFT
-from .effect import AppliedEffect, Effect, Parameter
-from .fluorescence import K_FLUORESCENCE
-from .glare import VEILING_GLARE
-from .lag import IMAGE_LAG
-from .readout import BAD_PIXELS, QUANTISATION, ROW_NOISE
-from .registration import MISREGISTRATION
-from .response import EXCESS_NOISE, GAIN_MAP_ERROR, NONLINEARITY
-from .scatter import OBJECT_SCATTER
-from .sharpness import FOCAL_SPOT, MOTION_BLUR, MTF_TAIL
+from .bad_pixels import BAD_PIXELS
+from .catalogue import GROUP, Catalogue
+from .composition_error import COMPOSITION_ERROR
+from .dark_drift import DARK_DRIFT
+from .effect import (
+    EVERY_SERIES,
+    LIT_SERIES,
+    AlwaysALittle,
+    Displacement,
+    Effect,
+    FalseEvidence,
+    Grid,
+    InImages,
+    Parameter,
+    Placement,
+    Reading,
+    Shows,
+    Variation,
+)
+from .excess_noise import EXCESS_NOISE
+from .filtration_error import FILTRATION_ERROR
+from .focal_spot import FOCAL_SPOT
+from .gain_map_error import GAIN_MAP_ERROR
+from .heel import HEEL
+from .image_lag import IMAGE_LAG
+from .k_fluorescence import K_FLUORESCENCE
+from .kv_error import KV_ERROR
+from .misregistration import MISREGISTRATION
+from .motion_blur import MOTION_BLUR
+from .mtf_tail import MTF_TAIL
+from .nonlinearity import NONLINEARITY
+from .object_scatter import OBJECT_SCATTER
+from .output_drift import OUTPUT_DRIFT
+from .quantisation import QUANTISATION
+from .row_noise import ROW_NOISE
+from .veiling_glare import VEILING_GLARE
 
-# within a stage effects act in this order
-EFFECTS: dict[str, Effect] = {
+# within a stage effects act in this order, those of other packages after ours
+OURS: dict[str, Effect] = {
     effect.id: effect
     for effect in (
         MISREGISTRATION,
@@ -44,12 +73,27 @@ EFFECTS: dict[str, Effect] = {
         COMPOSITION_ERROR,
     )
 }
+EFFECTS = Catalogue(OURS)
 
 __all__ = [
     "EFFECTS",
+    "EVERY_SERIES",
+    "GROUP",
+    "LIT_SERIES",
+    "OURS",
+    "AlwaysALittle",
     "AppliedEffect",
+    "Catalogue",
+    "Displacement",
     "Effect",
+    "FalseEvidence",
+    "Grid",
+    "InImages",
     "Parameter",
+    "Placement",
+    "Reading",
+    "Shows",
+    "Variation",
     "effect_of",
     "in_order",
 ]
@@ -61,10 +105,6 @@ def effect_of(applied: AppliedEffect) -> Effect:
     Raises:
         InputError: an id that the catalogue does not hold.
     """
-    from difflib import get_close_matches
-
-    from ...errors import InputError
-
     if applied.id not in EFFECTS:
         near = get_close_matches(applied.id, EFFECTS, n=1, cutoff=0.0)
         raise InputError(

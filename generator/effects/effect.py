@@ -1,16 +1,39 @@
-"""What an effect of the catalogue is: its parameters, its strength, its stage, and the change that it makes."""
+"""What an effect declares: all that the forward model, images, the diagnosis and its plans need to know of it.
+
+One effect is one `Effect` in one file of this folder. Readers ask its fields; no table elsewhere is kept by effect.
+"""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 
-import numpy as np
-
 from ...errors import InputError
-from ..line_state import STAGES, Change, FloatArray
+from ..line_state import STAGES, Change
+from ..series_request import KINDS
+from ..twin import Twin
 
-SINCE = ("always", "calibration")
+EVERY_SERIES = KINDS
+LIT_SERIES = ("flat", "object")
+# of a diagnosis' answer
+AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
+
+ABSORBED = {
+    "nothing": "a flat that calibrated shows it as any other flat does",
+    "numbers": "level, gain or spectrum hold it whole: a constant one is no gap",
+    "noise": "spread, photon-transfer slope and read noise hold it: flats stay as calibrated",
+    "maps": "the maps of the pixels hold it",
+    "maps of beams": "the shape of each beam's flat holds it",
+}
+RANDOM = {
+    "nothing": "all of it follows from its parameters",
+    "sides": "more of it on one side of the panel than on the other",
+    "offset": "lost bits may be cut off or rounded away: half a step on every level",
+    "pixels": "a pattern from pixel to pixel, a part of it smooth",
+    "lines": "means of the lines of a few frames",
+    "output": "level and trend of each lit series",
+}
+_ASKED_OF_RANDOM = {"lines": ("column_share",), "output": ("correlation_s", "jitter_share")}  # parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,7 +42,10 @@ class Parameter:
 
     Fields: name; unit (empty: none); low, high (plausible range of its size); default; source (of the range); log
     (fitted in its logarithm); signed (may be negative with the same size); fitted (False: states a condition of the
-    session, such as its length, and is not estimated).
+    session, such as its length, and is not estimated); fitted_if_later (estimated where the effect came after the calibration);
+    tried_without_times (values from which it is estimated where a session does not state its pauses); pixel_power: a number
+    found in squares of n x n pixels times n to this power is that of pixels (1: a length in pixels); most: beyond which there is
+    nothing (100 % of the pixels).
     """
 
     name: str
@@ -31,6 +57,10 @@ class Parameter:
     log: bool
     signed: bool = False
     fitted: bool = True
+    fitted_if_later: bool = False
+    tried_without_times: tuple[float, ...] = ()
+    pixel_power: float = 0.0
+    most: float = math.inf
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and self.low <= self.default <= self.high and math.isfinite(self.high)):
@@ -42,38 +72,229 @@ class Parameter:
         if self.log and not (self.low > 0 and not self.signed):
             raise InputError(f"parameter {self.name}", received=self.low, expected="above 0 and unsigned, for log")
 
+    def pixels_per_square(self, side: int) -> float:
+        """By what a number found in squares of side x side pixels is multiplied to be that of pixels."""
+        share: float = float(side) ** abs(self.pixel_power)
+        return share if self.pixel_power >= 0.0 else 1.0 / share
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shows:
+    """Where an effect, or what is wrong with its law, can show.
+
+    Fields: series: kinds of series that it can move; axis: of the answer, under which pictures like its own are listed; flats
+    (False: it leaves the detector-median level and noise of a flat alone); places (it can seem to move a scene's picture);
+    single_pixels (it can make pixels stand out of their neighbours); like_thinner (it brightens behind an object as a thickness map
+    that is too thick does).
+    """
+
+    series: tuple[str, ...]
+    axis: str
+    flats: bool = True
+    places: bool = False
+    single_pixels: bool = False
+    like_thinner: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.series or not set(self.series) <= set(KINDS):
+            raise InputError("series of an effect", received=self.series, expected="some of " + ", ".join(KINDS))
+        if self.axis not in AXES:
+            raise InputError("axis of an effect", received=self.axis, expected="one of " + ", ".join(AXES))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """How the strength is read from a session.
+
+    Fields: law_sd: relative standard deviation of strengths found by the fit, as lines depart from the law; probes: those that the
+    strength is defined by, where no law can be far off; sd: relative, of a strength read from these alone (None: it is fitted);
+    frame_levels (it is the rms of the frames' levels).
+    """
+
+    law_sd: float = 0.12
+    probes: tuple[str, ...] = ()
+    sd: float | None = None
+    frame_levels: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """Where the diagnosis asks the law before it refines.
+
+    Fields: shares: of the way up the strength's plausible range, in the logarithm (one: in proportion to the strength); variants:
+    inner parameters to start from, others at their default (empty: a quarter and three quarters of each range); refined (False: the
+    inner parameters stay those of the grid).
+    """
+
+    shares: tuple[float, ...] = (0.2, 0.7, 1.0)
+    variants: tuple[Mapping[str, float], ...] = ()
+    refined: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variation:
+    """How laws of an effect's kind may differ from line to line, and what about it is random.
+
+    Fields: random (one of RANDOM); loosely_tied: times the strength that the rest shows, which the random part may have; exact
+    (it acts as physics has it, whoever simulates it).
+    """
+
+    random: str = "nothing"
+    loosely_tied: float = 1.0
+    exact: bool = False
+
+    def __post_init__(self) -> None:
+        if self.random not in RANDOM:
+            raise InputError("random part of an effect", received=self.random, expected="one of " + ", ".join(RANDOM))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FalseEvidence:
+    """Evidence that sessions show of an effect which they do not have, or that its law leaves to others; natural logarithms.
+
+    Fields: alone: log evidence in sessions without it; alone_sharp: where pixels see no farther than themselves; leaves: share of
+    its log evidence that its law leaves to other effects (0: the usual); edges_alone (no such rest looks like it); unmistakable
+    (pixels or codes of its own show it).
+    """
+
+    alone: float = 0.0
+    alone_sharp: float = 0.0
+    leaves: float = 0.0
+    edges_alone: bool = False
+    unmistakable: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InImages:
+    """What single images hold of an effect.
+
+    Fields: left_out: why images have nothing of it; not_in_references: why images made from references have not; spot: it states
+    the whole focal spot, in place of the instrument's.
+    """
+
+    left_out: str = ""
+    not_in_references: str = ""
+    spot: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlwaysALittle:
+    """What most lines have of an effect, and calibration takes for its own: a nuisance, no effect. Strength: one prior sd."""
+
+    name: str
+    strength: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Displacement:
+    """How a scene lies against its thickness maps, px: rms size; shift and its direction; rms of enlargement and of turn."""
+
+    size_px: float
+    shift_px: float
+    direction_deg: float
+    radial_px: float
+    turn_px: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """Of an effect that displaces scenes, whose shifts registration finds.
+
+    Fields: parts: parameters -> displacement; without_shift: parameters -> those of what is no shift; combined: (parameters,
+    parameters) -> those that shift as the first and enlarge and turn as the second.
+    """
+
+    parts: Callable[[Mapping[str, float]], Displacement]
+    without_shift: Callable[[Mapping[str, float]], dict[str, float]]
+    combined: Callable[[Mapping[str, float], Mapping[str, float]], dict[str, float]]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
     """An effect that a real line may have and the base model has not.
 
-    Fields: id; title; parameters (the first is the strength); stage (where in the line it acts, see line_state);
-    reference (source of the model); after_calibration (usual reading: True, it set in after the calibration series;
-    False, it was always there); change: (state, parameters, context) -> state, which is no change at strength 0;
-    needs (what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`,
-    `spectral`, `scene`); options (words that an applied effect may carry, with what they mean).
+    Fields:
+        id, title; law: the equation, LaTeX; reference: source of the model; isolated_by: the measurement that shows it by itself.
+        parameters: the first is the strength.
+        stage: where in the line it acts, see line_state; timed: before the exposure, but it depends on how long that takes.
+        change: (state, parameters, context) -> state, which is no change at strength 0.
+        needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`.
+        options: words that an applied effect may carry, with what they mean.
+        after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
+            diagnosis tries both.
+        absorbed: one of ABSORBED: what calibration takes in of one that was always there.
+        shows, reading, grid, variation, false_evidence, images: see there.
+        lost_in_squares: why it cannot be seen in squares of pixels; empty: it can.
+        always_a_little: what most lines have of it, if any; placement: of one that displaces scenes.
+        worked_in: (twin, strength) -> the twin whose own numbers are those of a line with it, and warnings; None: it stays an effect.
     """
 
     id: str
     title: str
+    law: str
     parameters: tuple[Parameter, ...]
     stage: str
     reference: str
+    isolated_by: str
+    shows: Shows
     after_calibration: bool
+    absorbed: str
     change: Change = field(repr=False)
+    either_onset: bool = False
     needs: tuple[str, ...] = ()
     options: Mapping[str, str] = field(default_factory=dict)
+    timed: bool = False
+    reading: Reading = Reading()
+    grid: Grid = Grid()
+    variation: Variation = Variation()
+    false_evidence: FalseEvidence = FalseEvidence()
+    images: InImages = InImages()
+    lost_in_squares: str = ""
+    always_a_little: AlwaysALittle | None = None
+    placement: Placement | None = field(default=None, repr=False)
+    worked_in: Callable[[Twin, float], tuple[Twin, list[str]]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise InputError(f"effect {self.id}, stage", received=self.stage, expected="one of " + ", ".join(STAGES))
+        if self.absorbed not in ABSORBED:
+            raise InputError(
+                f"effect {self.id}, absorbed", received=self.absorbed, expected="one of " + ", ".join(ABSORBED)
+            )
         if not self.parameters or self.parameters[0].name != "strength":
             raise InputError(f"effect {self.id}", received="no strength", expected="strength as first parameter")
+        known = [item.name for item in self.parameters]
+        missing = [name for name in _ASKED_OF_RANDOM.get(self.variation.random, ()) if name not in known]
+        if missing:
+            raise InputError(
+                f"effect {self.id}, random part {self.variation.random}",
+                received=f"no parameter {missing[0]}",
+                expected="parameters " + ", ".join(_ASKED_OF_RANDOM[self.variation.random]),
+            )
+        unknown = [name for choice in self.grid.variants for name in choice if name not in known]
+        if unknown:
+            raise InputError(
+                f"effect {self.id}, variants", received=unknown[0], expected="parameters: " + ", ".join(known)
+            )
 
     @property
     def strength(self) -> Parameter:
         """The parameter that reports quote."""
         return self.parameters[0]
+
+    @property
+    def usual_onset(self) -> str:
+        """`calibration` (it came after it) or `always`."""
+        return "calibration" if self.after_calibration else "always"
+
+    @property
+    def onsets(self) -> tuple[str, ...]:
+        """Onsets that the diagnosis tries."""
+        return ("always", "calibration") if self.either_onset else (self.usual_onset,)
+
+    def pixels_per_square(self, name: str, side: int) -> float:
+        """By what a parameter found in squares of side x side pixels is multiplied to be that of pixels; 1 for others' names."""
+        return next((item.pixels_per_square(side) for item in self.parameters if item.name == name), 1.0)
 
     def values(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """All parameters by name; what is not given takes its default.
@@ -98,49 +319,3 @@ class Effect:
                 raise InputError(f"{name} of effect {self.id}", received=value, expected="a number above 0")
             result[name] = float(value)
         return result
-
-
-def spread_transfer(
-    f_row: FloatArray, f_column: FloatArray, *, reach_px: float, order: float, usual_order: float
-) -> FloatArray:
-    """Transfer function (1 + (m / p) (2 pi L f)^2)^-p of light that spreads with reach L, of any shape p.
-
-    p = 1/2 is exp(-R / L) / (2 pi L R), p = 1 a Lorentzian; larger orders come close to a Gaussian. The rms distance is the
-    same for all orders; m = `usual_order` is the one for which reach_px is defined. Frequencies in cycles per pixel.
-    """
-    squared = (2.0 * np.pi * reach_px) ** 2 * (f_row**2 + f_column**2)
-    return np.asarray((1.0 + usual_order / order * squared) ** -order)
-
-
-def order_parameter(usual: float) -> Parameter:
-    """The shape of a spread's transfer function."""
-    return Parameter(
-        name="order",
-        unit="",
-        low=0.5,
-        high=6.0,
-        default=usual,
-        source="1/2: exponential over distance, 1: Lorentzian, large: Gaussian",
-        log=True,
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AppliedEffect:
-    """An effect as it is in one line: its parameters, and since when.
-
-    Fields: id; parameters (name -> value; what is missing takes its default); since (`always`: it was there when the
-    twin was calibrated, so that calibration took a part of it in; `calibration`: it came afterwards); options (words).
-    """
-
-    id: str
-    parameters: Mapping[str, float]
-    since: str = "always"
-    options: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.since not in SINCE:
-            raise InputError(f"effect {self.id}, since", received=self.since, expected="one of " + ", ".join(SINCE))
-        for name, value in self.parameters.items():
-            if not math.isfinite(value):
-                raise InputError(f"{name} of effect {self.id}", received=value, expected="a finite number")

@@ -266,8 +266,8 @@ class PodPlan(Result):
         """The assumed curve, and ticks at the sizes to make; returns the axes."""
         import numpy as np
 
-        from ..pod.crossed import averaged_pod
         from ..pod.links import link_from_name
+        from ..pod.mixed import averaged_pod
 
         axes = axes_or_new(ax)
         c0, c1 = self.assumed.coefficients()

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from ..calibration.output_table import OutputTable
     from ..calibration.transmission_table import TransmissionTable
     from ..calibration.validate import Validation
-    from ..generator.predict import Prediction
-    from ..generator.predict_settings import Predictions
+    from ..generator.predict import Prediction, Predictions
     from ..generator.tube_twin import TubePrediction, TubeTwin
     from ..generator.twin import Twin
     from ..spectra import Spectrum

@@ -26,10 +26,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...materials import mass_attenuation_cm2_g, mass_photoelectric_cm2_g, material_from_name, scattering_per_sr
+from ...materials import (
+    mass_attenuation_cm2_g,
+    mass_photoelectric_cm2_g,
+    material_from_name,
+    scattering_per_sr,
+)
 from .._fine_picture import find_borders
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Parameter
+from ..spectral_signal import mean_signal_energy_keV
+from .effect import Effect, FalseEvidence, Grid, Parameter, Shows
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0
@@ -116,11 +122,6 @@ def _share_at_centre(shape: tuple[int, ...], pitch_mm: float, kernel: _Kernel) -
     places: FloatArray = np.arange(_COARSE, dtype=np.float64) * 2.0 + (1.0 - _COARSE)
     y_mm, x_mm = (np.asarray(half * places, dtype=np.float64) for half in (up, left))
     return float(kernel.cell(y_mm[:, None], x_mm[None, :], up, left).sum())
-
-
-def mean_signal_energy_keV(weights: FloatArray, energies_keV: FloatArray) -> float:
-    """Mean energy of a beam's signal, keV; weights (energy,) of the signal."""
-    return float(weights @ energies_keV[: weights.size] / weights.sum())
 
 
 def _energies_keV(weights: FloatArray, energies_keV: FloatArray) -> tuple[float, ...]:
@@ -227,6 +228,7 @@ def _add_scatter(state: LineState, parameters: Mapping[str, float], context: Lin
 OBJECT_SCATTER = Effect(
     id="object_scatter",
     title="radiation scattered by the object",
+    law=r"P \to P + s\,(E/E_0)^e\,[a\,P\,(-\ln T)] * K,\quad K(R) = \frac{h}{2\pi\,(h^2 + R^2)^{3/2}}",
     parameters=(
         Parameter(
             name="strength",
@@ -298,4 +300,20 @@ OBJECT_SCATTER = Effect(
     after_calibration=False,
     change=_add_scatter,
     needs=("spectral", "scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
+    isolated_by="a slab at two gaps to the detector, or a beam stop",
+    shows=Shows(series=("object",), axis="level", flats=False, places=True, like_thinner=True),
+    absorbed="nothing",
+    grid=Grid(
+        shares=(0.8,),
+        variants=(
+            {"width_mm": 25.0},
+            {"width_mm": 70.0},
+            {"width_mm": 200.0},
+            {"width_mm": 400.0, "own_directions": 1.0, "energy_exponent": -0.25},
+            {"width_mm": 40.0, "energy_exponent": -0.8, "own_albedo": 0.0, "gap_exponent": 0.5},
+        ),
+    ),
+    # photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of its log evidence goes to another
+    # effect, 0.016 where 40 % of scatter filled a wide field
+    false_evidence=FalseEvidence(leaves=0.02),
 )

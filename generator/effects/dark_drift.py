@@ -1,9 +1,7 @@
-"""What changes with time: the dark level, and the output of the tube.
+"""Dark level that drifts as the line warms up.
 
-dark drift    + s (t_exposure / t_longest) (g(time) - g(time of calibration)),
-              g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w)), T the session's length
-output drift  x (1 + e_n), e_n of standard deviation s, a share j of its variance new in every exposure, the rest with
-              correlation exp(-|dt| / tau); the same for all pixels
++ s (t_exposure / t_longest) (g(time) - g(time of calibration)),
+g = (1 - exp(-time / (w T))) / (1 - exp(-1 / w)), T the session's length
 """
 
 import math
@@ -13,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState
-from .effect import Effect, Parameter
+from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Shows, Variation
 
 
 def _drift_dark(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -33,6 +31,10 @@ def _drift_dark(state: LineState, parameters: Mapping[str, float], context: Line
 DARK_DRIFT = Effect(
     id="dark_drift",
     title="dark level drifts",
+    law=(
+        r"D \to D + s\,\frac{t}{t_\mathrm{longest}}\,[g(\tau) - g(\tau_\mathrm{calibration})],\quad "
+        r"g(\tau) = \frac{1 - e^{-\tau/(w\,T_\mathrm{session})}}{1 - e^{-1/w}}"
+    ),
     parameters=(
         Parameter(
             name="strength",
@@ -88,52 +90,11 @@ DARK_DRIFT = Effect(
     reference="thermal relaxation to a new temperature; dark current proportional to exposure time",
     after_calibration=False,
     change=_drift_dark,
-)
-
-
-def _drift_output(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
-    return replace(
-        state,
-        output_rms=parameters["strength"] / 100.0,
-        output_correlation_s=parameters["correlation_s"],
-        output_jitter_share=parameters["jitter_share"],
-    )
-
-
-OUTPUT_DRIFT = Effect(
-    id="output_drift",
-    title="tube output wanders from frame to frame",
-    parameters=(
-        Parameter(
-            name="strength",
-            unit="%",
-            low=0.1,
-            high=3.0,
-            default=0.5,
-            source="rms of the common factor of a frame; generators of 0.05-1 % ripple and drift",
-            log=True,
-        ),
-        Parameter(
-            name="correlation_s",
-            unit="s",
-            low=0.01,
-            high=600.0,
-            default=0.5,
-            source="from frame to frame (short) to a trend over the session (long)",
-            log=True,
-        ),
-        Parameter(
-            name="jitter_share",
-            unit="",
-            low=0.0,
-            high=1.0,
-            default=0.0,
-            source="share of the variance that is new in every exposure: ripple beside what wanders",
-            log=False,
-        ),
-    ),
-    stage="exposure",
-    reference="AR(1) process and white noise sampled at the frames",
-    after_calibration=False,
-    change=_drift_output,
+    isolated_by="darks in between, at the longest exposure time",
+    shows=Shows(series=EVERY_SERIES, axis="level", flats=False),
+    either_onset=True,
+    absorbed="nothing",
+    grid=Grid(shares=(0.8,)),
+    variation=Variation(random="sides"),
+    images=InImages(left_out="it depends on the time in a session"),
 )

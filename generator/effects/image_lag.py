@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LagLaw, LineContext, LineState
-from .effect import Effect, Parameter
+from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Reading, Shows
 
 _STEPS = (-1.5, -0.5, 0.5, 1.5)
 
@@ -41,6 +41,11 @@ def _trap_charge(state: LineState, parameters: Mapping[str, float], context: Lin
 IMAGE_LAG = Effect(
     id="image_lag",
     title="image lag",
+    law=(
+        r"y_n = (1 - \sum_i \phi_i)\,x_n + \sum_i (1 - a_i)\,R_{i,n},\quad "
+        r"R_{i,n+1} = a_i R_{i,n} + \phi_i x_n,\quad "
+        r"a_i = e^{-\Delta t/\tau_i}"
+    ),
     parameters=(
         Parameter(
             name="strength",
@@ -107,6 +112,8 @@ IMAGE_LAG = Effect(
             source="pause before each series of a session that states no times; diagnoses of such sessions fit it",
             log=True,
             fitted=False,
+            # quick traps still hold charge, slow ones have lost most
+            tried_without_times=(1.0, 20.0),
         ),
         Parameter(
             name="before_share",
@@ -118,10 +125,24 @@ IMAGE_LAG = Effect(
             " Diagnoses fit it where a lag came after the calibration",
             log=False,
             fitted=False,
+            fitted_if_later=True,
         ),
     ),
     stage="lag",
     reference="Hsieh, Gurmen, King (2000), doi:10.1109/42.887837; Starman et al. (2012), doi:10.1118/1.4752087",
     after_calibration=False,
     change=_trap_charge,
+    isolated_by="frames with the beam off straight after an exposure",
+    shows=Shows(series=EVERY_SERIES, axis="time"),
+    either_onset=True,
+    absorbed="noise",
+    reading=Reading(probes=("afterglow frames 0-0",), sd=0.08),
+    grid=Grid(
+        shares=(0.8,),
+        variants=(
+            *({"release_s": time_s, "pause_share": share} for time_s in (0.316, 3.16) for share in (0.0, 1.0)),
+            {"release_s": 0.3, "pause_share": 0.0, "spread": 1.3},  # one kind of traps
+        ),
+    ),
+    images=InImages(left_out="what was exposed before an image is not known"),
 )

@@ -1,7 +1,7 @@
 """Veiling glare: light that travels far inside the detector. It knows nothing of gap or thickness.
 
 h = (1 - r) delta + r exp(-R / L) / (2 pi L R),    transfer function (1 - r) + r / sqrt(1 + (2 pi L f)^2)
-(`order` 1/2; other shapes: effect.py)
+(`order` 1/2; other shapes: _light_spread.py)
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Parameter, order_parameter, spread_transfer
+from ._light_spread import order_parameter, spread_transfer
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 
 _USUAL_ORDER = 0.5
 
@@ -33,6 +34,7 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
 VEILING_GLARE = Effect(
     id="veiling_glare",
     title="veiling glare in the detector",
+    law=r"H(f) = (1 - s) + \frac{s}{\sqrt{1 + (2\pi L f)^2}}",
     parameters=(
         Parameter(
             name="strength",
@@ -59,4 +61,9 @@ VEILING_GLARE = Effect(
     after_calibration=False,
     change=_add_glare,
     needs=("pixel_mm",),
+    isolated_by="opaque discs of several sizes",
+    shows=Shows(series=LIT_SERIES, axis="sharpness", places=True, like_thinner=True),
+    either_onset=True,
+    absorbed="noise",
+    grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5})),
 )

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import Effect, Parameter
+from .effect import Displacement, Effect, FalseEvidence, Grid, InImages, Parameter, Placement, Reading, Shows
 
 
 def parts_px(strength_px: float, *, magnification_deg: float, rotation_deg: float) -> tuple[float, float, float]:
@@ -48,9 +48,36 @@ def _displace(state: LineState, parameters: Mapping[str, float], context: LineCo
     )
 
 
+_SHARP_EVIDENCE = 8.0  # two panels without effect, in squares of pixels, showed 6 of a tail
+
+
+def _parts(parameters: Mapping[str, float]) -> Displacement:
+    strength = parameters["strength"]
+    angles = {name: parameters.get(name, 0.0) for name in ("magnification_deg", "rotation_deg")}
+    shift, radial, turn = parts_px(strength, **angles)
+    return Displacement(
+        size_px=abs(strength),
+        shift_px=shift,
+        direction_deg=parameters.get("direction_deg", 0.0),
+        radial_px=radial,
+        turn_px=turn,
+    )
+
+
+def _without_shift(parameters: Mapping[str, float]) -> dict[str, float]:
+    parts = _parts(parameters)
+    return {**parameters, **angles_of(0.0, parts.radial_px, parts.turn_px), "direction_deg": 0.0}
+
+
+def _combined(shifted: Mapping[str, float], distorted: Mapping[str, float]) -> dict[str, float]:
+    shift, other = _parts(shifted).shift_px, _parts(distorted)
+    return {**shifted, **angles_of(abs(shift), other.radial_px, other.turn_px)}
+
+
 MISREGISTRATION = Effect(
     id="misregistration",
     title="object lies elsewhere than its thickness maps",
+    law=r"\mathbf r \to \mathbf r + \mathbf d(\mathbf r),\quad \sqrt{\langle d^2\rangle} = s",
     parameters=(
         Parameter(
             name="strength",
@@ -60,6 +87,7 @@ MISREGISTRATION = Effect(
             default=0.5,
             source="rms displacement over the field",
             log=True,
+            pixel_power=1.0,
         ),
         Parameter(
             name="direction_deg",
@@ -94,4 +122,22 @@ MISREGISTRATION = Effect(
     after_calibration=False,
     change=_displace,
     needs=("scene",),
+    isolated_by="a grid of balls, or an edge in two directions",
+    shows=Shows(series=("object",), axis="sharpness", flats=False, places=True),
+    absorbed="nothing",
+    reading=Reading(probes=("displacement along rows", "displacement along columns")),  # where scenes lie is its shift
+    grid=Grid(
+        shares=(0.6, 1.0),
+        variants=(
+            *({"direction_deg": 45.0 * k, "magnification_deg": 0.0} for k in range(8)),
+            *(
+                {"direction_deg": 0.0, name: sign * 90.0}
+                for name in ("magnification_deg", "rotation_deg")
+                for sign in (1, -1)
+            ),
+        ),
+    ),
+    false_evidence=FalseEvidence(alone_sharp=_SHARP_EVIDENCE, edges_alone=True),
+    images=InImages(left_out="picture and masks stay together"),
+    placement=Placement(parts=_parts, without_shift=_without_shift, combined=_combined),
 )

@@ -1,0 +1,59 @@
+"""Gain map error: a per-pixel gain that calibration does not know.
+
+y = x (1 + eta), eta fixed from frame to frame
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..line_state import FixedPattern, LineContext, LineState
+from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows, Variation
+
+
+def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
+    # a pattern that calibration saw is in its maps
+    if parameters["strength"] == 0 or context.since == "always":
+        return state
+    return replace(
+        state, gain_pattern=FixedPattern(rms=parameters["strength"] / 100.0, seed=int(parameters["pattern_seed"]))
+    )
+
+
+GAIN_MAP_ERROR = Effect(
+    id="gain_map_error",
+    title="per-pixel gain has changed",
+    law=r"y_{ij} = x_{ij}\,(1 + \eta_{ij}),\quad \mathrm{sd}(\eta) = s\ \text{(the same in every frame)}",
+    parameters=(
+        Parameter(
+            name="strength",
+            unit="%",
+            low=0.1,
+            high=3.0,
+            default=0.5,
+            source="standard deviation over the pixels; flat panels between two gain calibrations",
+            log=True,
+            pixel_power=1.0,  # of a pattern from pixel to pixel
+        ),
+        Parameter(
+            name="pattern_seed",
+            unit="",
+            low=0.0,
+            high=2.0**31,
+            default=0.0,
+            source="draws the pattern",
+            log=False,
+            fitted=False,
+        ),
+    ),
+    stage="response",
+    reference="fixed-pattern noise (PRNU), EMVA Standard 1288, release 4.0",
+    after_calibration=True,
+    change=_change_gain,
+    isolated_by="flats repeated, and behind a filter",
+    shows=Shows(series=EVERY_SERIES, axis="position", flats=False, single_pixels=True),
+    absorbed="maps",
+    reading=Reading(probes=("fixed_pattern",), sd=0.12),  # they hold only what differs from pixel to pixel
+    variation=Variation(random="pixels"),
+    # a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
+    false_evidence=FalseEvidence(unmistakable=True),
+)

@@ -48,13 +48,15 @@ _STARTS = (
     {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},
 )
-# Reaches of tails, equally likely: a factor of 1.5 apart changes the gain by less than a tail's share is known to.
-_REACHES_PX = (0.5, 0.75, 1.13, 1.7, _LONGEST_TAIL_PX)
+# Logarithm of a tail's reach, px, any value between these equally likely: averaged over at steps of a factor of 1.5, which change
+# the gain by less than a share is known to; where it is known better than that, at steps of its standard deviation.
+_LOG_REACH = (math.log(0.25), math.log(_LONGEST_TAIL_PX))
+_REACH_STEP = math.log(1.5)
 # Whether there is a tail is open; the low-frequency drop of panels with a scintillator is 2 to 20 %, which a beta law of mean 0.1
 # describes; of those with a tail one in ten may have any.
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
-_TAIL_STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations of the share, at which it is averaged over
+_STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
 _LEAST_SD, _MOST_SD = 0.005, 0.15  # of the share between such steps
 # A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
 # deviation of the mean adds an eighth to that.
@@ -440,6 +442,8 @@ def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fix
     names = _FAMILIES[family][2]
     free = [place for place, name in enumerate(names) if name not in fixed]
     bounds = np.array([_BOUNDS[name] for name in names]).T
+    if "log_tail_px" in names:
+        bounds[:, names.index("log_tail_px")] = _LOG_REACH
     bounds[1, names.index("sigma_px2")] = (_WIDEST_CORE * max(problem.sides)) ** 2
     tried = [
         _descended(problem, family, np.clip(one, bounds[0], bounds[1]), bounds, free)
@@ -568,21 +572,48 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
     families = [family for family, (model, *_, names) in _FAMILIES.items() if set(names) == {*core.names, *_TAIL}]
     for family in families:
         names = _FAMILIES[family][2]
-        share_at, reach_at = names.index("tail_share"), names.index("log_tail_px")
-        starts = _starts(family)
-        for reach_px in _REACHES_PX:
-            for start in starts:
-                start[reach_at] = math.log(reach_px)
-            best = _fitted(problem, family, starts, fixed=("log_tail_px",))
+        share_at = names.index("tail_share")
+        for reach_width, best in _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             sd = min(max(math.sqrt(max(variance, 0.0)), _LEAST_SD), _MOST_SD)
-            shares = np.unique(np.clip(best.theta[share_at] + sd * np.array(_TAIL_STEPS), 0.0, 1.0))
-            widths = 0.5 * np.diff(shares, prepend=shares[0], append=shares[-1])
-            for share, width in zip(shares, widths[:-1] + widths[1:], strict=True):
-                density = (1.0 - _NO_TAIL) * _share_density(float(share))
-                mass = width * density / (len(families) * len(_REACHES_PX))
-                yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, float(share))
-            starts = [best.theta.copy()]
+            for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
+                density = (1.0 - _NO_TAIL) * _share_density(share)
+                mass = width * density * reach_width / (_LOG_REACH[1] - _LOG_REACH[0]) / len(families)
+                yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, share)
+
+
+def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]]:
+    """The best spread of a family at each of some reaches of the tail, with the width of log reach that it stands for."""
+    place = _FAMILIES[family][2].index("log_tail_px")
+    count = 1 + math.ceil((_LOG_REACH[1] - _LOG_REACH[0]) / _REACH_STEP)
+    grid = np.linspace(*_LOG_REACH, count)
+    step = float(grid[1] - grid[0])
+    found: list[tuple[float, _Candidate]] = []
+    starts = _starts(family)
+    for reach in grid:
+        for start in starts:
+            start[place] = reach
+        item = _fitted(problem, family, starts, fixed=("log_tail_px",))
+        found.append((step if grid[0] < reach < grid[-1] else 0.5 * step, item))
+        starts = [item.theta.copy()]
+    best = min((item for _, item in found), key=lambda item: item.chi_square)
+    free = _fitted(problem, family, [best.theta])
+    sd = math.sqrt(max(float(free.covariance[len(free.coefficients) + place, len(free.coefficients) + place]), 0.0))
+    if not 0.0 < sd < 0.5 * step:
+        return found
+    sharp = []
+    for reach, width in _steps(float(free.theta[place]), sd, _LOG_REACH):
+        theta = free.theta.copy()
+        theta[place] = reach
+        sharp.append((width, _fitted(problem, family, [theta], fixed=("log_tail_px",))))
+    return sharp
+
+
+def _steps(middle: float, sd: float, bounds: tuple[float, float]) -> list[tuple[float, float]]:
+    """Values about a middle, inside the bounds, and the width that each stands for."""
+    values = np.unique(np.clip(middle + sd * np.array(_STEPS), *bounds))
+    halves = 0.5 * np.diff(values, prepend=values[0], append=values[-1])
+    return [(float(value), float(width)) for value, width in zip(values, halves[:-1] + halves[1:], strict=True)]
 
 
 def _share_density(share: float) -> float:

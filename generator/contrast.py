@@ -223,8 +223,10 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
     # frames of one exposure: averaging is put in where the noise is
     predicted = predict_flatfield(twin, replace(setting, averaged=1))
 
+    photons = model.weights(samples, beam)
+
     def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = model.signal(samples, beam, through=through)
+        found = model.signal_of_photons(samples, photons * through[: photons.shape[1]])
         return found.rate_DN_per_mAs, found.gain_DN
 
     return _Beam(
@@ -464,20 +466,29 @@ def disc_and_ring(pixels: int, dilations: int) -> tuple[NDArray[np.bool_], NDArr
 
 def _variance_of_difference(
     *,
-    disc: NDArray[np.bool_],
-    ring: NDArray[np.bool_],
+    pixels: tuple[int, int],
+    correlated: tuple[float, float, float],
     quantum: tuple[float, float],
     white: tuple[float, float],
-    detector: _Detector,
 ) -> float:
     """Variance of the disc's mean less the ring's; quantum and white variance a pixel as (in the disc, in the ring)."""
+    in_disc, in_both, in_ring = correlated
+    of_quanta = quantum[0] * in_disc - 2.0 * math.sqrt(quantum[0] * quantum[1]) * in_both + quantum[1] * in_ring
+    return of_quanta + white[0] / pixels[0] + white[1] / pixels[1]
+
+
+def _correlated_shares(masks: tuple[NDArray[np.bool_], NDArray[np.bool_]], spread: Spread) -> tuple[float, float, float]:
+    """Variance of the means over disc and over ring of noise of unit variance before the spread, and between them.
+
+    Returns:
+        Disc, disc with ring, ring; no unit.
+    """
     from scipy.signal import oaconvolve
 
-    weight = disc / disc.sum() - ring / ring.sum()
-    amplitude = weight * np.sqrt(np.where(disc, quantum[0], quantum[1]))
-    spread_out = oaconvolve(amplitude, detector.spread.noise_autocovariance(detector.spread.reach_px), mode="same")
-    correlated = float(np.sum(amplitude * spread_out))
-    return correlated + float(np.sum(weight**2 * np.where(disc, white[0], white[1])))
+    kernel = spread.noise_autocovariance(spread.reach_px)
+    disc, ring = (mask / mask.sum() for mask in masks)
+    around_disc, around_ring = (oaconvolve(mean, kernel, mode="same") for mean in (disc, ring))
+    return float(np.sum(disc * around_disc)), float(np.sum(ring * around_disc)), float(np.sum(ring * around_ring))
 
 
 def _quotients(low: _Slabs, high: _Slabs) -> tuple[FloatArray, FloatArray]:
@@ -490,8 +501,8 @@ def _combined(
     detector: _Detector,
     *,
     thickness_ratio: float,
-    object_pixels: int,
-    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    pixels: tuple[int, int],
+    correlated: tuple[float, float, float],
     by_table: Mapping[str, float],
 ) -> Contrast:
     R_product, R_object = _quotients(low, high)
@@ -517,10 +528,7 @@ def _combined(
     )
     share = detector.spread.variance_share
     sd_pixel = math.sqrt(quantum[0] * share + white[0])
-    disc, ring = masks
-    sd_object = math.sqrt(
-        _variance_of_difference(disc=disc, ring=ring, quantum=quantum, white=white, detector=detector)
-    )
+    sd_object = math.sqrt(_variance_of_difference(pixels=pixels, correlated=correlated, quantum=quantum, white=white))
     warnings = list(dict.fromkeys((*low.warnings, *high.warnings)))
     if low.few_photons or high.few_photons:
         warnings.append(
@@ -545,7 +553,7 @@ def _combined(
         ),
         delta_R_by_table=dict(by_table),
         R_product=q_product,
-        object_pixels=object_pixels,
+        object_pixels=pixels[0],
         sd_pixel=sd_pixel,
         sd_object=sd_object,
         cnr_pixel=abs(best) / sd_pixel,
@@ -639,6 +647,8 @@ def _contrasts(
     _checked_slabs(product, foreign_object, displaces, object_pixels)
     detector = _detector_of(line)
     masks = disc_and_ring(object_pixels, min(dilations_for_pixel(detector.pixel_mm), _WIDEST_RING_PX))
+    pixels = (int(masks[0].sum()), int(masks[1].sum()))
+    correlated = _correlated_shares(masks, detector.spread)
     known: dict[tuple[Setting, str], _Slabs] = {}
     beams: dict[Setting, _Beam] = {}
 
@@ -683,8 +693,8 @@ def _contrasts(
                     slabs(high, "xraylib"),
                     detector,
                     thickness_ratio=foreign_object.thickness_mm / product.thickness_mm,
-                    object_pixels=object_pixels,
-                    masks=masks,
+                    pixels=pixels,
+                    correlated=correlated,
                     by_table=by_table,
                 )
             )

@@ -33,7 +33,7 @@ from ..spectra import (
     tube_fluence_interpolated,
 )
 from .binning import refuse_binning
-from .predict import predict_flatfield, spectrum_outside
+from .predict import Prediction, predict_flatfield, spectrum_outside
 from .present_line import present_line
 from .psf import PSF_MODELS, Spread
 from .spectral_signal import OpenBeam
@@ -208,7 +208,9 @@ class _Slabs:
     warnings: tuple[str, ...]
 
 
-def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
+def _beam_of_twin(
+    twin: Twin, setting: Setting, intervals: bool, predict: Callable[[Twin, Setting], Prediction] = predict_flatfield
+) -> _Beam:
     line = present_line(twin)
     twin = line.twin
     told = line.warnings
@@ -221,7 +223,7 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
         samples = np.concatenate([samples, posterior.samples])
     beam = OpenBeam(kV=setting.kV, filters=setting.filters)
     # frames of one exposure: averaging is put in where the noise is
-    predicted = predict_flatfield(twin, replace(setting, averaged=1))
+    predicted = predict(twin, replace(setting, averaged=1))
 
     photons = model.weights(samples, beam)
 
@@ -562,6 +564,87 @@ def _combined(
     )
 
 
+class SlabContrasts:
+    """Contrasts of one foreign object in one product on one line, beams and slabs computed once for all pairs of settings.
+
+    Args:
+        line, product, foreign_object, object_pixels, displaces, library: as for `predict_contrast`.
+        predict: a twin and a setting -> its flatfield; one that keeps what it has predicted saves time.
+    """
+
+    def __init__(
+        self,
+        line: Twin | UncalibratedLine,
+        *,
+        product: Filter,
+        foreign_object: Filter,
+        object_pixels: int = 1,
+        displaces: bool = False,
+        library: Library | None = None,
+        predict: Callable[[Twin, Setting], Prediction] = predict_flatfield,
+    ) -> None:
+        _checked_slabs(product, foreign_object, displaces, object_pixels)
+        self._line = line
+        self._slab_words: dict[str, Any] = {
+            "product": product,
+            "foreign_object": foreign_object,
+            "displaces": displaces,
+            "library": library,
+        }
+        self._thickness_ratio = foreign_object.thickness_mm / product.thickness_mm
+        self._library = library
+        self._predict = predict
+        self._detector = _detector_of(line)
+        masks = disc_and_ring(object_pixels, min(dilations_for_pixel(self._detector.pixel_mm), _WIDEST_RING_PX))
+        self._pixels = (int(masks[0].sum()), int(masks[1].sum()))
+        self._correlated = _correlated_shares(masks, self._detector.spread)
+        self._known: dict[tuple[Setting, bool, str], _Slabs] = {}
+        self._beams: dict[tuple[Setting, bool], _Beam] = {}
+
+    def contrast(self, low: Setting, high: Setting, *, intervals: bool = True) -> Contrast:
+        """`predict_contrast` at a pair of settings; without intervals in a fraction of the time.
+
+        Raises:
+            InputError: as there.
+        """
+        if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
+            raise InputError(
+                "low and high setting",
+                received=f"{low} and {high}",
+                expected="two different spectra, the lower kV first",
+            )
+        by_table = {}
+        for table in TABLES if intervals else ("xraylib",):
+            q_product, q_object = _quotients(self._slabs(low, intervals, table), self._slabs(high, intervals, table))
+            by_table[table] = float(q_object[0] - q_product[0])
+        return _combined(
+            self._slabs(low, intervals, "xraylib"),
+            self._slabs(high, intervals, "xraylib"),
+            self._detector,
+            thickness_ratio=self._thickness_ratio,
+            pixels=self._pixels,
+            correlated=self._correlated,
+            by_table=by_table,
+        )
+
+    def _slabs(self, setting: Setting, intervals: bool, table: str) -> _Slabs:
+        key = (setting, intervals, table)
+        if key not in self._known:
+            beam = self._beam(setting, intervals)
+            self._known[key] = _slabs(beam, setting, self._detector, table=table, **self._slab_words)
+        return self._known[key]
+
+    def _beam(self, setting: Setting, intervals: bool) -> _Beam:
+        refuse_binning(setting)
+        key = (setting, intervals)
+        if key not in self._beams:
+            if isinstance(self._line, UncalibratedLine):
+                self._beams[key] = _beam_of_line(self._line, setting, self._library, intervals)
+            else:
+                self._beams[key] = _beam_of_twin(self._line, setting, intervals, self._predict)
+        return self._beams[key]
+
+
 def predict_contrast(
     line: Twin | UncalibratedLine,
     *,
@@ -594,17 +677,15 @@ def predict_contrast(
     Checked against: the paper's equation where the beam is nearly monoenergetic, noise drawn frame by frame
         (tests/test_generator_contrast.py).
     """
-    grid = _contrasts(
+    slabs = SlabContrasts(
         line,
-        [[(low, high)]],
         product=product,
         foreign_object=foreign_object,
         object_pixels=object_pixels,
         displaces=displaces,
-        intervals=True,
         library=library,
     )
-    return grid[0][0]
+    return slabs.contrast(low, high)
 
 
 def compute_contrast_map(
@@ -621,82 +702,12 @@ def compute_contrast_map(
 
     A setting that stands in several pairs is computed once. Raises as `predict_contrast`.
     """
-    return _contrasts(
+    slabs = SlabContrasts(
         line,
-        pairs,
         product=product,
         foreign_object=foreign_object,
         object_pixels=object_pixels,
         displaces=displaces,
-        intervals=False,
         library=library,
     )
-
-
-def _contrasts(
-    line: Twin | UncalibratedLine,
-    pairs: Iterable[Sequence[tuple[Setting, Setting]]],
-    *,
-    product: Filter,
-    foreign_object: Filter,
-    object_pixels: int,
-    displaces: bool,
-    intervals: bool,
-    library: Library | None,
-) -> tuple[tuple[Contrast, ...], ...]:
-    _checked_slabs(product, foreign_object, displaces, object_pixels)
-    detector = _detector_of(line)
-    masks = disc_and_ring(object_pixels, min(dilations_for_pixel(detector.pixel_mm), _WIDEST_RING_PX))
-    pixels = (int(masks[0].sum()), int(masks[1].sum()))
-    correlated = _correlated_shares(masks, detector.spread)
-    known: dict[tuple[Setting, str], _Slabs] = {}
-    beams: dict[Setting, _Beam] = {}
-
-    def slabs(setting: Setting, table: str) -> _Slabs:
-        refuse_binning(setting)
-        if setting not in beams:
-            if isinstance(line, UncalibratedLine):
-                beams[setting] = _beam_of_line(line, setting, library, intervals)
-            else:
-                beams[setting] = _beam_of_twin(line, setting, intervals)
-        key = (setting, table)
-        if key not in known:
-            known[key] = _slabs(
-                beams[setting],
-                setting,
-                detector,
-                product=product,
-                foreign_object=foreign_object,
-                displaces=displaces,
-                table=table,
-                library=library,
-            )
-        return known[key]
-
-    rows = []
-    for row in pairs:
-        found = []
-        for low, high in row:
-            if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
-                raise InputError(
-                    "low and high setting",
-                    received=f"{low} and {high}",
-                    expected="two different spectra, the lower kV first",
-                )
-            by_table = {}
-            for table in TABLES if intervals else ("xraylib",):
-                q_product, q_object = _quotients(slabs(low, table), slabs(high, table))
-                by_table[table] = float(q_object[0] - q_product[0])
-            found.append(
-                _combined(
-                    slabs(low, "xraylib"),
-                    slabs(high, "xraylib"),
-                    detector,
-                    thickness_ratio=foreign_object.thickness_mm / product.thickness_mm,
-                    pixels=pixels,
-                    correlated=correlated,
-                    by_table=by_table,
-                )
-            )
-        rows.append(tuple(found))
-    return tuple(rows)
+    return tuple(tuple(slabs.contrast(low, high, intervals=False) for low, high in row) for row in pairs)

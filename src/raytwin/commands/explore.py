@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     state = first_state(twin)
     explorer.view(state)
     explorer.map(state)
-    levels = ", ".join(level.name for level in twin.levels)
+    levels = "; ".join(level.name for level in twin.levels)
     target = CampaignTarget(path=arguments.campaign, references=arguments.references)
 
     def told(address: str, tunnel: str | None) -> None:

@@ -58,6 +58,8 @@ class _Page:
         from bokeh.models import Button, ColumnDataSource, CustomJS, Div
 
         wide = {"sizing_mode": "stretch_width"}
+        self.tiles = Div(name="tiles", **wide)
+        self.limits = Div(name="limits", **wide)
         self.numbers = Div(name="numbers", **wide)
         self.map_note = Div(name="map_note", **wide)
         self.image_note = Div(name="image_note", **wide)
@@ -89,7 +91,18 @@ class _Page:
         noise.on_click(self._new_noise)
         for widget in self.widgets.values():
             document.add_root(widget)
-        for model in (self.numbers, self.map_note, self.image_note, self.added, self.texts, *buttons, add, noise):
+        for model in (
+            self.tiles,
+            self.limits,
+            self.numbers,
+            self.map_note,
+            self.image_note,
+            self.added,
+            self.texts,
+            *buttons,
+            add,
+            noise,
+        ):
             document.add_root(model)
         for figure in self.figures.figures:
             document.add_root(figure)
@@ -173,7 +186,7 @@ class _Page:
                 name="layers",
                 title="Further filters in both beams",
                 value="+".join(map(str, more)),
-                placeholder="MATERIAL:mm, such as Al:1+air:1000",
+                placeholder="MATERIAL:mm+MATERIAL:mm",
                 **wide,
             ),
             material("product", "Product", state.product.material),
@@ -244,11 +257,13 @@ class _Page:
         try:
             self.state = self._state_of_controls()
         except InputError as error:
-            self.numbers.text = _problem_text(str(error))
+            self.limits.text = _problem_text(str(error))
             return
         view = self.explorer.view(self.state)
         self.document.hold("combine")
         try:
+            self.tiles.text = tiles_text(view)
+            self.limits.text = limits_text(view)
             self.numbers.text = numbers_text(view, self.explorer)
             self.figures.show(view)
             self.copied.data = {"command": [view.command], "python": [view.python]}
@@ -339,22 +354,30 @@ def _longest(layer: Filter | None) -> float:
     return max(_THICK_MM.get(layer.material, _USUAL_MM), layer.thickness_mm) if layer else _USUAL_MM
 
 
-_TABLE_STYLE = f"""<style>
- table {{ border-collapse: collapse; width: 100%; font: 14px/1.35 system-ui, "DejaVu Sans", sans-serif; color: #1b1f24; }}
+_FONT = 'system-ui, "DejaVu Sans", sans-serif'
+_STYLE = f"""<style>
+ :host, div, p, ul, table {{ font-family: {_FONT}; color: #1b1f24; }}
+ table {{ border-collapse: collapse; width: 100%; font-size: 14px; line-height: 1.35; }}
  th, td {{ text-align: left; padding: 3px 10px 3px 0; vertical-align: top; border-bottom: 1px solid #e6e9ee; }}
- th {{ font-weight: 600; }} td.q {{ color: #4a5360; }} span.i {{ color: #4a5360; font-size: 12px; white-space: nowrap; }}
+ th {{ font-weight: 600; }} td.q {{ color: #4a5360; width: 38%; }} span.i {{ color: #4a5360; font-size: 12px; white-space: nowrap; }}
  .low {{ color: #0a5b94; }} .high {{ color: #a54400; }}
- ul {{ margin: 6px 0 0; padding-left: 18px; font: 14px/1.35 system-ui, "DejaVu Sans", sans-serif; }}
- .broken {{ color: {_RED}; font-weight: 600; }} .caution {{ color: #4a5360; }}
- p, pre {{ margin: 6px 0 0; font-size: 13px; color: #4a5360; }}
- pre {{ white-space: pre-wrap; overflow-wrap: anywhere; color: #1b1f24; }}
- p, ul {{ font-family: system-ui, "DejaVu Sans", sans-serif; }}
- .bad {{ color: {_RED}; font-weight: 600; }}
+ ul {{ margin: 6px 0 0; padding-left: 18px; font-size: 14px; line-height: 1.35; }}
+ .caution {{ color: #4a5360; }} .bad, .bad b, .bad small, .broken, .broken li {{ color: {_RED}; font-weight: 600; }}
+ p {{ margin: 6px 0 0; font-size: 13px; color: #4a5360; }}
+ pre {{ margin: 6px 0 0; font-size: 13px; white-space: pre-wrap; overflow-wrap: anywhere; color: #1b1f24; }}
+ .tiles {{ display: flex; flex-wrap: wrap; gap: 4px 26px; }}
+ .tiles b {{ display: block; font-size: 19px; font-weight: 600; }} .tiles small {{ color: #4a5360; font-size: 12px; }}
+ .tiles span.i {{ font-weight: 400; }}
+ @media (max-width: 600px) {{
+  tr {{ display: grid; grid-template-columns: 1fr 1fr; border-bottom: 1px solid #e6e9ee; }} td, th {{ border-bottom: none; }}
+  td.q {{ grid-column: 1 / -1; width: auto; padding-bottom: 0; }} th.q {{ display: none; }} td.both {{ grid-column: 1 / -1; }}
+  .tiles {{ gap: 2px 14px; }} .tiles b {{ font-size: 15px; }} .tiles span.i {{ display: none; }}
+ }}
 </style>"""
 
 
 def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
-    """The table of numbers with their 95 % intervals, broken limits first, as HTML."""
+    """The table of numbers with their 95 % intervals, and what limits them, as HTML."""
     low, high = view.low, view.high
     rows = [
         ("level above dark, DN", *(_of(beam, "mean_DN") for beam in (low, high))),
@@ -364,19 +387,12 @@ def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
         ("air kerma of one frame, µGy", *(_of(beam, "air_kerma_uGy") for beam in (low, high))),
     ]
     found = view.contrast
+    if found is not None:
+        rows.append(("−ln(I/I₀) of the product", f"{found.low.M_product:.4f}", f"{found.high.M_product:.4f}"))
+        rows.append(("−ln(I/I₀) with the object", f"{found.low.M_object:.4f}", f"{found.high.M_object:.4f}"))
     both: list[tuple[str, str]] = []
     if found is not None:
-        rows.append(
-            ("−ln(I/I₀) of the product", f"{found.low.M_product:.4f}", f"{found.high.M_product:.4f}"),
-        )
-        rows.append(("−ln(I/I₀) with the object", f"{found.low.M_object:.4f}", f"{found.high.M_object:.4f}"))
-        both += [
-            ("contrast Delta R", _interval(found.delta_R, 4)),
-            ("contrast to noise of the object", f"{found.cnr_object:.3g}"),
-            ("contrast to noise of one pixel", f"{found.cnr_pixel:.3g}"),
-        ]
-    both.append(("air kerma of the pair, µGy", "not known" if view.dose_uGy is None else _interval(view.dose_uGy)))
-    both.append(("pairs a second, one image after the other", f"{view.pairs_per_s:.3g}"))
+        both.append(("contrast to noise of one pixel", f"{found.cnr_pixel:.3g}"))
     pixel_mm = explorer.instrument.pixel_mm
     if pixel_mm is not None and explorer.instrument.magnification is not None:
         across = object_diameter_mm(view.state, pixel_mm / explorer.instrument.magnification)
@@ -385,8 +401,7 @@ def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
         both.append((f"a90 of {pod.known.name}, {pod.known.size_name}", _a90_text(pod.known)))
         if pod.times_a90 is not None:
             at = f"; POD {_percents(pod.pod)}" if pod.pod is not None else ""
-            both.append(("contrast seen here over a90", f"{pod.times_a90:.3g}{at}"))
-    broken = "".join(f'<li class="broken">Not possible: {html.escape(text)}</li>' for text in view.limits)
+            both.append((f"Delta R over a90 of {pod.known.name}", f"{pod.times_a90:.3g}{at}"))
     told = "".join(f'<li class="caution">{html.escape(text)}</li>' for text in view.cautions)
     head = "".join(
         f'<th class="{name}">{name}, {beam.setting.kV:g} kV</th>' for name, beam in (("low", low), ("high", high))
@@ -395,11 +410,35 @@ def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
         f'<tr><td class="q">{html.escape(title)}</td><td>{one}</td><td>{other}</td></tr>' for title, one, other in rows
     )
     body += "".join(
-        f'<tr><td class="q">{html.escape(title)}</td><td colspan="2">{text}</td></tr>' for title, text in both
+        f'<tr><td class="q">{html.escape(title)}</td><td colspan="2" class="both">{text}</td></tr>'
+        for title, text in both
     )
-    lists = (f"<ul>{broken}</ul>" if broken else "") + (f"<ul>{told}</ul>" if told else "")
-    below = "<p>Small print: 95 % intervals of the quantity itself.</p>"
-    return f"{_TABLE_STYLE}<table><tr><th></th>{head}</tr>{body}</table>{below}{lists}"
+    below = "<p>In brackets: 95 % interval of the quantity itself, without the noise of a later measurement.</p>"
+    cautions = f"<ul>{told}</ul>" if told else ""
+    return f'{_STYLE}<table><tr><th class="q"></th>{head}</tr>{body}</table>{below}{cautions}'
+
+
+def tiles_text(view: ExplorerView) -> str:
+    """The answer at a glance: what the pair of images is worth, as HTML."""
+    found = view.contrast
+    tiles = [
+        ("contrast to noise of the object", "none" if found is None else f"{found.cnr_object:.3g}"),
+        ("contrast Delta R", "none" if found is None else _interval(found.delta_R, 3)),
+        ("air kerma of the pair, µGy", "not known" if view.dose_uGy is None else _interval(view.dose_uGy, 3)),
+        ("pairs a second", f"{view.pairs_per_s:.3g}"),
+    ]
+    every = "".join(f"<div><b>{text}</b><small>{html.escape(title)}</small></div>" for title, text in tiles)
+    if view.limits:
+        every += f'<div class="bad"><b>✗ not possible</b><small>{len(view.limits)} reason(s) below</small></div>'
+    return f'{_STYLE}<div class="tiles">{every}</div>'
+
+
+def limits_text(view: ExplorerView) -> str:
+    """What cannot be, in red, as HTML; empty where all can."""
+    if not view.limits:
+        return ""
+    broken = "".join(f"<li>Not possible: {html.escape(text)}</li>" for text in view.limits)
+    return f'{_STYLE}<ul class="broken">{broken}</ul>'
 
 
 def _of(beam: BeamView, name: str) -> str:
@@ -440,15 +479,15 @@ def _percents(pod: tuple[float, float, float]) -> str:
 
 
 def _note(text: str) -> str:
-    return f"{_TABLE_STYLE}<p>{html.escape(text)}</p>"
+    return f"{_STYLE}<p>{html.escape(text)}</p>"
 
 
 def _problem_text(text: str) -> str:
-    return f'{_TABLE_STYLE}<ul><li class="broken">{html.escape(text)}</li></ul>'
+    return f'{_STYLE}<ul class="broken"><li>{html.escape(text)}</li></ul>'
 
 
 def _texts_text(view: ExplorerView) -> str:
-    return f"{_TABLE_STYLE}<pre>{html.escape(view.command)}</pre>"
+    return f"{_STYLE}<pre>{html.escape(view.command)}</pre>"
 
 
 def _image_note(view: ExplorerView) -> str:
@@ -467,7 +506,7 @@ def _map_note(found: MapView) -> str:
     kV_low, kV_high, ratio = found.best
     return _note(
         f"Ring: what is set. Star: best on the map, {ratio:.3g} at {kV_low:g} and {kV_high:g} kV. Hatched: beyond the limits"
-        " of the line. Powers stay as set."
+        " of the line. Empty: no pair. Powers stay as set."
     )
 
 
@@ -501,6 +540,8 @@ class _Figures:
         spectrum.y_range.start = 0
         spectrum.legend.orientation = "horizontal"
         spectrum.legend.ncols = 2
+        spectrum.legend.spacing = 20
+        spectrum.legend.label_text_font_size = "12px"
         spectrum.add_layout(spectrum.legend[0], "below")
         self.pictures = {name: ColumnDataSource(data={"image": [], "side": []}) for name in ("low", "high", "ratio")}
         self.mappers = {name: LinearColorMapper(palette=Greys256, low=0.0, high=1.0) for name in self.pictures}
@@ -509,9 +550,8 @@ class _Figures:
         images = []
         titles = {"low": "low voltage, −ln(I/I₀)", "high": "high voltage, −ln(I/I₀)", "ratio": "ratio low / high"}
         for name, title in titles.items():
-            one = figure(
-                name=f"image_{name}", title=title, height=300, x_range=Range1d(0, 64), y_range=Range1d(0, 64), **plain
-            )
+            one = figure(name=f"image_{name}", title=title, height=300, match_aspect=True, **plain)
+            one.x_range.range_padding = one.y_range.range_padding = 0
             one.image(
                 "image", x=0, y=0, dw="side", dh="side", source=self.pictures[name], color_mapper=self.mappers[name]
             )
@@ -597,8 +637,6 @@ class _Figures:
         for name, image in (("low", pair.log_low), ("high", pair.log_high), ("ratio", pair.ratio)):
             self.pictures[name].data = {"image": [image], "side": [side]}
             self.mappers[name].update(low=scales[name][0], high=scales[name][1])
-        for one in self.images:
-            one.x_range.end = one.y_range.end = side
 
     def show_map(self, found: MapView) -> None:
         """The map of contrast to noise."""

@@ -12,6 +12,7 @@ Left out: scatter, the noise of the flat, and the softening of the object's edge
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -180,15 +181,33 @@ class _Detector:
 class _Beam:
     """A setting as a function: transmission of an object (energy,) -> rate and gain (draw,), row 0 the best values.
 
-    secondary_DN: of the gain, what secondary quanta add, the same behind any object.
+    signal: takes besides whether all draws are wanted or the best values alone; secondary_DN: of the gain, what secondary
+    quanta add, the same behind any object.
     """
 
-    signal: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    signal: Callable[[FloatArray, bool], tuple[FloatArray, FloatArray]]
     energies_keV: FloatArray
     open_signal_DN: float
     open_gain_DN: float
     secondary_DN: float
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Crossed:
+    """What slabs leave of a beam, whatever its load.
+
+    Fields: M_product, M_object (draw,), row 0 the best values; transmitted, gain_ratio (2,): signal and gain behind product, and
+    behind both, over those of the open beam; M_object_alone; thin_mu_product_per_mm, thin_mu_object_per_mm.
+    """
+
+    M_product: FloatArray
+    M_object: FloatArray
+    transmitted: tuple[float, float]
+    gain_ratio: tuple[float, float]
+    M_object_alone: float
+    thin_mu_product_per_mm: float
+    thin_mu_object_per_mm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,10 +244,13 @@ def _beam_of_twin(
     # frames of one exposure: averaging is put in where the noise is
     predicted = predict(twin, replace(setting, averaged=1))
 
-    photons = model.weights(samples, beam)
+    @cache
+    def photons(draws: bool) -> FloatArray:
+        return model.weights(samples if draws else samples[:1], beam)
 
-    def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = model.signal_of_photons(samples, photons * through[: photons.shape[1]])
+    def signal(through: FloatArray, draws: bool) -> tuple[FloatArray, FloatArray]:
+        bare = photons(draws)
+        found = model.signal_of_photons(samples if draws else samples[:1], bare * through[: bare.shape[1]])
         return found.rate_DN_per_mAs, found.gain_DN
 
     return _Beam(
@@ -261,12 +283,13 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
     )
     first, second = photons * response.mean_deposited_keV, photons * response.mean_square_deposited_keV2
 
-    def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = np.sum(first * through, axis=1)
+    def signal(through: FloatArray, draws: bool) -> tuple[FloatArray, FloatArray]:
+        rows = slice(None) if draws else slice(1)
+        rate = np.sum(first[rows] * through, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return rate, np.sum(second * through, axis=1) / rate / line.swank
+            return rate, np.sum(second[rows] * through, axis=1) / rate / line.swank
 
-    rate, gain = signal(np.ones_like(energies))
+    rate, gain = signal(np.ones_like(energies), False)
     # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
     if not rate[0] > 1e-30 * float(bare @ response.mean_deposited_keV):
         layers = setting.filters if line.tube is not None else (*line.inherent, *setting.filters)
@@ -351,43 +374,64 @@ def _checked_slabs(product: Filter, foreign_object: Filter, displaces: bool, obj
         )
 
 
-def _slabs(
+def _crossed(
     beam: _Beam,
-    setting: Setting,
-    detector: _Detector,
     *,
+    kV: float,
     product: Filter,
     foreign_object: Filter,
     displaces: bool,
     table: str,
     library: Library | None,
-) -> _Slabs:
+    draws: bool,
+) -> _Crossed:
     energies = beam.energies_keV
 
     def passed(*layers: Filter) -> FloatArray:
         return transmission(layers, energies, table=table, library=library, bin_width_keV=BIN_WIDTH_KEV)
+
+    def behind(layers: tuple[Filter, ...], opened: FloatArray, of_draws: bool) -> tuple[FloatArray, FloatArray]:
+        rate, gain = beam.signal(passed(*layers), of_draws)
+        if not np.all(rate > 1e-30 * opened[: rate.size]):
+            raise InputError(
+                "product and foreign object",
+                received=" behind ".join(str(layer) for layer in layers),
+                expected=f"slabs that let some photons through at {kV:g} kV",
+            )
+        return rate, gain
 
     around = product
     if displaces:
         around = Filter(
             material=product.material, thickness_mm=max(product.thickness_mm - foreign_object.thickness_mm, 0.0)
         )
-    open_rate, open_gain = beam.signal(np.ones_like(energies))
-    logs, noises, rates = [], [], []
-    for layers in ((product,), (around, foreign_object), (foreign_object,)):
-        rate, gain = beam.signal(passed(*layers))
-        if not np.all(rate > 1e-30 * open_rate):
-            raise InputError(
-                "product and foreign object",
-                received=" behind ".join(str(layer) for layer in layers),
-                expected=f"slabs that let some photons through at {setting.kV:g} kV",
-            )
-        logs.append(-np.log(rate / open_rate))
-        rates.append(rate[0] / open_rate[0])
-        noises.append(gain[0] / open_gain[0])
+    open_rate, open_gain = beam.signal(np.ones_like(energies), draws)
+    rates, gains = zip(
+        *(behind(layers, open_rate, draws) for layers in ((product,), (around, foreign_object))), strict=True
+    )
+    alone = behind((foreign_object,), open_rate, False)[0]
+    thin = []
+    for layer in (product, foreign_object):
+        mu = mu_per_mm(material_from_name(layer.material, library=library), energies, table=table)
+        # the signal is linear in the transmission, so the mean of mu over the signal is the signal of mu
+        thin.append(float(beam.signal(mu, False)[0][0] / open_rate[0]))
+    return _Crossed(
+        M_product=-np.log(rates[0] / open_rate),
+        M_object=-np.log(rates[1] / open_rate),
+        transmitted=(float(rates[0][0] / open_rate[0]), float(rates[1][0] / open_rate[0])),
+        gain_ratio=(float(gains[0][0] / open_gain[0]), float(gains[1][0] / open_gain[0])),
+        M_object_alone=float(-np.log(alone[0] / open_rate[0])),
+        thin_mu_product_per_mm=thin[0],
+        thin_mu_object_per_mm=thin[1],
+    )
+
+
+def _slabs(
+    beam: _Beam, crossed: _Crossed, setting: Setting, detector: _Detector, *, product: Filter, foreign_object: Filter
+) -> _Slabs:
     quantum, white, spreads = [], [], []
-    for share, ratio in zip(rates[:2], noises[:2], strict=True):
-        signal = beam.open_signal_DN * float(share)
+    for share, ratio in zip(crossed.transmitted, crossed.gain_ratio, strict=True):
+        signal = beam.open_signal_DN * share
         if not 1e-30 < signal < 1e30:
             raise InputError(
                 "setting",
@@ -395,36 +439,31 @@ def _slabs(
                 expected="a signal that a detector could hold",
                 remedy="check tube load, distance, pixel pitch and output",
             )
-        gain_DN = beam.open_gain_DN * float(ratio)
+        gain_DN = beam.open_gain_DN * ratio
         secondary_DN = min(beam.secondary_DN, 0.9 * gain_DN)
         # variance of M before the spread: gain S / S^2
         quantum.append((gain_DN - secondary_DN) / signal / setting.averaged)
         white.append((secondary_DN / signal + detector.read_variance_DN2 / signal**2) / setting.averaged)
         spreads.append(quantum[-1] * detector.spread.variance_share + white[-1])
-    thin = []
-    for layer in (product, foreign_object):
-        mu = mu_per_mm(material_from_name(layer.material, library=library), energies, table=table)
-        # the signal is linear in the transmission, so the mean of mu over the signal is the signal of mu
-        thin.append(float(beam.signal(mu)[0][0] / open_rate[0]))
     return _Slabs(
         channel=ContrastChannel(
             setting=setting,
             open_signal_DN=beam.open_signal_DN,
-            M_product=float(logs[0][0]),
-            M_object=float(logs[1][0]),
+            M_product=float(crossed.M_product[0]),
+            M_object=float(crossed.M_object[0]),
             sd_M_product=math.sqrt(spreads[0]),
             sd_M_object=math.sqrt(spreads[1]),
-            mu_eff_product_per_mm=float(logs[0][0]) / product.thickness_mm,
-            mu_eff_object_per_mm=float(logs[2][0]) / foreign_object.thickness_mm,
+            mu_eff_product_per_mm=float(crossed.M_product[0]) / product.thickness_mm,
+            mu_eff_object_per_mm=crossed.M_object_alone / foreign_object.thickness_mm,
         ),
-        M_product=logs[0],
-        M_object=logs[1],
+        M_product=crossed.M_product,
+        M_object=crossed.M_object,
         quantum_product=quantum[0],
         quantum_object=quantum[1],
         white_product=white[0],
         white_object=white[1],
-        thin_mu_product_per_mm=thin[0],
-        thin_mu_object_per_mm=thin[1],
+        thin_mu_product_per_mm=crossed.thin_mu_product_per_mm,
+        thin_mu_object_per_mm=crossed.thin_mu_object_per_mm,
         few_photons=math.sqrt(max(spreads) * setting.averaged) > _FEW_PHOTONS,
         warnings=beam.warnings,
     )
@@ -479,7 +518,9 @@ def _variance_of_difference(
     return of_quanta + white[0] / pixels[0] + white[1] / pixels[1]
 
 
-def _correlated_shares(masks: tuple[NDArray[np.bool_], NDArray[np.bool_]], spread: Spread) -> tuple[float, float, float]:
+def _correlated_shares(
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]], spread: Spread
+) -> tuple[float, float, float]:
     """Variance of the means over disc and over ring of noise of unit variance before the spread, and between them.
 
     Returns:
@@ -493,7 +534,7 @@ def _correlated_shares(masks: tuple[NDArray[np.bool_], NDArray[np.bool_]], sprea
     return float(np.sum(disc * around_disc)), float(np.sum(ring * around_disc)), float(np.sum(ring * around_ring))
 
 
-def _quotients(low: _Slabs, high: _Slabs) -> tuple[FloatArray, FloatArray]:
+def _quotients(low: _Slabs | _Crossed, high: _Slabs | _Crossed) -> tuple[FloatArray, FloatArray]:
     return low.M_product / high.M_product, low.M_object / high.M_object
 
 
@@ -585,12 +626,7 @@ class SlabContrasts:
     ) -> None:
         _checked_slabs(product, foreign_object, displaces, object_pixels)
         self._line = line
-        self._slab_words: dict[str, Any] = {
-            "product": product,
-            "foreign_object": foreign_object,
-            "displaces": displaces,
-            "library": library,
-        }
+        self._product, self._foreign_object, self._displaces = product, foreign_object, displaces
         self._thickness_ratio = foreign_object.thickness_mm / product.thickness_mm
         self._library = library
         self._predict = predict
@@ -598,7 +634,8 @@ class SlabContrasts:
         masks = disc_and_ring(object_pixels, min(dilations_for_pixel(self._detector.pixel_mm), _WIDEST_RING_PX))
         self._pixels = (int(masks[0].sum()), int(masks[1].sum()))
         self._correlated = _correlated_shares(masks, self._detector.spread)
-        self._known: dict[tuple[Setting, bool, str], _Slabs] = {}
+        self._known: dict[tuple[Setting, bool], _Slabs] = {}
+        self._crossed: dict[tuple[float, tuple[Filter, ...], bool, str], _Crossed] = {}
         self._beams: dict[tuple[Setting, bool], _Beam] = {}
 
     def contrast(self, low: Setting, high: Setting, *, intervals: bool = True) -> Contrast:
@@ -615,11 +652,11 @@ class SlabContrasts:
             )
         by_table = {}
         for table in TABLES if intervals else ("xraylib",):
-            q_product, q_object = _quotients(self._slabs(low, intervals, table), self._slabs(high, intervals, table))
+            q_product, q_object = _quotients(self._behind(low, intervals, table), self._behind(high, intervals, table))
             by_table[table] = float(q_object[0] - q_product[0])
         return _combined(
-            self._slabs(low, intervals, "xraylib"),
-            self._slabs(high, intervals, "xraylib"),
+            self._slabs(low, intervals),
+            self._slabs(high, intervals),
             self._detector,
             thickness_ratio=self._thickness_ratio,
             pixels=self._pixels,
@@ -627,12 +664,33 @@ class SlabContrasts:
             by_table=by_table,
         )
 
-    def _slabs(self, setting: Setting, intervals: bool, table: str) -> _Slabs:
-        key = (setting, intervals, table)
+    def _slabs(self, setting: Setting, intervals: bool) -> _Slabs:
+        key = (setting, intervals)
         if key not in self._known:
-            beam = self._beam(setting, intervals)
-            self._known[key] = _slabs(beam, setting, self._detector, table=table, **self._slab_words)
+            self._known[key] = _slabs(
+                self._beam(setting, intervals),
+                self._behind(setting, intervals, "xraylib"),
+                setting,
+                self._detector,
+                product=self._product,
+                foreign_object=self._foreign_object,
+            )
         return self._known[key]
+
+    def _behind(self, setting: Setting, intervals: bool, table: str) -> _Crossed:
+        key = (setting.kV, setting.filters, intervals, table)
+        if key not in self._crossed:
+            self._crossed[key] = _crossed(
+                self._beam(setting, intervals),
+                kV=setting.kV,
+                product=self._product,
+                foreign_object=self._foreign_object,
+                displaces=self._displaces,
+                table=table,
+                library=self._library,
+                draws=intervals and table == "xraylib",  # of other tables the best values alone count
+            )
+        return self._crossed[key]
 
     def _beam(self, setting: Setting, intervals: bool) -> _Beam:
         refuse_binning(setting)

@@ -50,6 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     from ..explore.server import check_bokeh, serve
 
     check_bokeh()
+    import numba
+
     from ..api._given import as_twin
     from ..explore.known_pod import read_known_pod
     from ..explore.page import CampaignTarget, page_of
@@ -59,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     twin = as_twin(arguments.twin)
     explorer = Explorer(twin, name=arguments.twin, pods=[read_known_pod(path) for path in arguments.pod])
     say("preparing the page")
+    # pictures are small: threads would cost more than they save
+    numba.set_num_threads(1)
     # the first answer compiles and reads what later ones use
     state = first_state(twin)
     explorer.view(state)

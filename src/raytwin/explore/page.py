@@ -24,6 +24,12 @@ _THICK_MM = {"Al": 10.0, "Ti": 5.0}  # longest filter of a material; others
 _USUAL_MM = 2.0
 _QUIET_MS = 60  # without a move before the map is drawn anew
 _RED = "#b00020"
+_CURVES = {
+    f"{beam}_{column}": (beam, where)
+    for beam in ("low", "high")
+    for column, where in (("open", "open field"), ("product", "behind the product"))
+}
+_PICTURES = {"low": "low voltage, −ln(I/I₀)", "high": "high voltage, −ln(I/I₀)", "ratio": "ratio low / high"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,11 +65,11 @@ class _Page:
 
         wide = {"sizing_mode": "stretch_width"}
         self.tiles = Div(name="tiles", **wide)
-        self.limits = Div(name="limits", **wide)
+        self.limits = Div(name="limits", visible=False, **wide)
         self.numbers = Div(name="numbers", **wide)
         self.map_note = Div(name="map_note", **wide)
         self.image_note = Div(name="image_note", **wide)
-        self.added = Div(name="added", **wide)
+        self.added = Div(name="added", visible=False, **wide)
         self.texts = Div(name="texts", **wide)
         # what scripts of the page read: the texts to copy, and how many answers there were
         self.copied = ColumnDataSource(data={"command": [""], "python": [""]})
@@ -257,23 +263,27 @@ class _Page:
         try:
             self.state = self._state_of_controls()
         except InputError as error:
-            self.limits.text = _problem_text(str(error))
+            self.limits.update(text=_problem_text(str(error)), visible=True)
+            self._count(began)
             return
         view = self.explorer.view(self.state)
         self.document.hold("combine")
         try:
             self.tiles.text = tiles_text(view)
-            self.limits.text = limits_text(view)
+            self.limits.update(text=limits_text(view), visible=bool(view.limits))
             self.numbers.text = numbers_text(view, self.explorer)
             self.figures.show(view)
             self.copied.data = {"command": [view.command], "python": [view.python]}
             self.texts.text = _texts_text(view)
             self.image_note.text = _image_note(view)
-            self.answers += 1
-            self.answer.data = {"count": [self.answers], "seconds": [time.perf_counter() - began]}
+            self._count(began)
         finally:
             self.document.unhold()
         self._ask_for_map()
+
+    def _count(self, began: float) -> None:
+        self.answers += 1
+        self.answer.data = {"count": [self.answers], "seconds": [time.perf_counter() - began]}
 
     def _ask_for_map(self) -> None:
         key = _map_key(self.state)
@@ -324,14 +334,13 @@ class _Page:
                 references=self.campaign.references,
             )
         except (RaytwinError, OSError) as error:
-            self.added.text = _problem_text(str(error))
+            self.added.update(text=_problem_text(str(error)), visible=True)
             return
         what = "The pair was added" if done.new else "The pair is in it already"
         more = f" Products and objects are described in {done.description}." if done.description else ""
-        self.added.text = _note(
-            f"{what}: {done.path}, {done.settings} setting{'s' if done.settings > 1 else ''}.{more}"
-            f" Next: raytwin sweep {done.path} --plan"
-        )
+        count = f"{done.settings} setting{'s' if done.settings > 1 else ''}"
+        text = _note(f"{what}: {done.path}, {count}.{more} Next: raytwin sweep {done.path} --plan")
+        self.added.update(text=text, visible=True)
 
 
 def object_diameter_mm(state: ExplorerState, pixel_mm: float) -> float:
@@ -519,42 +528,36 @@ class _Figures:
         from bokeh.plotting import figure
 
         plain: dict[str, Any] = {"sizing_mode": "stretch_width", "toolbar_location": None, "tools": ""}
-        self.spectra = {
-            name: ColumnDataSource(data={"energy": [], "photons": []})
-            for name in ("low_open", "low_product", "high_open", "high_product")
-        }
+        # one source a figure, so that an answer is few messages
+        self.spectra = ColumnDataSource(data={name: [] for name in ("energy", *_CURVES)})
         spectrum = figure(name="spectrum", height=330, **plain)
-        for beam, colour in (("low", LOW_COLOUR), ("high", HIGH_COLOUR)):
-            for where, dash, text in (("open", "solid", "open field"), ("product", "dashed", "behind the product")):
-                spectrum.line(
-                    "energy",
-                    "photons",
-                    source=self.spectra[f"{beam}_{where}"],
-                    color=colour,
-                    line_dash=dash,
-                    line_width=2,
-                    legend_label=f"{beam}, {text}",
-                )
+        for name, (beam, where) in _CURVES.items():
+            spectrum.line(
+                "energy",
+                name,
+                source=self.spectra,
+                color=LOW_COLOUR if beam == "low" else HIGH_COLOUR,
+                line_dash="solid" if where == "open field" else "dashed",
+                line_width=2,
+                legend_label=f"{beam}, {where}",
+            )
         spectrum.xaxis.axis_label = "photon energy, keV"
-        spectrum.yaxis.axis_label = "photons a keV, pixel and frame"
+        spectrum.yaxis.axis_label = "photons / (keV pixel frame)"
         spectrum.y_range.start = 0
         spectrum.legend.orientation = "horizontal"
         spectrum.legend.ncols = 2
-        spectrum.legend.spacing = 20
+        spectrum.legend.spacing, spectrum.legend.padding, spectrum.legend.label_width = 4, 4, 135
         spectrum.legend.label_text_font_size = "12px"
         spectrum.add_layout(spectrum.legend[0], "below")
-        self.pictures = {name: ColumnDataSource(data={"image": [], "side": []}) for name in ("low", "high", "ratio")}
-        self.mappers = {name: LinearColorMapper(palette=Greys256, low=0.0, high=1.0) for name in self.pictures}
+        self.pictures = ColumnDataSource(data={name: [] for name in (*_PICTURES, "side")})
+        self.mappers = {name: LinearColorMapper(palette=Greys256, low=0.0, high=1.0) for name in _PICTURES}
         # values below and above the scale take its ends; open field in the ratio has none
         self.mappers["ratio"].nan_color = "#c9d3e0"
         images = []
-        titles = {"low": "low voltage, −ln(I/I₀)", "high": "high voltage, −ln(I/I₀)", "ratio": "ratio low / high"}
-        for name, title in titles.items():
-            one = figure(name=f"image_{name}", title=title, height=300, match_aspect=True, **plain)
+        for name, title in _PICTURES.items():
+            one = figure(name=f"image_{name}", title=title, height=262, match_aspect=True, **plain)
             one.x_range.range_padding = one.y_range.range_padding = 0
-            one.image(
-                "image", x=0, y=0, dw="side", dh="side", source=self.pictures[name], color_mapper=self.mappers[name]
-            )
+            one.image(name, x=0, y=0, dw="side", dh="side", source=self.pictures, color_mapper=self.mappers[name])
             one.add_layout(ColorBar(color_mapper=self.mappers[name], width=10), "right")
             one.xaxis.axis_label = "pixels"
             one.yaxis.axis_label = "pixels"
@@ -614,29 +617,32 @@ class _Figures:
 
     def show(self, view: ExplorerView) -> None:
         """Spectra, images and where on the map the state lies."""
-        for name, beam in (("low", view.low), ("high", view.high)):
-            for where, photons in (("open", beam.open_photons), ("product", beam.product_photons)):
-                self.spectra[f"{name}_{where}"].data = {
-                    "energy": beam.energies_keV.astype(np.float32),
-                    "photons": photons.astype(np.float32),
-                }
+        longest = max((view.low, view.high), key=lambda beam: beam.energies_keV.size)
+        columns = {"energy": longest.energies_keV.astype(np.float32)}
+        for name, (beam, where) in _CURVES.items():
+            shown = view.low if beam == "low" else view.high
+            photons = shown.open_photons if where == "open field" else shown.product_photons
+            columns[name] = np.full(longest.energies_keV.size, np.nan, dtype=np.float32)
+            columns[name][: photons.size] = photons
+        self.spectra.data = columns
         self.here.data = {"x": [view.state.kV_low], "y": [view.state.kV_high]}
-        pair = view.images
-        if pair is None or view.contrast is None:
-            for source in self.pictures.values():
-                source.data = {"image": [], "side": []}
+        pair, found = view.images, view.contrast
+        if pair is None or found is None:
+            self.pictures.data = {name: [] for name in (*_PICTURES, "side")}
             return
-        found = view.contrast
-        side = pair.log_low.shape[0]
-        sd_ratio = found.sd_pixel
+        self.pictures.data = {
+            "low": [pair.log_low],
+            "high": [pair.log_high],
+            "ratio": [pair.ratio],
+            "side": [pair.log_low.shape[0]],
+        }
         scales = {
             "low": _grey_scale(found.low.M_product, found.low.M_object, found.low.sd_M_object),
             "high": _grey_scale(found.high.M_product, found.high.M_object, found.high.sd_M_object),
-            "ratio": _grey_scale(found.R_product, found.R_product + found.delta_R.value, sd_ratio),
+            "ratio": _grey_scale(found.R_product, found.R_product + found.delta_R.value, found.sd_pixel),
         }
-        for name, image in (("low", pair.log_low), ("high", pair.log_high), ("ratio", pair.ratio)):
-            self.pictures[name].data = {"image": [image], "side": [side]}
-            self.mappers[name].update(low=scales[name][0], high=scales[name][1])
+        for name, (low, high) in scales.items():
+            self.mappers[name].update(low=low, high=high)
 
     def show_map(self, found: MapView) -> None:
         """The map of contrast to noise."""
@@ -662,10 +668,11 @@ class _Figures:
 
 
 def _grey_scale(product: float, with_object: float, sd: float) -> tuple[float, float]:
-    """Ends of a picture's grey scale: product and object with four standard deviations of one pixel around."""
+    """Ends of a picture's grey scale: product and object with four standard deviations of one pixel around, in round steps."""
     low, high = min(product, with_object), max(product, with_object)
     room = max(4.0 * sd, 0.02 * abs(product), 1e-6)
-    return low - room, high + room
+    step = 0.5 * 10.0 ** np.floor(np.log10(high - low + 2.0 * room))
+    return float(np.floor((low - room) / step) * step), float(np.ceil((high + room) / step) * step)
 
 
 def _edges(centres: tuple[float, ...]) -> list[float]:

@@ -18,6 +18,7 @@ from .state import ExplorerState, first_state
 from .view import BeamView, Explorer, ExplorerView, MapView
 
 LOW_COLOUR, HIGH_COLOUR = "#0072B2", "#D55E00"  # apart for every kind of colour vision (Okabe and Ito)
+Changes = dict[str, dict[str, Any]]  # model by name -> property -> value
 FILTER_MATERIALS = ("Al", "Cu", "Sn", "Ag", "Mo", "Ti", "Fe", "Pb")
 _NO_FILTER = "no filter"
 _THICK_MM = {"Al": 10.0, "Ti": 5.0}  # longest filter of a material; others
@@ -56,6 +57,8 @@ class _Page:
         self.answers = 0
         self.seed = self.state.seed
         self._asked = False
+        self._open = False
+        self._sent: Changes = {}
         self._pieces: Iterator[MapView | None] | None = None
         self._map_key: Any = None
         self._waiting: Any = None
@@ -74,7 +77,6 @@ class _Page:
         # what scripts of the page read: the texts to copy, and how many answers there were
         self.copied = ColumnDataSource(data={"command": [""], "python": [""]})
         self.answer = ColumnDataSource(data={"count": [0], "seconds": [0.0]}, name="answer")
-        self.numbers.tags = [self.answer]
         buttons = []
         for name, label, key in (
             ("copy_command", "Copy command", "command"),
@@ -95,6 +97,36 @@ class _Page:
         add.on_click(self._add)
         noise = Button(label="New noise", name="noise")
         noise.on_click(self._new_noise)
+        # one message brings an answer; the page hands it out without telling the server what it knows
+        self.messages = ColumnDataSource(name="messages")
+        self.targets = {
+            **{
+                one.name: one
+                for one in (
+                    self.tiles,
+                    self.limits,
+                    self.numbers,
+                    self.map_note,
+                    self.image_note,
+                    self.added,
+                    self.texts,
+                )
+            },
+            "copied": self.copied,
+            "answer": self.answer,
+            **self.figures.targets,
+        }
+        self.messages.js_on_change(
+            "tags",
+            CustomJS(
+                args={"targets": self.targets},
+                code="""
+                for (const [name, properties] of Object.entries(cb_obj.tags[0])) {
+                  targets[name].setv(properties, {sync: false})
+                }""",
+            ),
+        )
+        self.numbers.tags = [self.answer, self.messages]
         for widget in self.widgets.values():
             document.add_root(widget)
         for model in (
@@ -118,6 +150,7 @@ class _Page:
         for widget in self.widgets.values():
             widget.on_change("active" if widget.name == "displaces" else "value", self._moved)
         self._show()
+        self._open = True
 
     def _controls(self) -> dict[str, Any]:
         from bokeh.models import AutocompleteInput, Checkbox, CustomJSTickFormatter, Select, Slider, TextInput
@@ -258,39 +291,52 @@ class _Page:
         self._moved("seed", None, None)
 
     def _show(self) -> None:
+        """The answer to what the controls say."""
         self._asked = False
         began = time.perf_counter()
         try:
             self.state = self._state_of_controls()
         except InputError as error:
-            self.limits.update(text=_problem_text(str(error)), visible=True)
-            self._count(began)
+            self._send({"limits": {"text": _problem_text(str(error)), "visible": True}}, began)
             return
         view = self.explorer.view(self.state)
-        self.document.hold("combine")
-        try:
-            self.tiles.text = tiles_text(view)
-            self.limits.update(text=limits_text(view), visible=bool(view.limits))
-            self.numbers.text = numbers_text(view, self.explorer)
-            self.figures.show(view)
-            self.copied.data = {"command": [view.command], "python": [view.python]}
-            self.texts.text = _texts_text(view)
-            self.image_note.text = _image_note(view)
-            self._count(began)
-        finally:
-            self.document.unhold()
-        self._ask_for_map()
+        changes: Changes = {
+            "tiles": {"text": tiles_text(view)},
+            "limits": {"text": limits_text(view), "visible": bool(view.limits)},
+            "numbers": {"text": numbers_text(view, self.explorer)},
+            "copied": {"data": {"command": [view.command], "python": [view.python]}},
+            "texts": {"text": _texts_text(view)},
+            "image_note": {"text": _image_note(view)},
+            **self.figures.changes(view),
+        }
+        again = _map_key(self.state) != self._map_key
+        if again:
+            changes["map_note"] = {"text": _note("Being drawn again for the settings above.")}
+        self._send(changes, began)
+        if again:
+            self._ask_for_map()
 
-    def _count(self, began: float) -> None:
-        self.answers += 1
-        self.answer.data = {"count": [self.answers], "seconds": [time.perf_counter() - began]}
+    def _send(self, changes: Changes, began: float | None = None) -> None:
+        """Bring changes to the page in one message, so that it is drawn once; what is the same already is left out."""
+        fresh: Changes = {}
+        for name, properties in changes.items():
+            known = self._sent.setdefault(name, {})
+            new = {key: value for key, value in properties.items() if key == "data" or known.get(key) != value}
+            known.update({key: value for key, value in new.items() if key != "data"})
+            if new:
+                fresh[name] = new
+        if began is not None:
+            self.answers += 1
+            fresh["answer"] = {"data": {"count": [self.answers], "seconds": [time.perf_counter() - began]}}
+        if self._open:
+            self.messages.tags = [fresh]
+        else:
+            for name, properties in fresh.items():
+                self.targets[name].update(**properties)
 
     def _ask_for_map(self) -> None:
-        key = _map_key(self.state)
-        if key == self._map_key:
-            return
+        """Draw the map once nothing has moved for a moment."""
         self._pieces = None
-        self.map_note.text = _note("Being drawn again for the settings above.")
         if self._waiting is not None:
             self.document.remove_timeout_callback(self._waiting)
         self._waiting = self.document.add_timeout_callback(self._begin_map, _QUIET_MS)
@@ -310,8 +356,7 @@ class _Page:
             return
         self._pieces = None
         self._map_key = _map_key(self.state)
-        self.figures.show_map(found)
-        self.map_note.text = _map_note(found)
+        self._send({**self.figures.map_changes(found), "map_note": {"text": _map_note(found)}})
 
     def _add(self) -> None:
         """Write what is seen to the campaign file."""
@@ -334,13 +379,13 @@ class _Page:
                 references=self.campaign.references,
             )
         except (RaytwinError, OSError) as error:
-            self.added.update(text=_problem_text(str(error)), visible=True)
+            self._send({"added": {"text": _problem_text(str(error)), "visible": True}})
             return
         what = "The pair was added" if done.new else "The pair is in it already"
         more = f" Products and objects are described in {done.description}." if done.description else ""
         count = f"{done.settings} setting{'s' if done.settings > 1 else ''}"
         text = _note(f"{what}: {done.path}, {count}.{more} Next: raytwin sweep {done.path} --plan")
-        self.added.update(text=text, visible=True)
+        self._send({"added": {"text": text, "visible": True}})
 
 
 def object_diameter_mm(state: ExplorerState, pixel_mm: float) -> float:
@@ -614,9 +659,20 @@ class _Figures:
         chart.x_range, chart.y_range = Range1d(*ends[0]), Range1d(*ends[1])
         chart.grid.visible = False
         self.figures = (spectrum, *images, chart)
+        # what answers change, by name
+        self.targets: dict[str, Any] = {
+            "spectra": self.spectra,
+            "pictures": self.pictures,
+            "here": self.here,
+            "cells": self.cells,
+            "beyond": self.beyond,
+            "best": self.best,
+            "cnr": self.cnr,
+            **{f"grey_{name}": mapper for name, mapper in self.mappers.items()},
+        }
 
-    def show(self, view: ExplorerView) -> None:
-        """Spectra, images and where on the map the state lies."""
+    def changes(self, view: ExplorerView) -> Changes:
+        """What spectra, images and the place on the map become."""
         longest = max((view.low, view.high), key=lambda beam: beam.energies_keV.size)
         columns = {"energy": longest.energies_keV.astype(np.float32)}
         for name, (beam, where) in _CURVES.items():
@@ -624,28 +680,33 @@ class _Figures:
             photons = shown.open_photons if where == "open field" else shown.product_photons
             columns[name] = np.full(longest.energies_keV.size, np.nan, dtype=np.float32)
             columns[name][: photons.size] = photons
-        self.spectra.data = columns
-        self.here.data = {"x": [view.state.kV_low], "y": [view.state.kV_high]}
-        pair, found = view.images, view.contrast
-        if pair is None or found is None:
-            self.pictures.data = {name: [] for name in (*_PICTURES, "side")}
-            return
-        self.pictures.data = {
-            "low": [pair.log_low],
-            "high": [pair.log_high],
-            "ratio": [pair.ratio],
-            "side": [pair.log_low.shape[0]],
+        found: Changes = {
+            "spectra": {"data": columns},
+            "here": {"data": {"x": [view.state.kV_low], "y": [view.state.kV_high]}},
+        }
+        pair, contrast = view.images, view.contrast
+        if pair is None or contrast is None:
+            found["pictures"] = {"data": {name: [] for name in (*_PICTURES, "side")}}
+            return found
+        found["pictures"] = {
+            "data": {
+                "low": [pair.log_low],
+                "high": [pair.log_high],
+                "ratio": [pair.ratio],
+                "side": [pair.log_low.shape[0]],
+            }
         }
         scales = {
-            "low": _grey_scale(found.low.M_product, found.low.M_object, found.low.sd_M_object),
-            "high": _grey_scale(found.high.M_product, found.high.M_object, found.high.sd_M_object),
-            "ratio": _grey_scale(found.R_product, found.R_product + found.delta_R.value, found.sd_pixel),
+            "low": _grey_scale(contrast.low.M_product, contrast.low.M_object, contrast.low.sd_M_object),
+            "high": _grey_scale(contrast.high.M_product, contrast.high.M_object, contrast.high.sd_M_object),
+            "ratio": _grey_scale(contrast.R_product, contrast.R_product + contrast.delta_R.value, contrast.sd_pixel),
         }
         for name, (low, high) in scales.items():
-            self.mappers[name].update(low=low, high=high)
+            found[f"grey_{name}"] = {"low": low, "high": high}
+        return found
 
-    def show_map(self, found: MapView) -> None:
-        """The map of contrast to noise."""
+    def map_changes(self, found: MapView) -> Changes:
+        """What the map of contrast to noise becomes."""
         columns, rows = _edges(found.kV_low), _edges(found.kV_high)
         cells: dict[str, list[float]] = {name: [] for name in ("x", "y", "w", "h", "cnr")}
         beyond: dict[str, list[float]] = {name: [] for name in ("x", "y", "w", "h")}
@@ -661,10 +722,13 @@ class _Figures:
                 if not found.allowed[row, column]:
                     for name, number in place.items():
                         beyond[name].append(number)
-        self.cells.data, self.beyond.data = cells, beyond
-        self.cnr.update(low=0.0, high=max([1e-6, *cells["cnr"]]))
-        best = found.best
-        self.best.data = {"x": [best[0]], "y": [best[1]]} if best is not None else {"x": [], "y": []}
+        best = {"x": [found.best[0]], "y": [found.best[1]]} if found.best is not None else {"x": [], "y": []}
+        return {
+            "cells": {"data": cells},
+            "beyond": {"data": beyond},
+            "best": {"data": best},
+            "cnr": {"high": max([1e-6, *cells["cnr"]])},
+        }
 
 
 def _grey_scale(product: float, with_object: float, sd: float) -> tuple[float, float]:

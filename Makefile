@@ -7,13 +7,13 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip || echo "pip stays as it is"
 	for try in 1 2 3 4; do \
-	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,develop]' && break; \
+	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,develop]' && break; \
 	  test $$try != 4 || exit 1; echo "the install broke off; once more in $$((try * 15)) s (what is complete is kept)"; sleep $$((try * 15)); done
 	touch $(READY)
 
@@ -21,7 +21,12 @@ demo: $(READY)
 	$(BIN)/raytwin demo -o demo
 
 test: $(READY) check
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
+
+# the page of `raytwin explore` in Debian's Chromium (apt-get install chromium), some minutes
+test-page: $(READY)
+	$(BIN)/python -m pip install --quiet playwright
+	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
@@ -88,7 +93,7 @@ check: $(READY)
 	ln -s $(CURDIR)/src/raytwin/* build/types/raytwin/
 	for room in $(ROOMS); do ln -s $(CURDIR)/$$room build/types/raytwin/$$room; done
 	MYPYPATH=build/types $(BIN)/mypy --strict -p raytwin
-	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow'
+	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow and not browser'
 
 format: $(READY)
 	$(BIN)/ruff check --fix src $(ROOMS) tests validation benchmarks

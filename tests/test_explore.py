@@ -92,14 +92,14 @@ def test_spectra_hold_the_photons_that_reach_a_pixel(view: ExplorerView) -> None
 
 def test_images_have_the_contrast_and_the_noise_that_were_predicted(explorer: Explorer, state: ExplorerState) -> None:
     """Means within four standard errors, noise within four of its own, in a large object and around it."""
-    wide = replace(state, object_pixels=4000)
+    wide = replace(state, object_pixels=1600)
     found = explorer.view(wide)
     assert found.images is not None and found.contrast is not None and found.images.whole
     side = found.images.log_low.shape[0]
     rows, columns = np.indices((side, side)) - side // 2
     distance = np.hypot(rows, columns)
-    radius = np.sqrt(4000 / np.pi)
-    inside, around = distance < radius - 4, (distance > radius + 4) & (columns > -0.3 * side)
+    radius = np.sqrt(1600 / np.pi)
+    inside, around = distance < radius - 3, (distance > radius + 3) & (columns > -0.3 * side)
     for image, channel in (
         (found.images.log_low, found.contrast.low),
         (found.images.log_high, found.contrast.high),

@@ -33,7 +33,20 @@ SHIPPED = {"raytwin.data.calibration": "data/calibration"}  # a folder of data w
 ABOVE = {"api", "commands", "explore"}  # in src/raytwin, above every room
 COMPOSERS = {"campaign", "commands", "api", "explore"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}
-HEAVY = {"torch", "matplotlib", "numpy", "scipy", "h5py", "numba", "spekpy", "xraylib", "xraydb", "dask", "bokeh", "tornado"}
+HEAVY = {
+    "torch",
+    "matplotlib",
+    "numpy",
+    "scipy",
+    "h5py",
+    "numba",
+    "spekpy",
+    "xraylib",
+    "xraydb",
+    "dask",
+    "bokeh",
+    "tornado",
+}
 HEAVY |= {"statsmodels", "pandas"}
 
 

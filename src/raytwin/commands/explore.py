@@ -47,9 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin explore`."""
-    from ..explore.server import check_bokeh, serve
+    from ..explore.server import listen, serve
 
-    check_bokeh()
+    listening = listen(arguments.port)
     import numba
 
     from ..api._given import as_twin
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     serve(
         page_of(explorer, target, f"calibrated at {levels}" if levels else "no measured level"),
-        port=arguments.port,
+        listening=listening,
         browser=not arguments.no_browser,
         told=told,
     )

@@ -14,6 +14,7 @@ from ..acquisition.setting import Filter, filters_from_text
 from ..errors import InputError, RaytwinError
 from ..generator.twin import Estimate
 from ..materials import library_from_files, material_from_name
+from ..results import same_value
 from .state import ExplorerState, first_state
 from .view import BeamView, Explorer, ExplorerView, MapView
 
@@ -23,7 +24,7 @@ FILTER_MATERIALS = ("Al", "Cu", "Sn", "Ag", "Mo", "Ti", "Fe", "Pb")
 _NO_FILTER = "no filter"
 _THICK_MM = {"Al": 10.0, "Ti": 5.0}  # longest filter of a material; others
 _USUAL_MM = 2.0
-_QUIET_MS = 60  # without a move before the map is drawn anew
+_QUIET_MS = 250  # without a move before the map is drawn anew
 _RED = "#b00020"
 _CURVES = {
     f"{beam}_{column}": (beam, where)
@@ -321,8 +322,8 @@ class _Page:
         fresh: Changes = {}
         for name, properties in changes.items():
             known = self._sent.setdefault(name, {})
-            new = {key: value for key, value in properties.items() if key == "data" or known.get(key) != value}
-            known.update({key: value for key, value in new.items() if key != "data"})
+            new = {key: value for key, value in properties.items() if not same_value(known.get(key), value)}
+            known.update(new)
             if new:
                 fresh[name] = new
         if began is not None:
@@ -584,16 +585,10 @@ class _Figures:
                 color=LOW_COLOUR if beam == "low" else HIGH_COLOUR,
                 line_dash="solid" if where == "open field" else "dashed",
                 line_width=2,
-                legend_label=f"{beam}, {where}",
             )
         spectrum.xaxis.axis_label = "photon energy, keV"
         spectrum.yaxis.axis_label = "photons / (keV pixel frame)"
         spectrum.y_range.start = 0
-        spectrum.legend.orientation = "horizontal"
-        spectrum.legend.ncols = 2
-        spectrum.legend.spacing, spectrum.legend.padding, spectrum.legend.label_width = 4, 4, 135
-        spectrum.legend.label_text_font_size = "12px"
-        spectrum.add_layout(spectrum.legend[0], "below")
         self.pictures = ColumnDataSource(data={name: [] for name in (*_PICTURES, "side")})
         self.mappers = {name: LinearColorMapper(palette=Greys256, low=0.0, high=1.0) for name in _PICTURES}
         # values below and above the scale take its ends; open field in the ratio has none

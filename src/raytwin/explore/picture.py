@@ -17,7 +17,7 @@ from ..generator.transfer import Channel, DetectorNoise
 from ..generator.twin import Twin
 from ..generator.twin_spectrum import secondary_gain_DN, slope_share
 
-SMALLEST_PX, LARGEST_PX = 64, 192
+SMALLEST_PX, LARGEST_PX = 64, 128
 _FINE = 3  # sub-pixels a pixel along each axis
 _OPEN_SHARE = 0.12  # of the picture's width that shows the open field
 _ROOM = 2.2  # picture over object

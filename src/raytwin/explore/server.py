@@ -53,7 +53,7 @@ def tunnel_command(port: int, environment: Mapping[str, str]) -> str | None:
 def serve(
     build: Callable[[Any], None],
     *,
-    port: int | None,
+    listening: tuple[list[Any], int],
     browser: bool,
     told: Callable[[str, str | None], None],
 ) -> None:
@@ -61,20 +61,15 @@ def serve(
 
     Args:
         build: fills a Bokeh document.
-        port: of the loopback address; 0 is any free one, None the default one or the next that is free.
+        listening: sockets and port, from `listen`.
         browser: open the page in the browser of this machine (not within an SSH session).
         told: called once with the page's address and the tunnel's command (None: not needed).
-
-    Raises:
-        InputError: the port is taken or cannot be used.
-        MissingDependencyError: Bokeh is not installed.
     """
-    check_bokeh()
     from bokeh.server.server import BaseServer
     from tornado.httpserver import HTTPServer
     from tornado.ioloop import IOLoop
 
-    sockets, bound = _bound(port)
+    sockets, bound = listening
     application = _guarded_application(build, bound)
     http = HTTPServer(application)
     http.add_sockets(sockets)
@@ -96,8 +91,17 @@ def serve(
         http.stop()
 
 
-def _bound(port: int | None) -> tuple[list[Any], int]:
-    """Listening sockets on the loopback address, and their port."""
+def listen(port: int | None) -> tuple[list[Any], int]:
+    """Listening sockets on the loopback address, and their port.
+
+    Args:
+        port: 0 is any free one, None the default one or the next that is free.
+
+    Raises:
+        InputError: the port is taken or cannot be used.
+        MissingDependencyError: Bokeh, which brings Tornado, is not installed.
+    """
+    check_bokeh()
     from tornado.netutil import bind_sockets
 
     if port is not None and not 0 <= port <= 65535:

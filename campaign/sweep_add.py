@@ -74,9 +74,7 @@ def add_setting(
         description = file.with_name(f"{file.stem}_scene.toml")
         if not description.exists():
             with whole_file(description) as temporary:
-                temporary.write_text(
-                    _description_text(product, foreign_object, object_mm, field_mm), encoding="utf-8"
-                )
+                temporary.write_text(_description_text(product, foreign_object, object_mm, field_mm), encoding="utf-8")
     named = description.name if description is not None else str(Path(references or "").resolve())
     twin_file = Path(twin)
     lines = [

@@ -130,6 +130,7 @@ def test_limits_that_are_broken_are_said_and_numbers_stay(explorer: Explorer, st
     bright = explorer.view(replace(state, exposure_ms=800.0))
     assert [text for text in bright.limits if re.match(r"90 kV: the detector saturates: \d+ DN above dark", text)]
     assert bright.high.full_scale_share is not None and bright.high.full_scale_share > 1
+    assert not set(bright.cautions) & set(bright.limits)
     with pytest.raises(InputError, match=r"at most the tube's 90 W"):
         explorer.twin.predict(kV=90, power_W=130, exposure_ms=20)
 
@@ -170,6 +171,8 @@ def test_the_map_holds_the_contrast_of_its_pairs_and_knows_the_limits(explorer: 
     assert np.isnan(found.cnr[2, 0])  # the low voltage is the higher one
     over = explorer.map(replace(bright, power_high_W=130.0), steps=(3, 4))
     assert not over.allowed.any() and over.best is None
+    bright_map = explorer.map(replace(bright, exposure_ms=800.0), steps=(3, 4))
+    assert bright_map.allowed[np.isfinite(bright_map.cnr)].sum() < found.allowed[np.isfinite(found.cnr)].sum()
 
 
 def test_commands_and_python_give_the_numbers_that_are_seen(view: ExplorerView, tmp_path: Path) -> None:

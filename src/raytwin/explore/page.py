@@ -384,7 +384,7 @@ class _Page:
             return
         what = "The pair was added" if done.new else "The pair is in it already"
         more = f" Products and objects are described in {done.description}." if done.description else ""
-        count = f"{done.settings} setting{'s' if done.settings > 1 else ''}"
+        count = _counted(done.settings, "setting")
         text = _note(f"{what}: {done.path}, {count}.{more} Next: raytwin sweep {done.path} --plan")
         self._send({"added": {"text": text, "visible": True}})
 
@@ -484,7 +484,9 @@ def tiles_text(view: ExplorerView) -> str:
     ]
     every = "".join(f"<div><b>{text}</b><small>{html.escape(title)}</small></div>" for title, text in tiles)
     if view.limits:
-        every += f'<div class="bad"><b>✗ not possible</b><small>{len(view.limits)} reason(s) below</small></div>'
+        every += (
+            f'<div class="bad"><b>✗ not possible</b><small>{_counted(len(view.limits), "reason")} below</small></div>'
+        )
     return f'{_STYLE}<div class="tiles">{every}</div>'
 
 
@@ -512,6 +514,10 @@ def _number(value: float, digits: int = 4) -> str:
         decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
         return f"{value:.{decimals}f}"
     return f"{value:.{digits}g}"
+
+
+def _counted(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def _share(beam: BeamView) -> str:
@@ -549,6 +555,9 @@ def _image_note(view: ExplorerView) -> str:
     if view.images is None:
         return _note("No images: see what is not possible above.")
     part = "" if view.images.whole else " The object is larger than the picture."
+    for beam in (view.low, view.high):
+        if beam.full_scale_share is not None and beam.full_scale_share > 1.0:
+            part += f" The image at {beam.setting.kV:g} kV is saturated and shows nothing."
     return _note(
         "Left edge: open field. Middle: the object in the product. Slabs without scatter, on pixels of the detector's median"
         f" response.{part}"
@@ -557,7 +566,7 @@ def _image_note(view: ExplorerView) -> str:
 
 def _map_note(found: MapView) -> str:
     if found.best is None:
-        return _note("No pair of voltages on the map is within the line's limits.")
+        return _note("Ring: what is set. No pair on the map is within the line's limits.")
     kV_low, kV_high, ratio = found.best
     return _note(
         f"Ring: what is set. Star: best on the map, {ratio:.3g} at {kV_low:g} and {kV_high:g} kV. Hatched: beyond the limits"

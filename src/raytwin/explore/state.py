@@ -93,7 +93,9 @@ def first_state(twin: Twin) -> ExplorerState:
     """The state that the page opens with: the calibrated voltages furthest apart with their filters, half of the tube's power."""
     ranges = ranges_of(twin)
     power_W = 0.5 * (twin.instrument.maximum_power_w or 80.0)
-    levels = sorted((level for level in twin.levels if level.kV), key=lambda level: level.kV or 0.0)
+    levels = sorted(
+        ((level.kV, level.filters) for level in twin.levels if level.kV is not None), key=lambda one: one[0]
+    )
     state = ExplorerState(
         kV_low=40.0,
         kV_high=min(90.0, ranges.kV[1]),
@@ -105,7 +107,11 @@ def first_state(twin: Twin) -> ExplorerState:
     )
     if not levels:
         return state
-    low, high = levels[0], levels[-1]
-    state = replace(state, kV_low=low.kV, filters_low=low.filters, filters_high=high.filters)
-    apart = (high.kV or 0.0) > (low.kV or 0.0)
-    return replace(state, kV_high=high.kV if apart else min(2.0 * (low.kV or 45.0), ranges.kV[1]))
+    (lowest_kV, filters_low), (highest_kV, filters_high) = levels[0], levels[-1]
+    return replace(
+        state,
+        kV_low=lowest_kV,
+        kV_high=highest_kV if highest_kV > lowest_kV else min(2.0 * lowest_kV, ranges.kV[1]),
+        filters_low=filters_low,
+        filters_high=filters_high,
+    )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from ..generator.contrast import Contrast, SlabContrasts
+from ..generator.contrast import Contrast, ContrastChannel, SlabContrasts
 from ..generator.line_limits import broken_limits, check_count_rate, frames_per_s, strained_limits
 from ..generator.predict import Prediction, full_scale, predict_flatfield
 from ..generator.present_line import present_line
@@ -90,7 +90,7 @@ class MapView:
     """Contrast-to-noise ratio of the object over both voltages.
 
     Fields: kV_low, kV_high (axis values); cnr (low, high), NaN where the pair is none or cannot be; allowed (low, high): within the
-    declared limits of the line; best (kV low, kV high, ratio) among the allowed; None where none is.
+    declared limits of the line and without saturation; best (kV low, kV high, ratio) among the allowed; None where none is.
     """
 
     kV_low: tuple[float, ...]
@@ -161,7 +161,7 @@ class Explorer:
             images=images,
             pods=tuple(_pod_view(known, contrast) for known in self.pods),
             limits=tuple(dict.fromkeys(limits)),
-            cautions=tuple(dict.fromkeys(cautions)),
+            cautions=tuple(text for text in dict.fromkeys(cautions) if text not in limits),
             command=command_text(self.name, state),
             python=python_text(self.name, state),
         )
@@ -183,14 +183,15 @@ class Explorer:
                     continue
                 pair = replace(state, kV_low=kV_low, kV_high=kV_high)
                 low, high = pair.setting("low"), pair.setting("high")
-                allowed[row, column] = not any(broken_limits(self.instrument, one) for one in (low, high))
+                allowed[row, column] = not any(broken_limits(self.instrument, setting) for setting in (low, high))
                 one = _or_told(lambda low=low, high=high: slabs.contrast(low, high, intervals=False), [])  # type: ignore[misc]
                 if one is not None:
                     cnr[row, column] = one.cnr_object
+                    allowed[row, column] &= not any(self._saturated(channel) for channel in (one.low, one.high))
             yield None
         usable = np.where(allowed, cnr, -np.inf)
         usable[np.isnan(usable)] = -np.inf
-        row, column = np.unravel_index(int(usable.argmax()), usable.shape)
+        row, column = (int(one) for one in np.unravel_index(int(usable.argmax()), usable.shape))
         best = (lows[row], highs[column], float(cnr[row, column])) if np.isfinite(usable[row, column]) else None
         yield MapView(kV_low=lows, kV_high=highs, cnr=cnr, allowed=allowed, best=best)
 
@@ -202,6 +203,11 @@ class Explorer:
         quarter = lowest + 0.25 * (highest - lowest)
         lows, highs = np.linspace(lowest + 5.0, middle, steps[0]), np.linspace(quarter, highest, steps[1])
         return tuple(float(round(one)) for one in lows), tuple(float(round(one)) for one in highs)
+
+    def _saturated(self, channel: ContrastChannel) -> bool:
+        """Whether the open field of one image is more than the converter holds."""
+        held = full_scale(self.twin, channel.setting, channel.open_signal_DN)
+        return held is not None and held[0] > held[1]
 
     def _limits(self, state: ExplorerState) -> tuple[list[str], list[str]]:
         limits, cautions = [], []

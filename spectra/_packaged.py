@@ -19,6 +19,11 @@ def packaged_version() -> str | None:
     return None if stored is None else str(stored)
 
 
+def is_packaged(anode: str, anode_angle_deg: float, model: str) -> bool:
+    """Whether the spectra of a tube come with the package, so that any voltage takes milliseconds."""
+    return _tube(tube_name(anode, anode_angle_deg, model)) is not None
+
+
 def packaged_fluence(anode: str, anode_angle_deg: float, model: str, kV: int) -> NDArray[np.float64] | None:
     """Bremsstrahlung and lines (2, n) at a whole kV, photons / keV / cm2 / mAs at 1 m on the common grid; None: not packaged."""
     table = _tube(tube_name(anode, anode_angle_deg, model))

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytwin.spectra import _packaged, energy_grid_keV, make_table, tube, tube_fluence_interpolated, tube_spectrum
+from raytwin.spectra import (
+    _packaged,
+    energy_grid_keV,
+    is_packaged,
+    make_table,
+    tube,
+    tube_fluence_interpolated,
+    tube_spectrum,
+)
 
 REMAKE = "run `python -m raytwin.spectra.make_table` and say what changed in the changelog"
 
@@ -85,4 +93,5 @@ def test_another_angle_comes_from_spekpy_with_its_own_version(nothing_kept: Path
     other = tube_spectrum(kV=20, anode_angle_deg=13.0)
     assert other.model_version == f"spekpy {version('spekpy')}"
     assert [path.name.split("_")[2] for path in nothing_kept.iterdir()] == ["13deg"]
+    assert not is_packaged("W", 13.0, "casim") and is_packaged("W", 12.0, "casim")
     assert other.fluence.sum() > tube_spectrum(kV=20).fluence.sum()  # less of the anode to cross

@@ -57,9 +57,16 @@ def run(arguments: argparse.Namespace) -> int:
     from ..explore.page import CampaignTarget, page_of
     from ..explore.state import first_state
     from ..explore.view import Explorer
+    from ..spectra import MODELS, is_packaged
 
     twin = as_twin(arguments.twin)
     explorer = Explorer(twin, name=arguments.twin, pods=[read_known_pod(path) for path in arguments.pod])
+    tube = twin.spectral
+    if tube is not None and not all(is_packaged(tube.anode, tube.anode_angle_deg, model) for model in MODELS):
+        say(
+            f"warning: no spectra are packaged for {tube.anode} at {tube.anode_angle_deg:g} degrees: a voltage that nobody"
+            " asked for before takes seconds, once"
+        )
     say("preparing the page")
     # pictures are small: threads would cost more than they save
     numba.set_num_threads(1)

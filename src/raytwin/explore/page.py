@@ -348,12 +348,12 @@ class _Page:
         self._advance_map()
 
     def _advance_map(self) -> None:
-        """One row of the map, then let moves that have arrived go first."""
+        """One piece of the map, then let moves that have arrived go first."""
         if self._pieces is None:
             return
         found = next(self._pieces)
         if found is None:
-            self.document.add_timeout_callback(self._advance_map, 5)
+            self.document.add_timeout_callback(self._advance_map, 1)
             return
         self._pieces = None
         self._map_key = _map_key(self.state)
@@ -604,12 +604,12 @@ class _Figures:
         self.mappers["ratio"].nan_color = "#c9d3e0"
         images = []
         for name, title in _PICTURES.items():
-            one = figure(name=f"image_{name}", title=title, height=262, match_aspect=True, **plain)
+            one = figure(name=f"image_{name}", title=title, height=262, match_aspect=True, min_border_left=10, **plain)
             one.x_range.range_padding = one.y_range.range_padding = 0
             one.image(name, x=0, y=0, dw="side", dh="side", source=self.pictures, color_mapper=self.mappers[name])
             one.add_layout(ColorBar(color_mapper=self.mappers[name], width=10), "right")
             one.xaxis.axis_label = "pixels"
-            one.yaxis.axis_label = "pixels"
+            one.yaxis.visible = False  # as long as the other side
             one.grid.visible = False
             images.append(one)
         self.images = images

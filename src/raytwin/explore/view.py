@@ -172,7 +172,7 @@ class Explorer:
         return found  # type: ignore[return-value]
 
     def map_by_rows(self, state: ExplorerState, *, steps: tuple[int, int] = MAP_STEPS) -> Iterator[MapView | None]:
-        """`map` in pieces of some ten milliseconds: None after each row, the map at the end."""
+        """`map` in pieces of some ten milliseconds: None after each of them, the map at the end."""
         lows, highs = self.map_axes(steps)
         cnr = np.full((len(lows), len(highs)), np.nan)
         allowed = np.zeros(cnr.shape, dtype=bool)
@@ -188,6 +188,8 @@ class Explorer:
                 if one is not None:
                     cnr[row, column] = one.cnr_object
                     allowed[row, column] &= not any(self._saturated(channel) for channel in (one.low, one.high))
+                if row == 0:
+                    yield None  # each of these is a beam of its own
             yield None
         usable = np.where(allowed, cnr, -np.inf)
         usable[np.isnan(usable)] = -np.inf

@@ -181,7 +181,10 @@ class TestInChromium:
         handle.focus()
         for _ in range(6):  # half a kV each
             page.keyboard.press("ArrowRight")
-        page.wait_for_function("Bokeh.documents[0].get_model_by_name('kV_low').value == 43")
+        page.wait_for_function(
+            "Bokeh.documents[0].get_model_by_name('numbers').text.includes('low, 43 kV')", timeout=10_000
+        )
+        page.wait_for_timeout(500)
         page.evaluate(MOVE, ["product_mm", 25])
         page.evaluate(MOVE, ["foreign_object", "Al"])
         page.wait_for_timeout(300)
@@ -197,6 +200,27 @@ class TestInChromium:
         tiles = plain(shown(page, "tiles"))
         assert f"{found.cnr_object:.3g} contrast to noise of the object" in tiles
         assert f"{found.delta_R.value:.3g}" in tiles
+
+    def test_the_map_is_there_and_follows_what_is_set(self, page) -> None:  # type: ignore[no-untyped-def]
+        def best() -> float:
+            return float(re.search(r"best on the map, ([\d.]+) at", plain(shown(page, "map_note")))[1])  # type: ignore[index]
+
+        def drawn() -> list[float]:
+            found = page.evaluate(
+                "() => { const m = Bokeh.documents[0].get_model_by_name('map');"
+                " return Array.from(m.renderers[0].data_source.get('cnr')) }"
+            )
+            return [float(one) for one in found]
+
+        first = best()
+        assert max(drawn()) == pytest.approx(first, rel=0.01)
+        page.evaluate(MOVE, ["averaged", 4])
+        page.wait_for_function(
+            "Bokeh.documents[0].get_model_by_name('map_note').text.includes('best on the map')", timeout=10_000
+        )
+        # four frames halve the noise, at any pair
+        assert best() == pytest.approx(2.0 * first, rel=0.01)
+        assert max(drawn()) == pytest.approx(best(), rel=0.01)
 
     def test_nothing_is_asked_of_another_machine(self, page) -> None:  # type: ignore[no-untyped-def]
         assert len(page.asked) > 3

@@ -314,8 +314,11 @@ class _Page:
         if again:
             changes["map_note"] = {"text": _note("Being drawn again for the settings above.")}
         self._send(changes, began)
-        if again:
+        if again and self._open:
             self._ask_for_map()
+        elif again:
+            # a page that is not open yet has no one to bring it later
+            self._send_map(self.explorer.map(self.state))
 
     def _send(self, changes: Changes, began: float | None = None) -> None:
         """Bring changes to the page in one message, so that it is drawn once; what is the same already is left out."""
@@ -356,6 +359,9 @@ class _Page:
             self.document.add_timeout_callback(self._advance_map, 1)
             return
         self._pieces = None
+        self._send_map(found)
+
+    def _send_map(self, found: MapView) -> None:
         self._map_key = _map_key(self.state)
         self._send({**self.figures.map_changes(found), "map_note": {"text": _map_note(found)}})
 

@@ -8,13 +8,13 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo docs wheel-check stories test test-slow validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip || echo "pip stays as it is"
 	for try in 1 2 3 4; do \
-	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,fits,develop]' && break; \
+	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,fits,develop]' && break; \
 	  test $$try != 4 || exit 1; echo "the install broke off; once more in $$((try * 15)) s (what is complete is kept)"; sleep $$((try * 15)); done
 	$(BIN)/python -m pip install --quiet --no-deps 'msfc-ccd==1.2.0' || echo "msfc-ccd could not be had: the test of its camera's frames is skipped"
 	touch $(READY)
@@ -45,7 +45,12 @@ wheel-check: $(READY)
 	cd build/wheel && venv/bin/python -c "import importlib.util as u; assert u.find_spec('torch') is None and u.find_spec('sphinx') is None"
 
 test: $(READY) check
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
+
+# the page of `raytwin explore` in Debian's Chromium (apt-get install chromium), some minutes
+test-page: $(READY)
+	$(BIN)/python -m pip install --quiet playwright
+	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
@@ -112,7 +117,7 @@ check: $(READY)
 	ln -s $(CURDIR)/src/raytwin/* build/types/raytwin/
 	for room in $(ROOMS); do ln -s $(CURDIR)/$$room build/types/raytwin/$$room; done
 	MYPYPATH=build/types $(BIN)/mypy --strict -p raytwin
-	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow'
+	$(BIN)/python -m pytest -q tests/test_house.py -m 'not slow and not browser'
 
 format: $(READY)
 	$(BIN)/ruff check --fix src $(ROOMS) tests validation benchmarks docs/_ext docs/conf.py

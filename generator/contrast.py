@@ -12,6 +12,7 @@ Left out: scatter, the noise of the flat, and the softening of the object's edge
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -33,7 +34,7 @@ from ..spectra import (
     tube_fluence_interpolated,
 )
 from .binning import refuse_binning
-from .predict import predict_flatfield, spectrum_outside
+from .predict import Prediction, predict_flatfield, spectrum_outside
 from .present_line import present_line
 from .psf import PSF_MODELS, Spread
 from .spectral_signal import OpenBeam
@@ -180,15 +181,33 @@ class _Detector:
 class _Beam:
     """A setting as a function: transmission of an object (energy,) -> rate and gain (draw,), row 0 the best values.
 
-    secondary_DN: of the gain, what secondary quanta add, the same behind any object.
+    signal: takes besides whether all draws are wanted or the best values alone; secondary_DN: of the gain, what secondary
+    quanta add, the same behind any object.
     """
 
-    signal: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    signal: Callable[[FloatArray, bool], tuple[FloatArray, FloatArray]]
     energies_keV: FloatArray
     open_signal_DN: float
     open_gain_DN: float
     secondary_DN: float
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Crossed:
+    """What slabs leave of a beam, whatever its load.
+
+    Fields: M_product, M_object (draw,), row 0 the best values; transmitted, gain_ratio (2,): signal and gain behind product, and
+    behind both, over those of the open beam; M_object_alone; thin_mu_product_per_mm, thin_mu_object_per_mm.
+    """
+
+    M_product: FloatArray
+    M_object: FloatArray
+    transmitted: tuple[float, float]
+    gain_ratio: tuple[float, float]
+    M_object_alone: float
+    thin_mu_product_per_mm: float
+    thin_mu_object_per_mm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,7 +227,9 @@ class _Slabs:
     warnings: tuple[str, ...]
 
 
-def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
+def _beam_of_twin(
+    twin: Twin, setting: Setting, intervals: bool, predict: Callable[[Twin, Setting], Prediction] = predict_flatfield
+) -> _Beam:
     line = present_line(twin)
     twin = line.twin
     told = line.warnings
@@ -221,10 +242,15 @@ def _beam_of_twin(twin: Twin, setting: Setting, intervals: bool) -> _Beam:
         samples = np.concatenate([samples, posterior.samples])
     beam = OpenBeam(kV=setting.kV, filters=setting.filters)
     # frames of one exposure: averaging is put in where the noise is
-    predicted = predict_flatfield(twin, replace(setting, averaged=1))
+    predicted = predict(twin, replace(setting, averaged=1))
 
-    def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        found = model.signal(samples, beam, through=through)
+    @cache
+    def photons(draws: bool) -> FloatArray:
+        return model.weights(samples if draws else samples[:1], beam)
+
+    def signal(through: FloatArray, draws: bool) -> tuple[FloatArray, FloatArray]:
+        bare = photons(draws)
+        found = model.signal_of_photons(samples if draws else samples[:1], bare * through[: bare.shape[1]])
         return found.rate_DN_per_mAs, found.gain_DN
 
     return _Beam(
@@ -257,12 +283,13 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
     )
     first, second = photons * response.mean_deposited_keV, photons * response.mean_square_deposited_keV2
 
-    def signal(through: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = np.sum(first * through, axis=1)
+    def signal(through: FloatArray, draws: bool) -> tuple[FloatArray, FloatArray]:
+        rows = slice(None) if draws else slice(1)
+        rate = np.sum(first[rows] * through, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return rate, np.sum(second * through, axis=1) / rate / line.swank
+            return rate, np.sum(second[rows] * through, axis=1) / rate / line.swank
 
-    rate, gain = signal(np.ones_like(energies))
+    rate, gain = signal(np.ones_like(energies), False)
     # fewer than one photon in 1e30 is no beam, whatever floating point can still hold
     if not rate[0] > 1e-30 * float(bare @ response.mean_deposited_keV):
         layers = setting.filters if line.tube is not None else (*line.inherent, *setting.filters)
@@ -347,43 +374,64 @@ def _checked_slabs(product: Filter, foreign_object: Filter, displaces: bool, obj
         )
 
 
-def _slabs(
+def _crossed(
     beam: _Beam,
-    setting: Setting,
-    detector: _Detector,
     *,
+    kV: float,
     product: Filter,
     foreign_object: Filter,
     displaces: bool,
     table: str,
     library: Library | None,
-) -> _Slabs:
+    draws: bool,
+) -> _Crossed:
     energies = beam.energies_keV
 
     def passed(*layers: Filter) -> FloatArray:
         return transmission(layers, energies, table=table, library=library, bin_width_keV=BIN_WIDTH_KEV)
+
+    def behind(layers: tuple[Filter, ...], opened: FloatArray, of_draws: bool) -> tuple[FloatArray, FloatArray]:
+        rate, gain = beam.signal(passed(*layers), of_draws)
+        if not np.all(rate > 1e-30 * opened[: rate.size]):
+            raise InputError(
+                "product and foreign object",
+                received=" behind ".join(str(layer) for layer in layers),
+                expected=f"slabs that let some photons through at {kV:g} kV",
+            )
+        return rate, gain
 
     around = product
     if displaces:
         around = Filter(
             material=product.material, thickness_mm=max(product.thickness_mm - foreign_object.thickness_mm, 0.0)
         )
-    open_rate, open_gain = beam.signal(np.ones_like(energies))
-    logs, noises, rates = [], [], []
-    for layers in ((product,), (around, foreign_object), (foreign_object,)):
-        rate, gain = beam.signal(passed(*layers))
-        if not np.all(rate > 1e-30 * open_rate):
-            raise InputError(
-                "product and foreign object",
-                received=" behind ".join(str(layer) for layer in layers),
-                expected=f"slabs that let some photons through at {setting.kV:g} kV",
-            )
-        logs.append(-np.log(rate / open_rate))
-        rates.append(rate[0] / open_rate[0])
-        noises.append(gain[0] / open_gain[0])
+    open_rate, open_gain = beam.signal(np.ones_like(energies), draws)
+    rates, gains = zip(
+        *(behind(layers, open_rate, draws) for layers in ((product,), (around, foreign_object))), strict=True
+    )
+    alone = behind((foreign_object,), open_rate, False)[0]
+    thin = []
+    for layer in (product, foreign_object):
+        mu = mu_per_mm(material_from_name(layer.material, library=library), energies, table=table)
+        # the signal is linear in the transmission, so the mean of mu over the signal is the signal of mu
+        thin.append(float(beam.signal(mu, False)[0][0] / open_rate[0]))
+    return _Crossed(
+        M_product=-np.log(rates[0] / open_rate),
+        M_object=-np.log(rates[1] / open_rate),
+        transmitted=(float(rates[0][0] / open_rate[0]), float(rates[1][0] / open_rate[0])),
+        gain_ratio=(float(gains[0][0] / open_gain[0]), float(gains[1][0] / open_gain[0])),
+        M_object_alone=float(-np.log(alone[0] / open_rate[0])),
+        thin_mu_product_per_mm=thin[0],
+        thin_mu_object_per_mm=thin[1],
+    )
+
+
+def _slabs(
+    beam: _Beam, crossed: _Crossed, setting: Setting, detector: _Detector, *, product: Filter, foreign_object: Filter
+) -> _Slabs:
     quantum, white, spreads = [], [], []
-    for share, ratio in zip(rates[:2], noises[:2], strict=True):
-        signal = beam.open_signal_DN * float(share)
+    for share, ratio in zip(crossed.transmitted, crossed.gain_ratio, strict=True):
+        signal = beam.open_signal_DN * share
         if not 1e-30 < signal < 1e30:
             raise InputError(
                 "setting",
@@ -391,36 +439,31 @@ def _slabs(
                 expected="a signal that a detector could hold",
                 remedy="check tube load, distance, pixel pitch and output",
             )
-        gain_DN = beam.open_gain_DN * float(ratio)
+        gain_DN = beam.open_gain_DN * ratio
         secondary_DN = min(beam.secondary_DN, 0.9 * gain_DN)
         # variance of M before the spread: gain S / S^2
         quantum.append((gain_DN - secondary_DN) / signal / setting.averaged)
         white.append((secondary_DN / signal + detector.read_variance_DN2 / signal**2) / setting.averaged)
         spreads.append(quantum[-1] * detector.spread.variance_share + white[-1])
-    thin = []
-    for layer in (product, foreign_object):
-        mu = mu_per_mm(material_from_name(layer.material, library=library), energies, table=table)
-        # the signal is linear in the transmission, so the mean of mu over the signal is the signal of mu
-        thin.append(float(beam.signal(mu)[0][0] / open_rate[0]))
     return _Slabs(
         channel=ContrastChannel(
             setting=setting,
             open_signal_DN=beam.open_signal_DN,
-            M_product=float(logs[0][0]),
-            M_object=float(logs[1][0]),
+            M_product=float(crossed.M_product[0]),
+            M_object=float(crossed.M_object[0]),
             sd_M_product=math.sqrt(spreads[0]),
             sd_M_object=math.sqrt(spreads[1]),
-            mu_eff_product_per_mm=float(logs[0][0]) / product.thickness_mm,
-            mu_eff_object_per_mm=float(logs[2][0]) / foreign_object.thickness_mm,
+            mu_eff_product_per_mm=float(crossed.M_product[0]) / product.thickness_mm,
+            mu_eff_object_per_mm=crossed.M_object_alone / foreign_object.thickness_mm,
         ),
-        M_product=logs[0],
-        M_object=logs[1],
+        M_product=crossed.M_product,
+        M_object=crossed.M_object,
         quantum_product=quantum[0],
         quantum_object=quantum[1],
         white_product=white[0],
         white_object=white[1],
-        thin_mu_product_per_mm=thin[0],
-        thin_mu_object_per_mm=thin[1],
+        thin_mu_product_per_mm=crossed.thin_mu_product_per_mm,
+        thin_mu_object_per_mm=crossed.thin_mu_object_per_mm,
         few_photons=math.sqrt(max(spreads) * setting.averaged) > _FEW_PHOTONS,
         warnings=beam.warnings,
     )
@@ -464,23 +507,34 @@ def disc_and_ring(pixels: int, dilations: int) -> tuple[NDArray[np.bool_], NDArr
 
 def _variance_of_difference(
     *,
-    disc: NDArray[np.bool_],
-    ring: NDArray[np.bool_],
+    pixels: tuple[int, int],
+    correlated: tuple[float, float, float],
     quantum: tuple[float, float],
     white: tuple[float, float],
-    detector: _Detector,
 ) -> float:
     """Variance of the disc's mean less the ring's; quantum and white variance a pixel as (in the disc, in the ring)."""
+    in_disc, in_both, in_ring = correlated
+    of_quanta = quantum[0] * in_disc - 2.0 * math.sqrt(quantum[0] * quantum[1]) * in_both + quantum[1] * in_ring
+    return of_quanta + white[0] / pixels[0] + white[1] / pixels[1]
+
+
+def _correlated_shares(
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]], spread: Spread
+) -> tuple[float, float, float]:
+    """Variance of the means over disc and over ring of noise of unit variance before the spread, and between them.
+
+    Returns:
+        Disc, disc with ring, ring; no unit.
+    """
     from scipy.signal import oaconvolve
 
-    weight = disc / disc.sum() - ring / ring.sum()
-    amplitude = weight * np.sqrt(np.where(disc, quantum[0], quantum[1]))
-    spread_out = oaconvolve(amplitude, detector.spread.noise_autocovariance(detector.spread.reach_px), mode="same")
-    correlated = float(np.sum(amplitude * spread_out))
-    return correlated + float(np.sum(weight**2 * np.where(disc, white[0], white[1])))
+    kernel = spread.noise_autocovariance(spread.reach_px)
+    disc, ring = (mask / mask.sum() for mask in masks)
+    around_disc, around_ring = (oaconvolve(mean, kernel, mode="same") for mean in (disc, ring))
+    return float(np.sum(disc * around_disc)), float(np.sum(ring * around_disc)), float(np.sum(ring * around_ring))
 
 
-def _quotients(low: _Slabs, high: _Slabs) -> tuple[FloatArray, FloatArray]:
+def _quotients(low: _Slabs | _Crossed, high: _Slabs | _Crossed) -> tuple[FloatArray, FloatArray]:
     return low.M_product / high.M_product, low.M_object / high.M_object
 
 
@@ -490,8 +544,8 @@ def _combined(
     detector: _Detector,
     *,
     thickness_ratio: float,
-    object_pixels: int,
-    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    pixels: tuple[int, int],
+    correlated: tuple[float, float, float],
     by_table: Mapping[str, float],
 ) -> Contrast:
     R_product, R_object = _quotients(low, high)
@@ -517,10 +571,7 @@ def _combined(
     )
     share = detector.spread.variance_share
     sd_pixel = math.sqrt(quantum[0] * share + white[0])
-    disc, ring = masks
-    sd_object = math.sqrt(
-        _variance_of_difference(disc=disc, ring=ring, quantum=quantum, white=white, detector=detector)
-    )
+    sd_object = math.sqrt(_variance_of_difference(pixels=pixels, correlated=correlated, quantum=quantum, white=white))
     warnings = list(dict.fromkeys((*low.warnings, *high.warnings)))
     if low.few_photons or high.few_photons:
         warnings.append(
@@ -545,13 +596,111 @@ def _combined(
         ),
         delta_R_by_table=dict(by_table),
         R_product=q_product,
-        object_pixels=object_pixels,
+        object_pixels=pixels[0],
         sd_pixel=sd_pixel,
         sd_object=sd_object,
         cnr_pixel=abs(best) / sd_pixel,
         cnr_object=abs(best) / sd_object,
         warnings=tuple(warnings),
     )
+
+
+class SlabContrasts:
+    """Contrasts of one foreign object in one product on one line, beams and slabs computed once for all pairs of settings.
+
+    Args:
+        line, product, foreign_object, object_pixels, displaces, library: as for `predict_contrast`.
+        predict: a twin and a setting -> its flatfield; one that keeps what it has predicted saves time.
+    """
+
+    def __init__(
+        self,
+        line: Twin | UncalibratedLine,
+        *,
+        product: Filter,
+        foreign_object: Filter,
+        object_pixels: int = 1,
+        displaces: bool = False,
+        library: Library | None = None,
+        predict: Callable[[Twin, Setting], Prediction] = predict_flatfield,
+    ) -> None:
+        _checked_slabs(product, foreign_object, displaces, object_pixels)
+        self._line = line
+        self._product, self._foreign_object, self._displaces = product, foreign_object, displaces
+        self._thickness_ratio = foreign_object.thickness_mm / product.thickness_mm
+        self._library = library
+        self._predict = predict
+        self._detector = _detector_of(line)
+        masks = disc_and_ring(object_pixels, min(dilations_for_pixel(self._detector.pixel_mm), _WIDEST_RING_PX))
+        self._pixels = (int(masks[0].sum()), int(masks[1].sum()))
+        self._correlated = _correlated_shares(masks, self._detector.spread)
+        self._known: dict[tuple[Setting, bool], _Slabs] = {}
+        self._crossed: dict[tuple[float, tuple[Filter, ...], bool, str], _Crossed] = {}
+        self._beams: dict[tuple[Setting, bool], _Beam] = {}
+
+    def contrast(self, low: Setting, high: Setting, *, intervals: bool = True) -> Contrast:
+        """`predict_contrast` at a pair of settings; without intervals in a fraction of the time.
+
+        Raises:
+            InputError: as there.
+        """
+        if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
+            raise InputError(
+                "low and high setting",
+                received=f"{low} and {high}",
+                expected="two different spectra, the lower kV first",
+            )
+        by_table = {}
+        for table in TABLES if intervals else ("xraylib",):
+            q_product, q_object = _quotients(self._behind(low, intervals, table), self._behind(high, intervals, table))
+            by_table[table] = float(q_object[0] - q_product[0])
+        return _combined(
+            self._slabs(low, intervals),
+            self._slabs(high, intervals),
+            self._detector,
+            thickness_ratio=self._thickness_ratio,
+            pixels=self._pixels,
+            correlated=self._correlated,
+            by_table=by_table,
+        )
+
+    def _slabs(self, setting: Setting, intervals: bool) -> _Slabs:
+        key = (setting, intervals)
+        if key not in self._known:
+            self._known[key] = _slabs(
+                self._beam(setting, intervals),
+                self._behind(setting, intervals, "xraylib"),
+                setting,
+                self._detector,
+                product=self._product,
+                foreign_object=self._foreign_object,
+            )
+        return self._known[key]
+
+    def _behind(self, setting: Setting, intervals: bool, table: str) -> _Crossed:
+        key = (setting.kV, setting.filters, intervals, table)
+        if key not in self._crossed:
+            self._crossed[key] = _crossed(
+                self._beam(setting, intervals),
+                kV=setting.kV,
+                product=self._product,
+                foreign_object=self._foreign_object,
+                displaces=self._displaces,
+                table=table,
+                library=self._library,
+                draws=intervals and table == "xraylib",  # of other tables the best values alone count
+            )
+        return self._crossed[key]
+
+    def _beam(self, setting: Setting, intervals: bool) -> _Beam:
+        refuse_binning(setting)
+        key = (setting, intervals)
+        if key not in self._beams:
+            if isinstance(self._line, UncalibratedLine):
+                self._beams[key] = _beam_of_line(self._line, setting, self._library, intervals)
+            else:
+                self._beams[key] = _beam_of_twin(self._line, setting, intervals, self._predict)
+        return self._beams[key]
 
 
 def predict_contrast(
@@ -586,17 +735,15 @@ def predict_contrast(
     Checked against: the paper's equation where the beam is nearly monoenergetic, noise drawn frame by frame
         (tests/test_generator_contrast.py).
     """
-    grid = _contrasts(
+    slabs = SlabContrasts(
         line,
-        [[(low, high)]],
         product=product,
         foreign_object=foreign_object,
         object_pixels=object_pixels,
         displaces=displaces,
-        intervals=True,
         library=library,
     )
-    return grid[0][0]
+    return slabs.contrast(low, high)
 
 
 def compute_contrast_map(
@@ -613,80 +760,12 @@ def compute_contrast_map(
 
     A setting that stands in several pairs is computed once. Raises as `predict_contrast`.
     """
-    return _contrasts(
+    slabs = SlabContrasts(
         line,
-        pairs,
         product=product,
         foreign_object=foreign_object,
         object_pixels=object_pixels,
         displaces=displaces,
-        intervals=False,
         library=library,
     )
-
-
-def _contrasts(
-    line: Twin | UncalibratedLine,
-    pairs: Iterable[Sequence[tuple[Setting, Setting]]],
-    *,
-    product: Filter,
-    foreign_object: Filter,
-    object_pixels: int,
-    displaces: bool,
-    intervals: bool,
-    library: Library | None,
-) -> tuple[tuple[Contrast, ...], ...]:
-    _checked_slabs(product, foreign_object, displaces, object_pixels)
-    detector = _detector_of(line)
-    masks = disc_and_ring(object_pixels, min(dilations_for_pixel(detector.pixel_mm), _WIDEST_RING_PX))
-    known: dict[tuple[Setting, str], _Slabs] = {}
-    beams: dict[Setting, _Beam] = {}
-
-    def slabs(setting: Setting, table: str) -> _Slabs:
-        refuse_binning(setting)
-        if setting not in beams:
-            if isinstance(line, UncalibratedLine):
-                beams[setting] = _beam_of_line(line, setting, library, intervals)
-            else:
-                beams[setting] = _beam_of_twin(line, setting, intervals)
-        key = (setting, table)
-        if key not in known:
-            known[key] = _slabs(
-                beams[setting],
-                setting,
-                detector,
-                product=product,
-                foreign_object=foreign_object,
-                displaces=displaces,
-                table=table,
-                library=library,
-            )
-        return known[key]
-
-    rows = []
-    for row in pairs:
-        found = []
-        for low, high in row:
-            if low.kV > high.kV or (low.kV == high.kV and low.filters == high.filters):
-                raise InputError(
-                    "low and high setting",
-                    received=f"{low} and {high}",
-                    expected="two different spectra, the lower kV first",
-                )
-            by_table = {}
-            for table in TABLES if intervals else ("xraylib",):
-                q_product, q_object = _quotients(slabs(low, table), slabs(high, table))
-                by_table[table] = float(q_object[0] - q_product[0])
-            found.append(
-                _combined(
-                    slabs(low, "xraylib"),
-                    slabs(high, "xraylib"),
-                    detector,
-                    thickness_ratio=foreign_object.thickness_mm / product.thickness_mm,
-                    object_pixels=object_pixels,
-                    masks=masks,
-                    by_table=by_table,
-                )
-            )
-        rows.append(tuple(found))
-    return tuple(rows)
+    return tuple(tuple(slabs.contrast(low, high, intervals=False) for low, high in row) for row in pairs)

@@ -3,6 +3,8 @@
 Limits that the instrument declares are errors; a rule of thumb is a warning.
 """
 
+from collections.abc import Iterator
+
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Setting
 from ..errors import InputError
@@ -65,9 +67,14 @@ def check_limits(instrument: Instrument, setting: Setting) -> tuple[str, ...]:
         InputError: tube voltage, current or power above the tube's; frames or lines closer together than exposure and
             readout take; an exposure that a line or TDI detector cannot have at this belt speed.
     """
-    _check_tube(instrument, setting)
-    _check_timing(instrument, setting)
-    return _strained(instrument, setting)
+    for broken in broken_limits(instrument, setting):
+        raise broken
+    return strained_limits(instrument, setting)
+
+
+def broken_limits(instrument: Instrument, setting: Setting) -> tuple[InputError, ...]:
+    """Every declared limit of tube, readout and belt that a setting breaks, as errors; `check_limits` raises the first."""
+    return (*_of_tube(instrument, setting), *_of_timing(instrument, setting))
 
 
 def check_count_rate(instrument: Instrument, setting: Setting, counts: float) -> None:
@@ -88,7 +95,7 @@ def check_count_rate(instrument: Instrument, setting: Setting, counts: float) ->
         )
 
 
-def _check_tube(instrument: Instrument, setting: Setting) -> None:
+def _of_tube(instrument: Instrument, setting: Setting) -> Iterator[InputError]:
     current = setting.tube_current_mA
     power = None if current is None else current * setting.kV
     limits = [
@@ -102,17 +109,17 @@ def _check_tube(instrument: Instrument, setting: Setting) -> None:
         limits.append((power, focal, "W", told, "lower the power, or declare the larger focal spot it is driven with"))
     for value, limit, unit, whose, remedy in limits:
         if value is not None and limit is not None and value > _ROUNDING * limit:
-            raise InputError(
+            yield InputError(
                 "setting", received=f"{value:.4g} {unit}", expected=f"at most {whose} {limit:g} {unit}", remedy=remedy
             )
 
 
-def _check_timing(instrument: Instrument, setting: Setting) -> None:
+def _of_timing(instrument: Instrument, setting: Setting) -> Iterator[InputError]:
     what = "frames" if instrument.detector in (None, "area") else "lines"
     shortest = shortest_interval_ms(instrument, setting)
     interval = setting.frame_interval_ms
     if interval is not None and interval * _ROUNDING < shortest:
-        raise InputError(
+        yield InputError(
             "frame_interval_ms",
             received=f"{interval:g} ms between {what}",
             expected=f"at least {shortest:.4g} ms for an exposure of {setting.exposure_ms:g} ms"
@@ -127,7 +134,7 @@ def _check_timing(instrument: Instrument, setting: Setting) -> None:
             return
         belt = period * instrument.tdi_stages
         if abs(setting.exposure_ms - belt) > _BELT_AGREES * belt:
-            raise InputError(
+            yield InputError(
                 "exposure_ms",
                 received=f"{setting.exposure_ms:g} ms",
                 expected=f"{belt:.4g} ms: {instrument.tdi_stages} stages of {period:.4g} ms at"
@@ -135,14 +142,14 @@ def _check_timing(instrument: Instrument, setting: Setting) -> None:
                 remedy="the belt sets the exposure of a TDI detector",
             )
     if shortest > _ROUNDING * period:
-        raise InputError(
+        yield InputError(
             "exposure_ms",
             received=f"{shortest:.4g} ms a line with its readout",
             expected=f"at most {period:.4g} ms, in which the belt moves one pixel at {setting.belt_speed_mm_s:g} mm/s",
             remedy="expose shorter or slow the belt down",
         )
     if interval is not None and abs(interval - period) > _BELT_AGREES * period:
-        raise InputError(
+        yield InputError(
             "frame_interval_ms",
             received=f"{interval:g} ms between lines",
             expected=f"{period:.4g} ms, in which the belt moves one pixel at {setting.belt_speed_mm_s:g} mm/s",
@@ -150,7 +157,7 @@ def _check_timing(instrument: Instrument, setting: Setting) -> None:
         )
 
 
-def _strained(instrument: Instrument, setting: Setting) -> tuple[str, ...]:
+def strained_limits(instrument: Instrument, setting: Setting) -> tuple[str, ...]:
     """Rules of thumb that the setting breaks, where nothing was declared."""
     current = setting.tube_current_mA
     declared = instrument.maximum_power_w is not None or instrument.focal_power_w_per_mm is not None

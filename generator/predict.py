@@ -454,11 +454,9 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
     of_quanta = max(variance - read_DN2, 0.0) * flat.quantum_sd
     of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
     relative_sd = 0.5 * math.hypot(of_quanta, of_reading) / variance
-    if instrument.bits is not None:
-        room = 2.0**instrument.bits - 1 - twin.dark_DN.value
-        held = mean_DN.value / binned.signal * binned.at_the_adc
-        if held > room:
-            warnings.append(f"the detector saturates: {held:.0f} DN above dark, room for {room:.0f} DN")
+    held = full_scale(twin, setting, mean_DN.value)
+    if held is not None and held[0] > held[1]:
+        warnings.append(f"the detector saturates: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN")
     if photons is not None and instrument.counting:
         check_count_rate(instrument, setting, photons.value)
     return Prediction(
@@ -472,6 +470,21 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
         measured_level=False,
         warnings=(),
     )
+
+
+def full_scale(twin: Twin, setting: Setting, mean_DN: float) -> tuple[float, float] | None:
+    """What the converter holds of a flatfield, and what it has room for, DN above dark; None: its bits are not known.
+
+    Args:
+        twin: for its bits, dark and way of binning.
+        setting: for its binning.
+        mean_DN: of the (binned) pixels, above dark.
+    """
+    bits = twin.instrument.bits
+    if bits is None:
+        return None
+    binned = binned_pixel(setting.binning, twin.instrument.binning_adds)
+    return mean_DN / binned.signal * binned.at_the_adc, 2.0**bits - 1 - twin.dark_DN.value
 
 
 def _log_sd(estimate: Estimate) -> float:

@@ -411,7 +411,7 @@ class SpectralModel:
         top = photons.shape[1]
         if through is not None:
             photons = photons * through[:top]
-        return self._signal_of_photons(samples, photons)
+        return self.signal_of_photons(samples, photons)
 
     def depth_of_parameters(self, layer: Filter, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Optical depth of a layer (energy,) with the scale and the table shares of one parameter set (parameter,)."""
@@ -445,7 +445,7 @@ class SpectralModel:
             photons = photons * np.exp(-crossed @ depths)
         else:
             photons = np.repeat(photons, len(stacks), axis=0)
-        return self._signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
+        return self.signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
 
     def moment_weights(self, parameters: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What each energy of an open beam adds to signal (DN), quantum variance (DN^2) and photons absorbed.
@@ -542,8 +542,13 @@ class SpectralModel:
             sums[2, chosen] = every[2]
         return sums
 
-    def _signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
-        """What photons (draw, energy) give, with the scintillator and gains of samples (draw, parameter)."""
+    def signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
+        """What photons (draw, energy), as `weights` gives them, leave behind an object or without one.
+
+        Args:
+            samples: (draw, parameter) in the order of `names`: scintillator and gains.
+            photons: (draw, energy) on the first of `energies_keV`, a bin, mAs and mm2 of pixel at 1 m.
+        """
         top = photons.shape[1]
         first, second, absorbed = self._moment_sums(samples, photons)
         log_gamma = self._column(samples, "log_DN_per_keV")

@@ -1,5 +1,6 @@
 """Spectra of X-ray tubes and the response of detectors: from kV and filters to what is detected."""
 
+from ._packaged import is_packaged
 from .detector import DEFAULT_SCINTILLATOR, Response, detector_response, k_escape_fractions
 from .effective import effective_mu_per_mm, signal_weights
 from .grid import BIN_WIDTH_KEV, FIRST_CENTRE_KEV, MAXIMUM_KV, energy_grid_keV
@@ -47,6 +48,7 @@ __all__ = [
     "filtered_spectrum",
     "fluence_per_cm2_mAs",
     "half_value_layer_mm",
+    "is_packaged",
     "k_escape_fractions",
     "light_per_keV",
     "mean_energy_keV",

@@ -1,4 +1,4 @@
-"""X-ray tubes: SpekPy's spectra at whole kV, each computed once, and a smooth function of kV between them."""
+"""X-ray tubes: SpekPy's spectra at whole kV, packaged or computed once, and a smooth function of kV between them."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -10,6 +10,7 @@ from ..acquisition.setting import Filter
 from ..errors import InputError
 from ..materials import Library
 from ._cache import keep, read_kept
+from ._packaged import packaged_fluence, packaged_lines, packaged_version
 from .grid import BIN_WIDTH_KEV, FIRST_CENTRE_KEV, MAXIMUM_KV, energy_grid_keV
 from .spectrum import Spectrum, filtered_spectrum
 
@@ -79,6 +80,7 @@ def tube_spectrum(
     fluence = tube_fluence_interpolated(
         kV, energies_keV=grid, anode=anode, anode_angle_deg=anode_angle_deg, model=model
     )
+    bare_angle = _checked_angle(anode_angle_deg)
     bare = Spectrum(
         energies_keV=grid,
         fluence=fluence,
@@ -86,7 +88,7 @@ def tube_spectrum(
         anode=anode,
         anode_angle_deg=float(anode_angle_deg),
         model=model,
-        model_version=f"spekpy {_spekpy_version()}",
+        model_version=f"spekpy {_version_of(anode, bare_angle, model)}",
     )
     return filtered_spectrum(bare, filters, table=table, library=library) if filters else bare
 
@@ -120,8 +122,9 @@ def tube_fluence_interpolated(
         for_sums: weights of a sum over energy rather than heights of the spectrum.
 
     Returns:
-        (n,) fluence. The first call at a kV computes up to four spectra (about a second); afterwards it takes about
-        0.3 ms.
+        (n,) fluence, in about 0.3 ms. Spectra of the default tube come with the package at every whole kV, bit for bit
+        those of SpekPy; for another anode or angle SpekPy computes up to four at the first call (0.4 to 10 s each),
+        which are kept on disk.
 
     Raises:
         InputError: an argument outside its range.
@@ -240,6 +243,14 @@ def _line_offsets(anode: str, anode_angle_deg: float, model: str) -> FloatArray:
 
     The lines' shares within a bin hardly change with kV; those at a kV above all edges are taken.
     """
+    places = packaged_lines(anode, anode_angle_deg, model)
+    if places is None:
+        places = kept_line_places(anode, anode_angle_deg, model)
+    return np.asarray((places[1] - energy_grid_keV(MAXIMUM_KV)) / BIN_WIDTH_KEV)
+
+
+def kept_line_places(anode: str, anode_angle_deg: float, model: str) -> FloatArray:
+    """Height and mean energy (keV) of the lines in each bin of the whole grid (2, n), from the cache or SpekPy."""
     kV = int(min(100.0, MAXIMUM_KV_OF_ANODE[anode]))
     grid = energy_grid_keV(MAXIMUM_KV)
     key: dict[str, object] = {
@@ -247,10 +258,10 @@ def _line_offsets(anode: str, anode_angle_deg: float, model: str) -> FloatArray:
         "anode_angle_deg": anode_angle_deg,
         "model": model,
         "kV": kV,
-        "spekpy": _spekpy_version(),
+        "spekpy": spekpy_version(),
         "lines": f"{grid.size} bins of {BIN_WIDTH_KEV} keV from 1 keV, lines to {_LINE_BIN_KEV} keV",
     }
-    name = f"lines_{anode}_{anode_angle_deg:g}deg_{model}_spekpy{_spekpy_version()}.npz"
+    name = f"lines_{anode}_{anode_angle_deg:g}deg_{model}_spekpy{spekpy_version()}.npz"
     kept = read_kept(name, key, size=grid.size)
     if kept is None:
         import spekpy
@@ -264,7 +275,7 @@ def _line_offsets(anode: str, anode_angle_deg: float, model: str) -> FloatArray:
         energy = np.bincount(place, weights=heights * energies, minlength=grid.size)
         kept = np.array([total, np.divide(energy, total, out=grid.copy(), where=total > 0)])
         keep(name, key, kept)
-    return np.asarray((kept[1] - grid) / BIN_WIDTH_KEV)
+    return kept
 
 
 def _filled(values: FloatArray, size: int) -> FloatArray:
@@ -295,6 +306,15 @@ def _cubic_weights(below: int, share: float, anode: str) -> dict[int, float]:
 
 @lru_cache(maxsize=2048)
 def _tube_node(anode: str, anode_angle_deg: float, model: str, kV: int) -> FloatArray:
+    """Bremsstrahlung and lines (2, n) at a whole kV on the common grid up to it: packaged, from the cache or SpekPy's."""
+    found = packaged_fluence(anode, anode_angle_deg, model, kV)
+    if found is None:
+        found = kept_tube_fluence(anode, anode_angle_deg, model, kV)
+    found.setflags(write=False)
+    return found
+
+
+def kept_tube_fluence(anode: str, anode_angle_deg: float, model: str, kV: int) -> FloatArray:
     """Bremsstrahlung and lines (2, n) at a whole kV on the common grid up to it, from the cache or SpekPy."""
     bins = energy_grid_keV(float(kV)).size
     key: dict[str, object] = {
@@ -302,15 +322,14 @@ def _tube_node(anode: str, anode_angle_deg: float, model: str, kV: int) -> Float
         "anode_angle_deg": anode_angle_deg,
         "model": model,
         "kV": kV,
-        "spekpy": _spekpy_version(),
+        "spekpy": spekpy_version(),
         "grid": f"{bins} bins of {BIN_WIDTH_KEV} keV from 1 keV",
     }
-    name = f"tube_{anode}_{anode_angle_deg:g}deg_{model}_{kV}kV_spekpy{_spekpy_version()}.npz"
+    name = f"tube_{anode}_{anode_angle_deg:g}deg_{model}_{kV}kV_spekpy{spekpy_version()}.npz"
     kept = read_kept(name, key, size=bins)
     if kept is None:
         kept = _spekpy_fluence(anode, anode_angle_deg, model, kV)
         keep(name, key, kept)
-    kept.setflags(write=False)
     return kept
 
 
@@ -340,10 +359,17 @@ def _spekpy_fluence(anode: str, anode_angle_deg: float, model: str, kV: int) -> 
 
 
 @lru_cache(maxsize=1)
-def _spekpy_version() -> str:
+def spekpy_version() -> str:
+    """Version of the SpekPy that is installed."""
     from importlib.metadata import version
 
     return version("spekpy")
+
+
+def _version_of(anode: str, anode_angle_deg: float, model: str) -> str:
+    """SpekPy's version that the spectra of a tube are of: of the packaged ones where it is among them."""
+    packaged = packaged_version() if packaged_lines(anode, anode_angle_deg, model) is not None else None
+    return packaged or spekpy_version()
 
 
 def checked_kV(kV: float, *, anode: str) -> float:

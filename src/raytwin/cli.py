@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "blind-check": ("blind_check", "the diagnosis on sealed cases of the virtual lab"),
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
+    "explore": ("explore", "a page of settings in the browser: what changes with kV, filter, exposure, product"),
     "export": ("export", "the twin in the form other simulators read"),
     "info": ("info", "what is installed; or a twin in a table"),
 }
@@ -58,7 +59,7 @@ Before any measurement:
 
 # commands that read HDF5 files of others: the library itself may die at damaged ones
 READING = frozenset(
-    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect"}
+    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect", "explore"}
 )
 
 

@@ -48,8 +48,8 @@ def measure_seed(
     """Rows `{quantity, seed, truth, value, low, high}` of one hidden system."""
     rows: list[dict[str, Any]] = []
 
-    def add(quantity: str, truth: float, estimate: dict[str, float] | None, label: str = "") -> None:
-        if estimate is not None:
+    def add(quantity: str, truth: float | None, estimate: dict[str, float] | None, label: str = "") -> None:
+        if estimate is not None and truth is not None:
             rows.append({"quantity": quantity, "seed": seed, "label": label, "truth": truth, **estimate})
 
     with tempfile.TemporaryDirectory() as folder:

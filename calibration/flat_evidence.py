@@ -78,7 +78,7 @@ def flat_evidence(
     lit = [place for place, source in enumerate(in_use) if source.group >= 0]
     correlation = correlation_of_quanta(
         [in_use[place].power for place in lit],
-        [fit.expected_DN2[place] for place in lit],
+        [fit.expected_DN2[place] + fit.slow_DN2[place] for place in lit],
         [fit.quanta_DN2[place] for place in lit],
         unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
     )

@@ -497,7 +497,7 @@ def correlation_of_quanta(
 
     Args:
         powers: of series with signal.
-        expected_DN2: their fitted power (K + 1, K + 1) as squares show it, electronic noise included.
+        expected_DN2: their fitted power (K + 1, K + 1) as squares show it, with electronic noise and slow changes.
         quanta_DN2: fitted power of what follows the signal (K + 1, K + 1), not smeared.
         unseen_sd: relative standard deviation of the fitted power at frequencies that were not measured.
         reach: largest lag, px.

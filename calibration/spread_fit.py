@@ -91,7 +91,8 @@ class SpreadFit:
     in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
     excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its
     standard deviation; criteria (family -> twice the logarithm of the best family's evidence over its own); expected_DN2: power of
-    each series as squares show it; quanta_DN2: that of what follows the signal, not smeared.
+    each series as squares show it; quanta_DN2: that of what follows the signal, not smeared; slow_DN2:
+    that of slow changes, which expected_DN2 leaves out.
     """
 
     spread: Spread
@@ -114,6 +115,7 @@ class SpreadFit:
     criteria: dict[str, float]
     expected_DN2: tuple[FloatArray, ...] = field(repr=False)
     quanta_DN2: tuple[FloatArray, ...] = field(repr=False)
+    slow_DN2: tuple[FloatArray, ...] = field(repr=False)
 
     @property
     def sigma_px(self) -> float:
@@ -724,6 +726,7 @@ def fit_spread(
         },
         expected_DN2=expected,
         quanta_DN2=_quanta(problem, chosen),
+        slow_DN2=_slow_changes(problem, chosen),
     )
 
 
@@ -835,6 +838,16 @@ def _quanta(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
     )
 
 
+def _slow_changes(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:
+    """Fitted power (K + 1, K + 1) of slow changes in each series."""
+    result = [np.zeros(one.power_DN2.shape) for one in problem.series]
+    for order, number in enumerate(problem.drifting):
+        place = 2 * problem.groups + 1 + 2 * order
+        slow = _slow(problem.series[number].square_px)
+        result[number] = np.tensordot(item.coefficients[place : place + 2], slow, axes=1)
+    return tuple(result)
+
+
 def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]) -> tuple[float, float]:
     """Gain by extrapolation of the low-frequency power to 0, over the fit's, and its standard deviation.
 
@@ -843,8 +856,8 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
     """
     rows, weights, values = [], [], []
     read = float(item.coefficients[2 * problem.groups])
-    lit = list(problem.drifting)
-    for number, (one, group, power) in enumerate(zip(problem.series, problem.group, expected, strict=True)):
+    every = zip(problem.series, problem.group, expected, _slow_changes(problem, item), strict=True)
+    for one, group, power, slow in every:
         if group < 0:
             continue
         frequency = np.arange(power.shape[0]) / one.square_px
@@ -853,13 +866,9 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
         band = one.used & (square < _LOW_BAND**2) & (power > electronic)
         if not band.any():
             continue
-        excess = np.zeros(power.shape)
-        if number in lit:
-            place = 2 * problem.groups + 1 + 2 * lit.index(number)
-            excess = np.tensordot(item.coefficients[place : place + 2], _slow(one.square_px), axes=1)
         quanta = (power - electronic)[band]
-        values.append((one.power_DN2 - power - excess)[band] / quanta)
-        weights.append(one.modes[band] * (quanta / power[band]) ** 2)
+        values.append((one.power_DN2 - power - slow)[band] / quanta)
+        weights.append(one.modes[band] * (quanta / (power + slow)[band]) ** 2)
         grid = np.broadcast_arrays(frequency[:, None] ** 2, frequency[None, :] ** 2)
         rows.append(np.column_stack([np.ones(quanta.size), grid[0][band], grid[1][band]]))
     if not rows:

@@ -399,12 +399,13 @@ def electronic_shape(darks: Sequence[NoisePower], side: int) -> FloatArray:
     (1994) 425).
     """
     shape = np.ones((side // 2 + 1, side // 2 + 1))
-    if not darks:
-        return shape
     used = usable(side)
-    modes = np.sum([item.modes[used] for item in darks], axis=0)
-    over_median = [item.power_DN2[used] / max(float(np.median(item.power_DN2[used])), 1e-300) for item in darks]
-    power = np.sum([item.modes[used] * own for item, own in zip(darks, over_median, strict=True)], axis=0) / modes
+    medians = [(item, float(np.median(item.power_DN2[used]))) for item in darks]
+    alive = [(item, median) for item, median in medians if median > 0]  # darks of zeros have no shape
+    if not alive:
+        return shape
+    modes = np.sum([item.modes[used] for item, _ in alive], axis=0)
+    power = np.sum([item.modes[used] * item.power_DN2[used] / median for item, median in alive], axis=0) / modes
     root_variance = 1.0 / (9.0 * modes)
     departure = (np.cbrt(power) - (1.0 - root_variance)) / np.sqrt(root_variance)
     lines = np.abs(departure) > math.sqrt(2.0 * math.log(power.size))

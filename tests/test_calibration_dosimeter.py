@@ -324,7 +324,7 @@ def test_a_bad_table_is_told_in_one_line(tmp_path, capsys, option, text, expecte
 def test_the_page_of_the_dosimeter_runs_as_it_is_written(tmp_path, capsys, monkeypatch):
     page = (Path(__file__).parents[1] / "docs" / "dosimeter.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    Path("doses.csv").write_text(re.search(r"```csv\n(.*?)```", page, re.DOTALL).group(1))
+    Path("doses.csv").write_text(re.search(r"```text\n(.*?)```", page, re.DOTALL).group(1))
     answers = {}
     for line in re.search(r"```bash\n(.*?)```", page, re.DOTALL).group(1).splitlines():
         words = shlex.split(line)[1:]

@@ -80,6 +80,7 @@ def test_the_family_follows_the_evidence():
     assert tailed.criteria["Gaussian, light collected in pixels"] > 100.0
 
 
+@pytest.mark.slow
 def test_stated_standard_deviations_are_those_of_repetition():
     """Spread of 16 repetitions against the stated one: chi-square with 15 degrees below its 99.9 %; the white part's prior and
     other families may widen what is stated."""

@@ -256,6 +256,7 @@ def test_a_wedge_that_says_nothing_is_left_out_with_the_reason(tmp_path, line, m
     assert message in found.skipped
 
 
+@pytest.mark.slow
 def test_wedges_with_scatter_are_left_out_with_a_warning(tmp_path, line):
     # twice the thickness is stated: what scatter does to a thick step, too much signal behind it
     thickness = np.where(steps_map() > 0, 2.0 * steps_map(), 0.0).astype(np.float32)

@@ -691,6 +691,7 @@ def test_the_table_and_the_page_hold_every_case_and_nothing_from_outside(many, t
     assert summary_text(result).startswith("300 sealed sessions of the virtual lab were diagnosed")
 
 
+@pytest.mark.slow
 def test_a_page_is_written_for_a_single_case_too(tmp_path):
     _, check = checked(tmp_path / "check", BlindOptions(cases=1, seed=FRESH))
     result = score_check(check)

@@ -215,6 +215,7 @@ def test_images_of_the_two_twins_differ_by_the_effect(line, twin, tmp_path, stan
     assert np.all(np.asarray(lower) > 0.01)
 
 
+@pytest.mark.slow
 def test_an_effect_that_changes_no_image_leaves_a90_as_it_was_and_says_so(line, twin, tmp_path, stand_in):
     after = with_effect(twin, "image_lag", 1.0)
     found = run_task(twin, after, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=TaskPlan())
@@ -242,6 +243,7 @@ def test_sizes_that_all_are_detected_at_give_null_with_a_warning(line, twin, tmp
     assert "none that the data support" in task_text(found)
 
 
+@pytest.mark.slow
 def test_too_few_measured_images_to_learn_from_leave_the_improved_twins_networks(
     line, twin, tmp_path, stand_in, monkeypatch
 ):

@@ -70,6 +70,7 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     assert [effect.id for effect in read_twin(sessions / "again" / "twin.h5").effects] == ["excess_noise"]
 
 
+@pytest.mark.slow
 def test_session_without_effect_is_not_explained_by_one(sessions, capsys):
     found = diagnose(sessions, capsys, "null")
     assert found["verdict"] in ("no_gap", "ambiguous")

@@ -99,6 +99,7 @@ def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path
     assert "means of 2 x 2 pixels" in (tmp_path / "answer" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_path, capsys):
     import h5py
 
@@ -129,6 +130,7 @@ def test_a_long_line_is_refused_as_a_line_and_a_small_series_is_left_out(tmp_pat
     assert "at least 16 rows and columns" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_plan_of_a_large_panel_is_in_its_own_pixels(tmp_path, capsys, monkeypatch):
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "6", "--products", "1"]

@@ -18,6 +18,8 @@ from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.series import SeriesRequest, expected_series
 from raytwin.generator.twin_io import read_twin
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):

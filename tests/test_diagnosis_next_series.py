@@ -38,6 +38,7 @@ def explanation(diagnosis, *effects):
     return {effect: (found.variants[effect], found.strengths[effect][0]) for effect in effects}
 
 
+@pytest.mark.slow
 def test_a_session_of_flats_and_products_lacks_all_that_isolates_effects(diagnosis):
     planned = measurements_lacking(diagnosis.problem)
     assert tuple(item.name for item in planned) == ALL

@@ -110,6 +110,7 @@ def test_right_labels_raise_no_doubt(session):
     assert found.unusable == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [

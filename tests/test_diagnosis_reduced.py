@@ -194,6 +194,7 @@ def test_single_frames_with_a_twin_are_judged_and_lines_seen_as_they_stand_in_on
     assert "composition_error" in untested(answer)
 
 
+@pytest.mark.slow
 def test_images_divided_by_their_open_field_are_compared_alike_as_light_shares_and_logarithms(diagnosed, line):
     words = ("--twin", str(line / "twin.h5"))
     answers = []
@@ -225,6 +226,7 @@ def test_a_session_in_fractions_of_its_brightest_flat_is_refused_with_what_to_do
     assert "multiply all frames of the file by one factor, darks included, for example 10000" in lines[0]
 
 
+@pytest.mark.slow
 def test_one_dark_of_zeros_among_others_is_a_failure_to_read_it(diagnosed):
     def change(file):
         file["series"]["dark_25ms"]["frames"][...] = 0
@@ -241,6 +243,7 @@ def test_objects_and_darks_without_flats_are_judged_with_a_twin(diagnosed, line)
     assert not {"row_noise", "object_scatter"} & untested(answer)
 
 
+@pytest.mark.slow
 def test_a_session_is_compared_with_a_twin_of_its_own_as_without_one(diagnosed, line, tmp_path):
     shutil.copy(line / "session.h5", tmp_path / "plain.h5")
     with h5py.File(tmp_path / "plain.h5", "r+") as file:
@@ -280,6 +283,7 @@ def test_a_twin_knows_the_frames_it_was_made_of(line, tmp_path):
         assert not made_of(twin, acquisition.series)
 
 
+@pytest.mark.slow
 def test_a_fading_ghost_is_no_noise_that_another_days_darks_may_lie_within(tmp_path):
     words = ["--protocol", "full", "--seed", "2942", "--size", "48", "--frames", "4", "--effect", "image_lag=2"]
     for day in ("0", "1"):
@@ -292,6 +296,7 @@ def test_a_fading_ghost_is_no_noise_that_another_days_darks_may_lie_within(tmp_p
         assert not made_of(twin, acquisition.series)
 
 
+@pytest.mark.slow
 def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
     session = tmp_path / "bent.h5"
     words = [
@@ -320,6 +325,7 @@ def test_products_at_two_exposures_tell_a_bent_line(line, tmp_path, capsys):
     assert strength["low"] < 3.0 < strength["high"]
 
 
+@pytest.mark.slow
 def test_the_back_layer_of_a_panel_is_no_mislabelled_front(diagnosed, line, tmp_path):
     def with_back_layer(file):
         for name in list(file["series"]):
@@ -341,6 +347,7 @@ def test_the_back_layer_of_a_panel_is_no_mislabelled_front(diagnosed, line, tmp_
     ]
 
 
+@pytest.mark.slow
 def test_a_dark_with_the_beam_on_is_found_among_objects_without_flats(diagnosed, line):
     def change(file):
         only("dark", "object")(file)
@@ -414,6 +421,7 @@ def test_a_session_of_saturated_flats_says_so(diagnosed):
     assert "every pixel of every frame is 65535 DN and" in lines[0]
 
 
+@pytest.mark.slow
 def test_series_without_light_is_left_out_and_the_rest_is_judged(diagnosed):
     def change(file):
         file["series"][f"{FLAT_40}_2"]["frames"][...] = 0
@@ -459,6 +467,7 @@ def test_wrong_label_is_said_first_and_no_effect_is_named(diagnosed, tmp_path):
     assert read_twin(tmp_path / "answer" / "twin.h5").effects == ()
 
 
+@pytest.mark.slow
 def test_what_a_session_cannot_show_is_listed_with_reasons(diagnosed):
     code, answer, _ = diagnosed(only("dark", "flat"))
     assert code == 0
@@ -508,6 +517,7 @@ def test_beam_off_frames_follow_straight_after_the_exposure_where_no_times_are_s
     assert starts["later"] > starts["after"] + 0.4 + 0.5
 
 
+@pytest.mark.slow
 def test_pauses_that_no_session_states_are_sought_with_a_lag_and_those_it_states_are_not(line, tmp_path):
     timeless = tmp_path / "timeless.h5"
     shutil.copy(line / "session.h5", timeless)
@@ -593,6 +603,7 @@ def test_a_heel_that_was_always_there_is_named_with_a_twin_from_another_session(
     assert leading["strength"]["value"] == pytest.approx(12.0, abs=2.5)
 
 
+@pytest.mark.slow
 def test_beams_that_no_series_calibrated_move_where_the_spectrums_lines_are_drawn(line, tmp_path):
     shutil.copy(line / "session.h5", tmp_path / "one.h5")
     with h5py.File(tmp_path / "one.h5", "r+") as file:

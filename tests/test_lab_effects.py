@@ -145,6 +145,7 @@ def test_output_drift_has_its_rms_over_the_frames_of_the_session():
 # --- object -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_scatter_behind_20_mm_of_water_has_its_strength_over_primary_on_the_mean_of_both_kV():
     system = system_on("coarse")
     line, bare = line_with("object_scatter=20", system=system), line_with(None, system=system)

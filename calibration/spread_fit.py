@@ -48,7 +48,7 @@ _STARTS = (
     {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},
 )
-# Logarithm of a tail's reach, px, any value between these equally likely: averaged over at steps of a factor of 1.5, which change
+# Logarithm of a tail's reach, px, any reach between these equally likely: averaged over at steps of a factor of 1.5, which change
 # the gain by less than a share is known to; where it is known better than that, at steps of its standard deviation.
 _LOG_REACH = (math.log(0.25), math.log(_LONGEST_TAIL_PX))
 _REACH_STEP = math.log(1.5)
@@ -58,10 +58,10 @@ _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
 _LEAST_SD, _MOST_SD = 0.005, 0.15  # of the share between such steps
-# A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
-# deviation of the mean adds an eighth to that.
+# A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within a quarter of a standard
+# deviation of the mean adds a thirtieth to that.
 _AS_LIKELY = 2.0 * math.log(10.0)
-_NEAR_THE_MEAN = 0.5
+_NEAR_THE_MEAN = 0.25
 _WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
 _TAIL = ("tail_share", "log_tail_px")
 _LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
@@ -576,17 +576,17 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
     for family in families:
         names = _FAMILIES[family][2]
         share_at = names.index("tail_share")
-        for reach_width, best in _of_reaches(problem, family):
+        for reach_mass, best in _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             sd = min(max(math.sqrt(max(variance, 0.0)), _LEAST_SD), _MOST_SD)
             for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
                 density = (1.0 - _NO_TAIL) * _share_density(share)
-                mass = width * density * reach_width / (_LOG_REACH[1] - _LOG_REACH[0]) / len(families)
+                mass = width * density * reach_mass / len(families)
                 yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, share)
 
 
 def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]]:
-    """The best spread of a family at each of some reaches of the tail, with the width of log reach that it stands for."""
+    """The best spread of a family at each of some reaches of the tail, with its share of all reaches."""
     place = _FAMILIES[family][2].index("log_tail_px")
     count = 1 + math.ceil((_LOG_REACH[1] - _LOG_REACH[0]) / _REACH_STEP)
     grid = np.linspace(*_LOG_REACH, count)
@@ -597,7 +597,7 @@ def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]
         for start in starts:
             start[place] = reach
         item = _fitted(problem, family, starts, fixed=("log_tail_px",))
-        found.append((step if grid[0] < reach < grid[-1] else 0.5 * step, item))
+        found.append((_reach_mass(float(reach), step if grid[0] < reach < grid[-1] else 0.5 * step), item))
         starts = [item.theta.copy()]
     best = min((item for _, item in found), key=lambda item: item.chi_square)
     free = _fitted(problem, family, [best.theta])
@@ -608,8 +608,13 @@ def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]
     for reach, width in _steps(float(free.theta[place]), sd, _LOG_REACH):
         theta = free.theta.copy()
         theta[place] = reach
-        sharp.append((width, _fitted(problem, family, [theta], fixed=("log_tail_px",))))
+        sharp.append((_reach_mass(reach, width), _fitted(problem, family, [theta], fixed=("log_tail_px",))))
     return sharp
+
+
+def _reach_mass(log_reach: float, width: float) -> float:
+    """Share of all reaches that lie within a width of the logarithm about this one."""
+    return math.exp(log_reach) * width / (math.exp(_LOG_REACH[1]) - math.exp(_LOG_REACH[0]))
 
 
 def _steps(middle: float, sd: float, bounds: tuple[float, float]) -> list[tuple[float, float]]:

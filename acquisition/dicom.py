@@ -161,8 +161,12 @@ def _write(
 ) -> dict[str, Any]:
     told = agreement([header for _, header in group.files]).values
     dark = group.kind == "dark"
-    setting = {word: told.get(word) for word in SETTING_WORDS if not (dark and word in ("kV", "current_mA", "filters"))}
-    distances = {word: told.get(word) or None for word in ("source_object_mm", "source_detector_mm") if word in varying}
+    setting: dict[str, Any] = {
+        word: told.get(word) for word in SETTING_WORDS if not (dark and word in ("kV", "current_mA", "filters"))
+    }
+    distances: dict[str, Any] = {
+        word: told.get(word) or None for word in ("source_object_mm", "source_detector_mm") if word in varying
+    }
     folder = group.files[0][0].parent
     label = group.first.label or (folder.name if folder != root else group.files[0][0].stem)
     scene = re.sub(r"[/\s]+", "_", label.strip()) if group.kind == "object" else ""

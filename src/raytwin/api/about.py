@@ -29,6 +29,7 @@ _EXTRAS = {
     "fits": ("astropy",),
     "dicom": ("pydicom",),
     "fabio": ("fabio",),
+    "meshes": ("trimesh",),
 }
 _LIBRARIES = (
     "numpy",

@@ -31,6 +31,7 @@ _CODECS = {
 # keys of EDF headers, in small letters: SAXS keys of ESRF ID02 (seconds, metres), Lima (seconds), SPEC
 _EXPOSURE_S = ("exposuretime", "acq_expo_time", "exposure_time", "exposure", "count_time", "exposuretime_s")
 _PIXEL_M = ("psize_1", "pixelsize_1")
+_CBF_MARK = b"\x0c\x1a\x04\xd5"
 _CBF_EXPOSURE = re.compile(r"Exposure_time\s+([\d.eE+-]+)\s*s")
 _CBF_PERIOD = re.compile(r"Exposure_period\s+([\d.eE+-]+)\s*s")
 _CBF_PIXEL = re.compile(r"Pixel_size\s+([\d.eE+-]+)\s*m")
@@ -119,6 +120,9 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
+            # without the mark before its data fabio looks for it for ever
+            if path.suffix.lower() == ".cbf" and _CBF_MARK not in path.read_bytes():
+                raise ValueError("no binary section")
             image = fabio.factory(_CODECS[path.suffix.lower()]).read(str(path))
             try:
                 yield image, faults

@@ -31,7 +31,8 @@ _CODECS = {
 # keys of EDF headers, in small letters: SAXS keys of ESRF ID02 (seconds, metres), Lima (seconds), SPEC
 _EXPOSURE_S = ("exposuretime", "acq_expo_time", "exposure_time", "exposure", "count_time", "exposuretime_s")
 _PIXEL_M = ("psize_1", "pixelsize_1")
-_CBF_MARK = b"\x0c\x1a\x04\xd5"
+_CBF_SECTION = b"--CIF-BINARY-FORMAT-SECTION--"
+_CBF_MARK = b"\x0c\x1a\x04\xd5"  # ends the header of the binary section
 _CBF_EXPOSURE = re.compile(r"Exposure_time\s+([\d.eE+-]+)\s*s")
 _CBF_PERIOD = re.compile(r"Exposure_period\s+([\d.eE+-]+)\s*s")
 _CBF_PIXEL = re.compile(r"Pixel_size\s+([\d.eE+-]+)\s*m")
@@ -104,6 +105,14 @@ class _Keep(logging.Handler):
         self._faults.append(record.getMessage())
 
 
+def _check_cbf(path: Path) -> None:
+    """Refuse a CBF file without binary section or its mark: fabio would look for the mark for ever."""
+    data = path.read_bytes()
+    section = data.find(_CBF_SECTION)
+    if section < 0 or data.find(_CBF_MARK, section) < 0:
+        raise ValueError("no binary section")
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
     """The open file, and a list that takes what fabio logs as an error: it fills up what is missing with zeros."""
@@ -120,9 +129,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            # without the mark before its data fabio looks for it for ever
-            if path.suffix.lower() == ".cbf" and _CBF_MARK not in path.read_bytes():
-                raise ValueError("no binary section")
+            if path.suffix.lower() == ".cbf":
+                _check_cbf(path)
             image = fabio.factory(_CODECS[path.suffix.lower()]).read(str(path))
             try:
                 yield image, faults

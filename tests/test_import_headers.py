@@ -229,6 +229,9 @@ def test_edf_and_cbf_come_in_with_their_exposure(tmp_path, capsys):
     whole = (folder / "flat.edf").read_bytes()
     (folder / "flat.edf").write_bytes(whole[: len(whole) - 300])
     assert "flat.edf" in refused(capsys, "images", folder, out=tmp_path / "p.h5")
+    (folder / "flat.edf").write_bytes(whole)
+    (folder / "sample.cbf").write_bytes((folder / "sample.cbf").read_bytes()[:250])
+    assert "no binary section" in refused(capsys, "images", folder, out=tmp_path / "p.h5")
 
 
 # HIS of Varex panels

@@ -125,6 +125,7 @@ def _header(tags: Any) -> ImageHeader:
         number=_whole(tags, "InstanceNumber"),
         shape=(int(tags.Rows), int(tags.Columns)) if "Rows" in tags and "Columns" in tags else None,
         series=str(tags.get("SeriesInstanceUID", "") or ""),
+        series_number=_whole(tags, "SeriesNumber"),
         label=" ".join(word for word in words if word),
         notes=tuple(notes),
     )

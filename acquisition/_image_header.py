@@ -39,7 +39,8 @@ class ImageHeader:
     Fields: kV; current_mA; exposure_ms (of one frame); filters (in the beam's order; () = none); averaged; frame_interval_ms;
     anode (symbol); pixel_mm (pitch of the detector); bits; focal_spot_mm; source_detector_mm; source_object_mm; corrected
     (subset of `offset`, `gain`, `defects`, or None); time_s (of the first frame, by the file's clock); number (of the file in
-    its series); series (identifier of the series); label (text by which people know it); notes (what was not understood).
+    its series); series (identifier of the series); series_number (its place); label (text by
+    which people know it); notes (what was not understood).
     """
 
     kV: float | None = None
@@ -59,6 +60,7 @@ class ImageHeader:
     number: int | None = None
     shape: tuple[int, int] | None = None
     series: str = ""
+    series_number: int | None = None
     label: str = ""
     notes: tuple[str, ...] = ()
 

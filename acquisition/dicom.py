@@ -40,10 +40,12 @@ class _Group:
         return str(self.key[-1])
 
     @property
-    def started(self) -> tuple[float, tuple[Any, ...]]:
-        """Sorts groups in time, those without a clock by their names."""
+    def started(self) -> tuple[float, float, tuple[Any, ...]]:
+        """Sorts groups in time, those without a clock by the number of their series, then by their names."""
         times = [header.time_s for _, header in self.files if header.time_s is not None]
-        return (min(times) if times else float("inf")), natural_key(self.files[0][0])
+        number = self.first.series_number
+        infinite = float("inf")
+        return min(times, default=infinite), infinite if number is None else number, natural_key(self.files[0][0])
 
 
 def import_dicom(

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,9 @@ HDF5_ERRORS = (
     MemoryError,
     SystemError,
 )
+
+# what viewers (h5web, silx) look at to show a file's arrays as pictures: words of NeXus, no measurements
+NEXUS_WORDS = frozenset({"NX_class", "default", "signal", "axes", "auxiliary_signals", "interpretation"})
 
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
@@ -144,9 +147,9 @@ def _attribute(node: Any, name: str, *, where: str) -> Any:
 
 
 def plain_attributes(node: Any, *, where: str) -> Mapping[str, Any]:
-    """All attributes as Python values, in a new dictionary."""
+    """All attributes as Python values, in a new dictionary; words for viewers are left out."""
     with reading(where):
-        return {name: _plain(_attribute(node, name, where=where)) for name in node.attrs}
+        return {name: _plain(_attribute(node, name, where=where)) for name in node.attrs if name not in NEXUS_WORDS}
 
 
 def _plain(value: Any) -> Any:
@@ -208,3 +211,42 @@ def frames_per_piece(*, chunk_frames: int | None, frame_bytes: int, maximum_byte
     if chunk_frames * frame_bytes > 4 * maximum_bytes:
         return fitting
     return max(chunk_frames, fitting // chunk_frames * chunk_frames)
+
+
+def format_of_file(path: str | os.PathLike[str]) -> str | None:
+    """The root attribute `format` of an HDF5 file; None where it is no such file or has none."""
+    try:
+        with h5py.File(path, "r") as file:
+            return text_attribute(file, "format", where=str(path))
+    except (*HDF5_ERRORS, InputError):
+        return None
+
+
+def mark_as_pictures(group: Any, signal: str, *, others: Sequence[str] = (), axes: Sequence[str] = ()) -> None:
+    """Say to viewers that an array of a group is what to show, as a picture or a stack of them.
+
+    Args:
+        group: that holds the arrays.
+        signal: name of the array (..., row, column).
+        others: arrays of the same shape that are shown beside it.
+        axes: names of the arrays along its axes, `.` where there is none; empty: none.
+
+    Source: NeXus, base class NXdata.
+    """
+    group.attrs["NX_class"] = "NXdata"
+    group.attrs["signal"] = signal
+    if others:
+        group.attrs["auxiliary_signals"] = list(others)
+    if axes:
+        group.attrs["axes"] = list(axes)
+    for name in (signal, *others):
+        group[name].attrs["interpretation"] = "image"
+
+
+def mark_as_entry(group: Any, default: str) -> None:
+    """Say to viewers which member of a group to open first.
+
+    Source: NeXus, base class NXentry.
+    """
+    group.attrs["NX_class"] = "NXentry"
+    group.attrs["default"] = default

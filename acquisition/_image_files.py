@@ -1,4 +1,4 @@
-"""Images out of TIFF, PNG, FITS and raw files, one at a time; every fault names the file."""
+"""Images out of TIFF, PNG, FITS, DICOM, HIS, EDF and raw files, one at a time; every fault names the file."""
 
 import logging
 import math
@@ -13,12 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileFormatError, InputError, MissingDependencyError
+from ..errors import FileFormatError, InputError
+from ._picture_checks import damaged, missing_library, one_channel
 
 TIFF_ENDINGS = (".tif", ".tiff")
 RAW_ENDINGS = (".raw", ".bin", ".img")
 FITS_ENDINGS = (".fits", ".fit", ".fts")
-IMAGE_ENDINGS = (*TIFF_ENDINGS, ".png", ".bmp", *RAW_ENDINGS, *FITS_ENDINGS)
+DICOM_ENDINGS = (".dcm", ".dicom", ".dic", ".dcn")
+HIS_ENDINGS = (".his",)
+# of the formats that fabio knows: those whose ending says which one it is
+FABIO_ENDINGS = (".edf", ".cbf", ".mccd", ".spe", ".mar1200", ".mar1600", ".mar2300", ".mar3450", ".kcd", ".esper")
+IMAGE_ENDINGS = (
+    *(*TIFF_ENDINGS, ".png", ".bmp", *RAW_ENDINGS, *FITS_ENDINGS),
+    *(*DICOM_ENDINGS, *HIS_ENDINGS, *FABIO_ENDINGS),
+)
 # TIFF tags that say where the numbers of a picture lie and how to read them; any other may be broken without harm
 _TIFF_TAGS_THAT_COUNT = frozenset(
     {
@@ -103,11 +111,25 @@ def iter_images(path: Path, *, raw: RawLayout | None = None) -> Iterator[NDArray
         yield from _fits_planes(path)
     elif ending in RAW_ENDINGS:
         yield from _raw_images(path, raw)
+    elif ending in DICOM_ENDINGS:
+        from ._dicom_files import iter_dicom
+
+        yield from iter_dicom(path)
+    elif ending in HIS_ENDINGS:
+        from ._his_files import iter_his
+
+        yield from iter_his(path)
+    elif ending in FABIO_ENDINGS:
+        from ._fabio_files import iter_fabio
+
+        yield from iter_fabio(path)
     elif ending in (".png", ".bmp"):
-        yield _one_channel(path, _decoded(path))
+        yield one_channel(path, _decoded(path))
     else:
         raise FileFormatError(
-            str(path), received=f"a file {ending or 'without ending'}", expected="TIFF, PNG, FITS or raw"
+            str(path),
+            received=f"a file {ending or 'without ending'}",
+            expected="TIFF, PNG, FITS, DICOM, HIS, EDF or raw",
         )
 
 
@@ -140,7 +162,7 @@ def _decoded(path: Path) -> NDArray[Any]:
             warnings.simplefilter("error")
             return np.asarray(imageio.imread(path))
     except Exception as error:  # the decoders behind imageio raise whatever they like at damaged files
-        raise _damaged(path, error) from None
+        raise damaged(path, error) from None
 
 
 @contextmanager
@@ -174,9 +196,7 @@ def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
     try:
         from astropy.io import fits
     except ImportError:
-        raise MissingDependencyError(
-            f"{path}: got a FITS file; expected the library that reads it; install it with `pip install 'raytwin[fits]'`"
-        ) from None
+        raise missing_library(path, what="a FITS file", extra="fits") from None
     try:
         with warnings.catch_warnings():
             # a file that was cut off is read with a warning and zeros in place of what is missing
@@ -188,7 +208,7 @@ def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
                 # BZERO makes whole numbers of what FITS has no type for: unsigned ones
                 values = np.asarray(found.data)
     except Exception as error:  # astropy raises whatever it likes at damaged files
-        raise _damaged(path, error) from None
+        raise damaged(path, error) from None
     values = values.astype(values.dtype.newbyteorder("="), copy=False)
     if values.ndim == 2:
         values = values[None]
@@ -197,7 +217,7 @@ def _fits_planes(path: Path) -> Iterator[NDArray[Any]]:
             str(path), received=f"an array of {values.ndim} axes", expected="an image (row, column) or a stack of them"
         )
     for plane in values:
-        yield _one_channel(path, plane)
+        yield one_channel(path, plane)
 
 
 def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
@@ -214,30 +234,15 @@ def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
                 whole = np.asarray(series.asarray())
                 pages = iter([whole] if whole.ndim == 2 or _is_colour(whole) else whole)
             for page in pages:
-                yield _one_channel(path, np.asarray(page))
+                yield one_channel(path, np.asarray(page))
     except (InputError, GeneratorExit):
         raise
     except Exception as error:  # tifffile raises struct, value, index and codec errors at damaged files
-        raise _damaged(path, error) from None
+        raise damaged(path, error) from None
 
 
 def _is_colour(values: NDArray[Any]) -> bool:
     return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
-
-
-def _one_channel(path: Path, values: NDArray[Any]) -> NDArray[Any]:
-    if values.ndim == 3 and values.shape[-1] in (3, 4) and bool(np.all(values[..., :3] == values[..., :1])):
-        values = values[..., 0]  # grey, stored as colour
-    if values.ndim != 2:
-        raise FileFormatError(
-            str(path),
-            received=f"an image of shape {values.shape}",
-            expected="one grey value a pixel",
-            remedy="export the detector's own numbers, not a colour picture",
-        )
-    if values.dtype.kind not in "iufb":
-        raise FileFormatError(str(path), received=f"values of type {values.dtype}", expected="numbers")
-    return values
 
 
 def _raw_images(path: Path, raw: RawLayout | None) -> Iterator[NDArray[Any]]:
@@ -262,15 +267,6 @@ def _raw_images(path: Path, raw: RawLayout | None) -> Iterator[NDArray[Any]]:
         for _ in range(size // image_bytes):
             values = np.frombuffer(stream.read(image_bytes), dtype=dtype).reshape(raw.rows, raw.columns)
             yield values.astype(dtype.newbyteorder("="))
-
-
-def _damaged(path: Path, error: Exception) -> FileFormatError:
-    return FileFormatError(
-        str(path),
-        received=f"{path.stat().st_size} bytes that cannot be decoded ({error or type(error).__name__})",
-        expected="a complete image file",
-        remedy="the file looks truncated or damaged: copy or export it again",
-    )
 
 
 def frame_dtype(image: NDArray[Any]) -> type[Any]:

@@ -19,6 +19,8 @@ from ._hdf5 import (
     check_stored,
     child,
     frames_per_piece,
+    mark_as_entry,
+    mark_as_pictures,
     number_attribute,
     open_hdf5,
     plain_attributes,
@@ -619,8 +621,10 @@ class SeriesWriter:
         self._time_s += times
 
     def _finish(self) -> None:
+        timed = len(self._time_s) == self.n_frames > 0
         if self._time_s:
             self._group.create_dataset("time_s", data=np.asarray(self._time_s, dtype=np.float64))
+        mark_as_pictures(self._group, "frames", axes=("time_s", ".", ".") if timed else ())
 
 
 class AcquisitionWriter:
@@ -811,6 +815,17 @@ class AcquisitionWriter:
     def _finish(self) -> None:
         for writer in self._writers:
             writer._finish()
+        if self._writers:
+            # a flat shows more than a dark does
+            shown = [name for name in self._series if self._series[name].attrs["kind"] in ("flat", "object")]
+            mark_as_entry(self._series, next(iter(shown), self._writers[0].name))
+        for group in self._scenes.values():
+            maps = list(group.get("thickness_mm", ()))
+            if maps:
+                mark_as_pictures(group["thickness_mm"], maps[0], others=maps[1:])
+            masks = [name for name in ("foreign_object_mask", "product_mask") if name in group]
+            if masks:
+                mark_as_pictures(group, masks[0], others=masks[1:])
 
 
 @contextmanager
@@ -831,6 +846,7 @@ def write_acquisition(
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
+        file.attrs.update({"NX_class": "NXroot", "default": "series"})
         _write_instrument(file.create_group("instrument"), instrument or Instrument())
         writer = AcquisitionWriter(file, compression=compression)
         yield writer

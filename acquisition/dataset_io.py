@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
-from ._hdf5 import check_format, check_stored, child, open_hdf5, plain_attributes, reading
+from ._hdf5 import check_format, check_stored, child, mark_as_pictures, open_hdf5, plain_attributes, reading
 
 FORMAT = "raytwin-dataset"
 VERSION = 1
@@ -344,6 +344,11 @@ class DatasetWriter:
         self._rows.append(row)
 
     def _finish(self) -> None:
+        # the arrays lie at the root, which is an entry of its own for viewers
+        mark_as_pictures(self._file, "images")
+        for name in ("counts", "foreign_object_masks", "product_masks"):
+            if name in self._file:
+                self._file[name].attrs["interpretation"] = "image"
         group = self._file.create_group("rows")
         for name in _COLUMNS:
             values = [getattr(row, name) for row in self._rows]

@@ -1,4 +1,4 @@
-"""Import of a folder of images (TIFF, PNG, raw) that a sidecar describes.
+"""Import of a folder of images (TIFF, PNG, FITS, DICOM, HIS, EDF, raw) that a sidecar describes.
 
 The sidecar is `raytwin.toml` in the folder:
 
@@ -48,15 +48,29 @@ The sidecar is `raytwin.toml` in the folder:
 Further words of a series: name, index, kV, current_mA, power_W, exposure_ms, filter, averaged, frame_interval_ms,
 belt_speed_mm_s, panel_rotation_deg, source_object_mm, source_detector_mm, photons_per_pixel, scene, corrected
 (`offset+gain`), dtype. A scene that is not `for_each` has a `name`.
+
+What the sidecar leaves open is taken from the headers of DICOM, HIS and EDF files and from the pixel size of OME-TIFF and
+ImageJ files; where both state it, the sidecar counts and the difference is told.
 """
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import FileFormatError, InputError
-from ._image_files import IMAGE_ENDINGS, RawLayout, frame_dtype, iter_images, number_or_nan, read_image, read_mask
+from ._image_files import (
+    IMAGE_ENDINGS,
+    TIFF_ENDINGS,
+    RawLayout,
+    frame_dtype,
+    iter_images,
+    number_or_nan,
+    read_image,
+    read_mask,
+)
+from ._image_header import ImageHeader
 from ._sidecar import (
     NAME,
     check_words,
@@ -71,8 +85,10 @@ from ._sidecar import (
     text_of,
 )
 from .acquisition_io import AcquisitionWriter, SeriesWriter, write_acquisition
+from .image_header import INSTRUMENT_WORDS, SETTING_WORDS, agreement, alike, read_image_header
 from .import_report import ImportReport, Skipped
-from .setting import filters_from_text, setting_from_text
+from .instrument import Instrument
+from .setting import Setting, filters_from_text, setting_from_text, text_from_filters
 
 MINIMAL = "[[series]] kind='flat' files='*.tif' setting='kv=40,power_w=40,exposure_ms=20'"
 
@@ -136,8 +152,11 @@ def import_images(
     )
     images = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_ENDINGS and path.is_file()]
     used = _Used(len(images), progress)
-    with write_acquisition(out, instrument_of(tables, where=NAME)) as writer:
-        read, notes = _write(writer, folder, tables, used)
+    stated = instrument_of(tables, where=NAME)
+    plans = _plans(folder, tables)
+    instrument, notes = _instrument(stated, plans)
+    with write_acquisition(out, instrument) as writer:
+        read, more = _write(writer, folder, tables, plans, used)
     skipped = [
         Skipped(what=path.relative_to(folder).as_posix(), reason="no series or scene of the sidecar names it")
         for path in images
@@ -151,8 +170,101 @@ def import_images(
         read=tuple(read),
         frames=sum(int(entry["frames"]) for entry in read),
         skipped=tuple(skipped),
-        notes=tuple(notes),
+        notes=(*notes, *more),
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plan:
+    """One series to write: its table, where that stands, scene, name, files, and what the files' headers say."""
+
+    table: Mapping[str, Any]
+    where: str
+    scene: str
+    name: str
+    files: list[Path]
+    headers: list[ImageHeader]
+
+
+def _plans(folder: Path, tables: Mapping[str, Any]) -> list[_Plan]:
+    series = tables_of(tables, "series", where=NAME)
+    if not series:
+        raise InputError(NAME, received="no [[series]]", expected="at least one series", remedy=f"at least: {MINIMAL}")
+    plans = []
+    for number, table in enumerate(series, start=1):
+        where = f"{NAME}, series {table.get('name', number)}"
+        check_words(table, _SERIES_WORDS, where=where)
+        for place, scene, name in _places(folder, table, number, where=where):
+            patterns = table.get("files")
+            if not isinstance(patterns, str | list) or not patterns:
+                raise InputError(
+                    f"{where}, files", received=repr(patterns), expected="a pattern such as 'flats/*.tif', or a list"
+                )
+            files = files_matching(place, patterns, where=f"{where}, files")
+            # a TIFF says its pixel size alone: that of the first stands for the series
+            told = [path for path in files if path.suffix.lower() not in TIFF_ENDINGS] or files[:1]
+            headers = [read_image_header(path) for path in told]
+            plans.append(_Plan(table=table, where=where, scene=scene, name=name, files=files, headers=headers))
+    return plans
+
+
+def _instrument(stated: Instrument, plans: list[_Plan]) -> tuple[Instrument, list[str]]:
+    """The sidecar's instrument, with what the files' headers say where it is silent."""
+    found = agreement([header for plan in plans for header in plan.headers])
+    taken, notes = {}, []
+    for word in INSTRUMENT_WORDS:
+        value, own = found.values.get(word), getattr(stated, word)
+        if word in found.differing:
+            notes.append(f"{word}: {_two(found.differing[word])} in the files' headers; neither is taken")
+        elif value and own is None:
+            taken[word] = value
+            notes.append(f"{word} = {value} from the files' headers")
+        elif value and not alike(own, value):
+            notes.append(f"{word}: {own} in the sidecar, {value} in the files' headers; the sidecar counts")
+    return replace(stated, **taken), notes
+
+
+def _two(values: tuple[Any, Any]) -> str:
+    return " and ".join(text_from_filters(one) or "no filter" if isinstance(one, tuple) else f"{one}" for one in values)
+
+
+def _from_headers(plan: _Plan, attributes: dict[str, Any], setting: Setting | None) -> list[str]:
+    """Fill what the sidecar leaves open in a series' attributes with what its files' headers say.
+
+    Raises:
+        FileFormatError: files of several settings in one series, and no word of the sidecar that decides.
+    """
+    found = agreement(plan.headers)
+    notes = [
+        f"series {plan.name}: {text}" for text in dict.fromkeys(note for one in plan.headers for note in one.notes)
+    ]
+    dark = plan.table.get("kind") in ("dark", "afterglow")
+    for word in SETTING_WORDS:
+        if dark and word in ("kV", "current_mA"):
+            continue
+        own = attributes.get(word)
+        load = attributes.get("power_W") if word == "current_mA" else None
+        if setting is not None:
+            own = getattr(setting, word) if word != "filters" else setting.filters
+            load = setting.power_W if word == "current_mA" else None
+            if own is None and word != "frame_interval_ms":
+                continue  # a setting is stated as a whole
+        if word in found.differing and own is None and load is None:
+            raise FileFormatError(
+                f"{plan.where}, {word}",
+                received=f"{_two(found.differing[word])} in the headers of its files",
+                expected="one setting a series",
+                remedy=f"split the series, or state {'filter' if word == 'filters' else word} in the sidecar",
+            )
+        value = found.values.get(word)
+        if value is None or (value == 0 and word != "exposure_ms"):
+            continue
+        if own is None and load is None:
+            attributes[word] = value
+        elif own is not None and not alike(own, value):
+            told = text_from_filters(value) if word == "filters" else value
+            notes.append(f"series {plan.name}: {word} {told or 'none'} in the files' headers; the sidecar counts")
+    return notes
 
 
 class _Used:
@@ -173,18 +285,13 @@ class _Used:
 
 
 def _write(
-    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], used: _Used
+    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], plans: list[_Plan], used: _Used
 ) -> tuple[list[dict[str, Any]], list[str]]:
     raw = raw_layout_of(tables, where=NAME)
-    series = tables_of(tables, "series", where=NAME)
-    if not series:
-        raise InputError(NAME, received="no [[series]]", expected="at least one series", remedy=f"at least: {MINIMAL}")
     read: list[dict[str, Any]] = []
-    for number, table in enumerate(series, start=1):
-        where = f"{NAME}, series {table.get('name', number)}"
-        check_words(table, _SERIES_WORDS, where=where)
-        for place, scene, name in _places(folder, table, number, where=where):
-            read.append(_write_series(writer, place, table, raw, used, scene=scene, name=name, where=where))
+    notes: list[str] = []
+    for plan in plans:
+        read.append(_write_series(writer, plan, raw, used, notes))
     for number, table in enumerate(tables_of(tables, "scene", where=NAME), start=1):
         where = f"{NAME}, scene {table.get('name', number)}"
         check_words(table, _SCENE_WORDS, where=where)
@@ -194,7 +301,8 @@ def _write(
                 raise InputError(where, received="no name", expected="name or for_each")
             _write_scene(writer, place, table, used, known=rows.get(scene, {}), name=scene, where=where)
     named = {entry["scene"] for entry in read if entry["scene"]}
-    return read, [f"scene {scene}: nothing is said about it" for scene in sorted(named - set(writer.scene_names))]
+    notes += [f"scene {scene}: nothing is said about it" for scene in sorted(named - set(writer.scene_names))]
+    return read, notes
 
 
 def _places(folder: Path, table: Mapping[str, Any], number: int, *, where: str) -> Iterator[tuple[Path, str, str]]:
@@ -213,21 +321,9 @@ def _places(folder: Path, table: Mapping[str, Any], number: int, *, where: str) 
 
 
 def _write_series(
-    writer: AcquisitionWriter,
-    place: Path,
-    table: Mapping[str, Any],
-    raw: RawLayout | None,
-    used: _Used,
-    *,
-    scene: str,
-    name: str,
-    where: str,
+    writer: AcquisitionWriter, plan: _Plan, raw: RawLayout | None, used: _Used, notes: list[str]
 ) -> dict[str, Any]:
-    patterns = table.get("files")
-    if not isinstance(patterns, str | list) or not patterns:
-        raise InputError(
-            f"{where}, files", received=repr(patterns), expected="a pattern such as 'flats/*.tif', or a list"
-        )
+    table, where, files = plan.table, plan.where, plan.files
     setting_text = text_of(table, "setting", where=where)
     attributes: dict[str, Any] = {word: number_of(table, word, where=where) for word in (*_NUMBERS, *_WHOLE)}
     for word in _WHOLE:
@@ -236,7 +332,11 @@ def _write_series(
     filter_text = text_of(table, "filter", where=where)
     if filter_text is not None:
         attributes["filters"] = filters_from_text(filter_text)
-    files = files_matching(place, patterns, where=f"{where}, files")
+    setting = None if setting_text is None else setting_from_text(setting_text)
+    corrected = [word for word in (text_of(table, "corrected", where=where) or "").split("+") if word]
+    if "corrected" not in table:
+        corrected = sorted(agreement(plan.headers).values.get("corrected", ()))
+    notes += _from_headers(plan, attributes, setting)
     series: SeriesWriter | None = None
     shape: tuple[int, int] | None = None
     for path in files:
@@ -245,14 +345,14 @@ def _write_series(
             if series is None:
                 shape = (image.shape[0], image.shape[1])
                 series = writer.add_series(
-                    name,
+                    plan.name,
                     kind=text_of(table, "kind", where=where) or "",
                     shape=shape,
                     dtype=text_of(table, "dtype", where=where) or frame_dtype(image),
-                    setting=None if setting_text is None else setting_from_text(setting_text),
-                    scene=scene,
+                    setting=setting,
+                    scene=plan.scene,
                     role=text_of(table, "role", where=where),
-                    corrected=[word for word in (text_of(table, "corrected", where=where) or "").split("+") if word],
+                    corrected=corrected,
                     **attributes,
                 )
             if image.shape != shape:
@@ -269,11 +369,11 @@ def _write_series(
                     str(path), received=error.received, expected=error.expected, remedy=error.remedy
                 ) from None
     entry: dict[str, Any] = {
-        "name": name,
+        "name": plan.name,
         "kind": table.get("kind"),
         "frames": 0 if series is None else series.n_frames,
     }
-    return entry | {"files": len(files), "scene": scene}
+    return entry | {"files": len(files), "scene": plan.scene}
 
 
 def _write_scene(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ._image_files import IMAGE_ENDINGS, RAW_ENDINGS, iter_images, natural_key
+from ._dicom_files import is_dicom
+from ._image_files import DICOM_ENDINGS, IMAGE_ENDINGS, RAW_ENDINGS, iter_images, natural_key
 from ._sidecar import NAME
 from .import_report import ImportReport
 
@@ -19,10 +20,14 @@ _FLAT_WORDS = re.compile(r"flat|^io\d|white|open|bright|gain|air|ff", re.I)
 
 
 def layout_of(place: Path) -> str | None:
-    """`images`, `emva1288`, `nxtomo` or `zenodo`, as `raytwin import` calls it; None: no layout that it reads."""
+    """`images`, `emva1288`, `nxtomo`, `dicom`, `xtekct` or `zenodo`, as `raytwin import` calls it; None: no layout that it reads."""
     if place.is_file():
         if place.name.lower() == "emva1288_data.txt":
             return "emva1288"
+        if place.suffix.lower() == ".xtekct":
+            return "xtekct"
+        if place.suffix.lower() in DICOM_ENDINGS or is_dicom(place):
+            return "dicom"
         return "nxtomo" if place.suffix.lower() in _NEXUS_ENDINGS else None
     if not place.is_dir():
         return None
@@ -33,6 +38,10 @@ def layout_of(place: Path) -> str | None:
         return "emva1288"
     if sum(name.endswith(_NEXUS_ENDINGS) for name in names) == 1:
         return "nxtomo"
+    if sum(name.endswith(".xtekct") for name in names) == 1:
+        return "xtekct"
+    if any(path.suffix.lower() in DICOM_ENDINGS for path in place.rglob("*")):
+        return "dicom"
     if "stats.csv" in names or any(re.fullmatch(r"\d+(\.\d+)?w", name) for name in names):
         return "zenodo"
     return None
@@ -62,11 +71,19 @@ def import_folder(
         from .nxtomo import import_nxtomo
 
         return import_nxtomo(source, out, progress=progress)
+    if layout == "dicom":
+        from .dicom import import_dicom
+
+        return import_dicom(source, out, progress=progress)
+    if layout == "xtekct":
+        from .xtekct import import_xtekct
+
+        return import_xtekct(source, out, progress=progress)
     if layout == "zenodo":
         from .zenodo import import_zenodo
 
         return import_zenodo(source, out, progress=progress)
-    raise InputError("layout", received=repr(layout), expected="images, emva1288, nxtomo or zenodo")
+    raise InputError("layout", received=repr(layout), expected="images, emva1288, nxtomo, dicom, xtekct or zenodo")
 
 
 def draft_sidecar(folder: Path) -> str:

@@ -10,8 +10,6 @@ One tree a tube voltage; the same number is the same image in both. The names ca
 import csv
 import math
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..files import whole_folder
 from .dataset_io import Dataset, DatasetRow
 from .setting import Setting, setting_from_text, text_from_filters
 
@@ -74,11 +73,6 @@ def write_tiff_folder(
     """
     import tifffile
 
-    final = Path(folder)
-    if final.exists() and (not final.is_dir() or any(final.iterdir())):
-        raise InputError(
-            str(folder), received="a file or a folder with something in it", expected="a new or empty folder"
-        )
     partners: dict[str, str] = {}
     settings = [_settings(row) for row in dataset.rows]
     for low, high in settings:
@@ -91,9 +85,7 @@ def write_tiff_folder(
                     expected="one partner for each tree",
                     remedy="export the settings one by one",
                 )
-    final.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{final.name}.", dir=final.parent))
-    try:
+    with whole_folder(folder) as temporary:
         counted: dict[tuple[str, str, str], int] = {}
         tables: dict[Path, list[dict[str, str]]] = {}
         for number, (row, pair) in enumerate(zip(dataset.rows, settings, strict=True)):
@@ -117,15 +109,6 @@ def write_tiff_folder(
                 writer = csv.DictWriter(stream, COLUMNS)
                 writer.writeheader()
                 writer.writerows(rows)
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o777 & ~umask)
-        if final.exists():
-            final.rmdir()
-        os.replace(temporary, final)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
     filters = sorted({text_from_filters(one.filters) or "none" for pair in settings for one in pair})
     return TiffFolder(
         folder=str(folder),

@@ -40,8 +40,8 @@ A thickness map of your own is a product or a foreign object with shape = "map",
 .npz with one array a material, .h5 with thickness_mm/<material>, or a TIFF of one material; mm, at `pixel_mm` in the
 object's plane.
 
-A mesh of your own has shape = "mesh", file = "part.stl" (or files) and, where its unit is not the millimetre, scale_mm = mm a unit
-(a number or a range).
+A mesh of your own has shape = "mesh", file = "part.stl" (or .obj, .ply, .3mf; or files) and, where its unit is not mm,
+scale_mm = mm a unit (a number or a range).
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Closed meshes of triangles as shapes: STL files, and the path lengths of rays through them."""
+"""Closed meshes of triangles as shapes: STL, OBJ, PLY and 3MF files, and the path lengths of rays through them."""
 
 import struct
 from dataclasses import dataclass, field
@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileFormatError, InputError
+from ..errors import FileFormatError, InputError, MissingDependencyError
 from .shapes import Rays
 
 Array = NDArray[np.float64]
 
+TRIMESH_ENDINGS = (".obj", ".ply", ".3mf")
 _HEADER = 84
 _RECORD = 50
 
@@ -59,20 +60,28 @@ class Mesh:
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> Mesh:
-    """A mesh from an STL file, binary or text, moved to its middle; `scale` mm a unit of the file.
+    """A mesh from a file, moved to its middle; `scale` mm a unit of the file.
+
+    STL, binary or text, is read here; OBJ, PLY and 3MF by trimesh (extra `meshes`). 3MF states its unit: its lengths are
+    made mm before `scale` multiplies them.
 
     Raises:
-        FileFormatError: no STL, or a surface with holes.
+        FileFormatError: no such mesh, a damaged one, or a surface with holes.
+        MissingDependencyError: another format than STL, and trimesh is not installed.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(
-            str(path), received=f"a file that cannot be read ({error.strerror})", expected="STL"
-        ) from None
-    corners = _binary(data) if _is_binary(data) else _text(data, path)
+    ending = path.suffix.lower()
+    if ending in TRIMESH_ENDINGS:
+        corners = _by_trimesh(path)
+    else:
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise FileFormatError(
+                str(path), received=f"a file that cannot be read ({error.strerror})", expected="a mesh"
+            ) from None
+        corners = _binary(data) if _is_binary(data) else _text(data, path)
     if not len(corners) or not bool(np.isfinite(corners).all()):
-        raise FileFormatError(str(path), received=f"{len(corners)} finite triangles", expected="an STL mesh")
+        raise FileFormatError(str(path), received=f"{len(corners)} finite triangles", expected="a mesh")
     corners = corners[_areas(corners) > 0]
     _check_closed(corners, path)
     # the sum of all corners' tetrahedra is the volume: negative where the triangles are seen from inside
@@ -81,6 +90,34 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> Mesh:
     flat = corners.reshape(-1, 3)
     middle = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     return Mesh(corners_mm=np.ascontiguousarray((corners - middle) * scale))
+
+
+def _by_trimesh(path: Path) -> Array:
+    """Corners (triangle, 3, 3) in the file's unit, of a 3MF in mm; several bodies are one mesh."""
+    if not path.is_file():
+        raise FileFormatError(str(path), received="no such file", expected="a mesh", remedy="check the path")
+    try:
+        import trimesh
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: got a mesh of kind {path.suffix}; expected STL, or the library that reads it; install it with"
+            " `pip install 'raytwin[meshes]'`"
+        ) from None
+    try:
+        options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        scene = trimesh.load_scene(path, file_type=path.suffix.lower().lstrip("."), process=False, **options)
+        mesh = scene.to_mesh()
+        corners = np.asarray(mesh.triangles, dtype=np.float64)
+        units = scene.units
+        factor = trimesh.units.unit_conversion(units, "millimeter") if units else 1.0
+    except Exception as error:  # trimesh raises whatever it likes at damaged files
+        raise FileFormatError(
+            str(path),
+            received=f"{path.stat().st_size} bytes that cannot be read ({error or type(error).__name__})",
+            expected=f"a mesh of kind {path.suffix.lower()}",
+            remedy="export it again, or as STL",
+        ) from None
+    return corners * float(factor)
 
 
 def _is_binary(data: bytes) -> bool:

@@ -62,6 +62,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
     """Write a twin, whole or of a tube alone; the file appears whole or not at all."""
     import h5py
 
+    from ..acquisition._hdf5 import mark_as_pictures
+
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
@@ -90,6 +92,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         maps = file.create_group("maps")
         for name in _MAPS:
             maps.create_dataset(name, data=getattr(twin.maps, name), compression="gzip", shuffle=True)
+        mark_as_pictures(maps, _MAPS[0], others=_MAPS[1:])
+        file.attrs.update({"NX_class": "NXroot", "default": "maps"})
         if twin.maps.dark_exposure_ms is not None:
             maps.attrs["dark_exposure_ms"] = twin.maps.dark_exposure_ms
         noise = file.create_group("noise")

@@ -2,6 +2,7 @@
 
 import math
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -162,3 +163,34 @@ def test_a_description_takes_a_mesh(tmp_path):
     path.write_text('[[product]]\nshape = "box"\nscale_mm = 1\nmaterial = "water"\n')
     with pytest.raises(InputError, match="the word 'scale_mm'"):
         read_description(path)
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "3mf"])
+def test_other_formats_give_the_same_body_and_holes_are_refused(tmp_path, ending):
+    trimesh = pytest.importorskip("trimesh", reason="OBJ, PLY and 3MF need the extra `meshes`")
+    pytest.importorskip("networkx", reason="3MF needs the extra `meshes`")
+    pytest.importorskip("lxml", reason="3MF needs the extra `meshes`")
+    mesh = trimesh.Trimesh(vertices=CORNERS + 7.0, faces=FACES, process=False)
+    path = tmp_path / f"block.{ending}"
+    mesh.export(path)
+    found = read_mesh(path, scale=2.0)
+    assert found.longest_mm == pytest.approx(8.0, rel=1e-6) and len(found.corners_mm) == len(FACES)
+    if ending == "3mf":
+        in_inches(path)
+        assert read_mesh(path).longest_mm == pytest.approx(4 * 25.4, rel=1e-6)
+    trimesh.Trimesh(vertices=CORNERS, faces=FACES[1:], process=False).export(path)
+    with pytest.raises(FileFormatError, match="holes"):
+        read_mesh(path)
+    path.write_bytes(b"\x00 no mesh")
+    with pytest.raises(FileFormatError, match="block"):
+        read_mesh(path)
+
+
+def in_inches(path):
+    """Restate the unit of a 3MF file, without a change of its numbers."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            assert not name.endswith(".model") or b'unit="millimeter"' in data
+            archive.writestr(name, data.replace(b'unit="millimeter"', b'unit="inch"'))

@@ -787,7 +787,7 @@ def test_an_acquisition_without_pairs_makes_no_dataset(tmp_path, capsys):
     assert "truncated" in refused(capsys, "reference", tmp_path / "cut.h5", out=tmp_path / "d.h5")
 
 
-@pytest.mark.parametrize("layout", ["images", "nxtomo", "emva1288", "zenodo", "reference"])
+@pytest.mark.parametrize("layout", ["images", "dicom", "xtekct", "nxtomo", "emva1288", "zenodo", "reference"])
 def test_every_layout_has_a_help_with_an_example(layout, capsys):
     with pytest.raises(SystemExit) as caught:
         main(["import", layout, "--help"])

@@ -33,7 +33,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "lab": ("lab", "a session measured in the virtual lab"),
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
     "explore": ("explore", "a page of settings in the browser: what changes with kV, filter, exposure, product"),
-    "export": ("export", "the twin in the form other simulators read"),
+    "export": ("export", "a twin for other simulators, images for other trainers and viewers"),
     "info": ("info", "what is installed; or a twin in a table"),
 }
 
@@ -59,7 +59,19 @@ Before any measurement:
 
 # commands that read HDF5 files of others: the library itself may die at damaged ones
 READING = frozenset(
-    {"check", "calibrate", "validate", "diagnose", "import", "predict", "generate", "contrast", "detect", "explore"}
+    {
+        "check",
+        "calibrate",
+        "validate",
+        "diagnose",
+        "import",
+        "predict",
+        "generate",
+        "contrast",
+        "detect",
+        "explore",
+        "export",
+    }
 )
 
 

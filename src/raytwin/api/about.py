@@ -5,20 +5,32 @@ import importlib.util
 import os
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import InputError
 from ..results import Result, Table, plain
 from ._folder import written_folder
 from ._given import PathLike, as_any_twin, as_twin
+from ._progress import Progress, Telling
 
 if TYPE_CHECKING:
+    from ..acquisition.acquisition_io import AcquisitionFile
+    from ..acquisition.dataset_io import Dataset
     from ..acquisition.setting import Setting
     from ..generator.tube_twin import TubeTwin
     from ..generator.twin import Twin
 
-_EXTRAS = {"segmentation": ("torch", "segmentation_models_pytorch"), "cluster": ("dask", "distributed")}
+_EXTRAS = {
+    "segmentation": ("torch", "segmentation_models_pytorch"),
+    "cluster": ("dask", "distributed"),
+    "fits": ("astropy",),
+    "dicom": ("pydicom",),
+    "fabio": ("fabio",),
+    "meshes": ("trimesh",),
+}
 _LIBRARIES = (
     "numpy",
     "scipy",
@@ -72,7 +84,7 @@ class Info(Result):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class Exported(Result):
-    """Files that were written for another simulator: its name, folder, files (name -> what it holds), warnings."""
+    """Files that were written for another program: its name, folder, files (name -> what it holds), warnings."""
 
     to: str
     folder: Path
@@ -154,34 +166,82 @@ def _devices() -> tuple[str, ...]:
 
 
 def export(
-    twin: "Twin | PathLike",
+    source: "Twin | Dataset | AcquisitionFile | PathLike",
     output: PathLike,
     *,
     to: str,
     settings: "Setting | str | Sequence[Setting | str] | None" = None,
+    labels: str = "polygons",
+    bits: int | None = None,
+    pixel_mm: float | None = None,
+    progress: Progress | bool | None = None,
 ) -> Exported:
-    """A twin in the form that another simulator reads: spectrum at the detector, its response, optical spread, noise.
+    """A twin for other simulators, a dataset for other trainers, an acquisition for other viewers.
 
     Args:
-        twin: a twin with a spectral part, its file, or a shipped calibration's name.
-        output: folder to write, new or not.
-        to: `csv`, `gvxr` (gVirtualXray's JSON), `xcist` (gecatsim's spectrum and configuration files) or `leap`.
-        settings: that the spectra are written for; None: the measured kV and filters, at 1 mAs.
+        source: a twin with a spectral part, its file, or a shipped calibration's name; or a dataset or an acquisition,
+            open or its file.
+        output: folder to write; of a dataset or an acquisition, a new or empty one.
+        to: of a twin `csv`, `gvxr` (gVirtualXray's JSON), `xcist` (gecatsim's spectrum and configuration files) or `leap`; of a
+            dataset `coco`, `yolo` or `tiff`; of an acquisition `tiff`, `nxtomo` or `dicom`.
+        settings: of a twin, that the spectra are written for; None: the measured kV and filters, at 1 mAs.
+        labels: of YOLO: `polygons` or `boxes`.
+        bits: of a grey value for trainers, 8 or 16; None: 8 for YOLO, 16 for COCO.
+        pixel_mm: pitch (mm) for the tags of a dataset's TIFF; None: the dataset's own, where it states one.
+        progress: True for a bar, or a function of (stage, done, total).
 
     Returns:
         What was written.
 
     Raises:
-        InputError: another simulator, a twin without spectral part, a setting that the twin cannot have.
+        InputError: another form, a twin without spectral part, a setting that the twin cannot have, a folder with something
+            in it.
 
     Example:
         >>> written = rt.export("twin.h5", "for_others", to="csv")
         >>> sorted(written.files)[:2]
         ['levels.csv', 'noise.json']
     """
-    from ..generator.export import export_twin
+    from ..acquisition import acquisition_io, dataset_io
+    from ..acquisition._hdf5 import format_of_file
 
     folder = Path(output)
+    with ExitStack() as stack:
+        opened: Any = source
+        if isinstance(source, str | os.PathLike):
+            kind = format_of_file(source)
+            if kind == dataset_io.FORMAT:
+                opened = stack.enter_context(dataset_io.read_dataset(source))
+            elif kind == acquisition_io.FORMAT:
+                opened = stack.enter_context(acquisition_io.open_acquisition(source))
+        is_dataset = isinstance(opened, dataset_io.Dataset)
+        is_acquisition = isinstance(opened, acquisition_io.AcquisitionFile)
+        if (is_dataset or is_acquisition) and settings is not None:
+            raise InputError("settings", received=str(settings), expected="none: only a twin is exported for settings")
+        if is_dataset:
+            from ..acquisition.export_dataset import export_dataset
+
+            telling = stack.enter_context(Telling(progress, unit="pair"))
+            telling.begin("images", len(opened))
+            images = export_dataset(
+                opened,
+                folder,
+                to=to,
+                labels=labels,
+                bits=bits,
+                pixel_mm=pixel_mm,
+                progress=lambda done, _: telling.reach(done),
+            )
+            return Exported(to=to, folder=folder, files=images.files, warnings=images.warnings)
+        if is_acquisition:
+            from ..acquisition.export_acquisition import export_acquisition
+
+            telling = stack.enter_context(Telling(progress, unit="frame"))
+            telling.begin("frames", sum(series.n_frames for series in opened.series))
+            files, warnings = export_acquisition(opened, folder, to=to, progress=lambda done, _: telling.reach(done))
+            return Exported(to=to, folder=folder, files=files, warnings=warnings)
+    from ..generator.export import export_twin
+
     with written_folder(folder):
-        files, warnings = export_twin(as_twin(twin), folder, to=to, settings=settings)
+        files, warnings = export_twin(as_twin(opened), folder, to=to, settings=settings)
     return Exported(to=to, folder=folder, files=files, warnings=warnings)

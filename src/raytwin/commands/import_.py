@@ -1,6 +1,8 @@
 """Turn other file layouts into an acquisition file or a dataset file.
 
-images    a folder of TIFF, PNG, FITS or raw images, described by a sidecar raytwin.toml in it   -> acquisition
+images    a folder of TIFF, PNG, FITS, DICOM, HIS, EDF or raw images with a sidecar raytwin.toml   -> acquisition
+dicom     DICOM and DICONDE images: kV, current, exposure and filter come from their tags    -> acquisition
+xtekct    a Nikon scan: the .xtekct file and the TIFF projections beside it                  -> acquisition
 nxtomo    a NeXus NXtomo file: flats, darks and projections told apart by image_key        -> acquisition
 emva1288  a set with EMVA1288_Data.txt and the images it lists                             -> acquisition
 zenodo    the paper's data, 10.5281/zenodo.10579608: processed images                      -> dataset
@@ -23,11 +25,15 @@ EXAMPLE = """examples:
   raytwin import emva1288 measured/emva_ccd -o ccd.h5
   raytwin import nxtomo scan.nxs -o scan.h5
   raytwin import images session/ -o session.h5
+  raytwin import dicom radiographs/ -o session.h5
+  raytwin import xtekct scan/scan.xtekct -o scan.h5 --exposure-ms 500
   raytwin import zenodo Submission --select "Dataset #1" -o set1.h5
   raytwin import reference session.h5 -o reference.h5 --low kv=40,exposure_ms=100 --high kv=90,exposure_ms=100"""
 
 _LAYOUTS = {
-    "images": "a folder of TIFF, PNG, FITS or raw images with a sidecar",
+    "images": "a folder of TIFF, PNG, FITS, DICOM, HIS, EDF or raw images with a sidecar",
+    "dicom": "DICOM or DICONDE images: a folder, or one file",
+    "xtekct": "a Nikon .xtekct file with its projections",
     "nxtomo": "a NeXus NXtomo file",
     "emva1288": "a folder with EMVA1288_Data.txt",
     "zenodo": "the paper's data: processed images, a raw session or calibration flats",
@@ -53,6 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             layout.add_argument("--sidecar", metavar="TOML", help="sidecar (default: raytwin.toml in the folder)")
         if name == "nxtomo":
             layout.add_argument("--detector", metavar="NAME", help="detector group, where several hold frames")
+        if name == "xtekct":
+            layout.add_argument("--exposure-ms", type=float, metavar="T", help="exposure of a projection (ms)")
         if name == "zenodo":
             layout.add_argument("--select", metavar="TEXT", help="only folders whose path holds this text")
             layout.add_argument("--kv", type=float, metavar="KV", help="tube voltage of calibration flats (kV)")
@@ -112,6 +120,15 @@ def _import(arguments: argparse.Namespace) -> Any:
             from ..acquisition.emva1288 import import_emva1288
 
             return import_emva1288(source, out, progress=progress)
+        if arguments.layout == "dicom":
+            from ..acquisition.dicom import import_dicom
+
+            return import_dicom(source, out, progress=progress)
+        if arguments.layout == "xtekct":
+            from ..acquisition.xtekct import import_xtekct
+
+            exposure_ms = _positive(arguments.exposure_ms, "--exposure-ms", "ms")
+            return import_xtekct(source, out, exposure_ms=exposure_ms, progress=progress)
         if arguments.layout == "zenodo":
             from ..acquisition.zenodo import import_zenodo
 

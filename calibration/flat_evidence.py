@@ -75,11 +75,11 @@ def flat_evidence(
     ]
     sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
     in_use = [source for source in sources if source.in_fit]
-    lit = [place for place, source in enumerate(in_use) if source.group >= 0]
+    lit = [number for number, source in enumerate(in_use) if source.group >= 0]
     correlation = correlation_of_quanta(
-        [in_use[place].power for place in lit],
-        [fit.expected_DN2[place] + fit.slow_DN2[place] for place in lit],
-        [fit.quanta_DN2[place] for place in lit],
+        [in_use[number].power for number in lit],
+        [fit.expected_DN2[number] + fit.slow_DN2[number] for number in lit],
+        [fit.quanta_DN2[number] for number in lit],
         unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
     )
     evidence = {

@@ -75,11 +75,11 @@ def flat_evidence(
     ]
     sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
     in_use = [source for source in sources if source.in_fit]
-    lit = [number for number, source in enumerate(in_use) if source.group >= 0]
+    bright = [number for number, source in enumerate(in_use) if source.group >= 0]
     correlation = correlation_of_quanta(
-        [in_use[number].power for number in lit],
-        [fit.expected_DN2[number] + fit.slow_DN2[number] for number in lit],
-        [fit.quanta_DN2[number] for number in lit],
+        [in_use[number].power for number in bright],
+        [fit.expected_DN2[number] + fit.slow_DN2[number] for number in bright],
+        [fit.quanta_DN2[number] for number in bright],
         unseen_sd=float(np.median(fit.gain_sd_DN / np.maximum(fit.gain_DN, 1e-300))),
     )
     evidence = {

@@ -58,7 +58,7 @@ class DemoPlan:
     batch: int = 8
     seed: int = 1
     recipe: str = "raytwin"
-    gap: GapPlan = GapPlan()
+    gap: GapPlan = field(default_factory=GapPlan)
 
     def __post_init__(self) -> None:
         for name in ("products", "test_products", "generated", "networks", "first_steps", "shared_steps", "steps"):

@@ -200,7 +200,7 @@ def summary_text(result: Mapping[str, Any]) -> str:
     missing = [f"{row['exposure_ms']:g} ms" for row in table if row["real"] and row["real"]["a90"] is None]
     if missing:
         text += f" At {', '.join(missing)} the measured test set does not support an a90."
-    return f"{text} {answer_text(result['gap'])}"
+    return text
 
 
 def truth_rows(calibration: Mapping[str, Any], truth: Mapping[str, Any], twin: Twin) -> list[dict[str, str]]:

@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin demo`."""
     from .. import __version__
     from ..campaign.demo import PAPER_PLAN, DemoPlan, gap_summary, run_demo
+    from ..campaign.demo_gap import answer_text
     from ..campaign.report import summary_text, write_report
     from ..cli import main
     from ..errors import InputError
@@ -74,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         plan, arguments.output, run=main, tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}")
     )
     report = write_report(result, arguments.output, version=__version__)
-    summary = summary_text(result)
+    summary = f"{summary_text(result)} {answer_text(result['gap'])}"
     found = {name: result["gap"]["diagnosis"][name] for name in ("verdict", "gap", "causes")}
     answer(
         {

@@ -178,7 +178,7 @@ def withheld_rows(frames: Sequence[WithheldFrame]) -> list[dict[str, str]]:
     """One row a withheld series: error of the expected brightness and departure in units of noise, before and after."""
     return [
         {
-            "name": frame.series.replace("_", ", "),
+            "name": f"{frame.series.split('_')[0].replace('product', 'product ')}, {frame.kV:g} kV, {frame.exposure_ms:g} ms",
             "error_before": f"{frame.error_percent(frame.before_DN):+.2f} %",
             "error_after": f"{frame.error_percent(frame.after_DN):+.2f} %",
             "departure_before": f"{frame.departure(frame.before_DN):.1f}",
@@ -195,6 +195,6 @@ def withheld_text(frames: Sequence[WithheldFrame]) -> str:
         for name in ("before_DN", "after_DN")
     )
     return (
-        f"Whole products, measured on another day, took no part in the diagnosis. The twin's brightness within them was off by"
-        f" {before:.1f} % and is off by {after:.2f} % with the effect added (median of {len(frames)} frames)."
+        f"Whole products, measured on another day, took no part in the diagnosis. Within them the twin's brightness was off by"
+        f" {before:.2f} %; with the effect added it is off by {after:.2f} % (median of {len(frames)} series)."
     )

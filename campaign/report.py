@@ -146,7 +146,11 @@ def _needed(looks: Sequence[Mapping[str, str]]) -> str:
             f"of the quarter with least contrast ({least[0][0]:.3f} to {least[-1][0]:.3f}) {found} of {quarter} were found; an a90"
             " needs objects of less contrast (thinner bones)"
         )
-    return "hits and misses do not order by contrast; an a90 needs more objects, over a wider range of contrast"
+    hits = sum(hit for _, hit in ordered)
+    return (
+        f"{hits} of {len(ordered)} were found, and contrast does not tell which; an a90 needs more objects, over a wider range of"
+        " contrast"
+    )
 
 
 def _key_figures(result: Mapping[str, Any], withheld: Sequence[WithheldFrame]) -> list[dict[str, str]]:

@@ -24,7 +24,7 @@ def line(tmp_path_factory):
         protocol="full",
         seed=5,
         rows=48,
-        frames=6,
+        frames=4,
         products=1,
         families=(),
         unkindness=NONE,
@@ -69,14 +69,14 @@ def test_a_withheld_frame_is_told_in_percent_and_in_units_of_noise():
     frame = one_frame(980.0, 1001.0)
     assert withheld_rows([frame]) == [
         {
-            "name": "product1, 40kV, 100ms",
+            "name": "product 1, 40 kV, 100 ms",
             "error_before": "-2.00 %",
             "error_after": "+0.10 %",
             "departure_before": "4.0",
             "departure_after": "0.2",
         }
     ]
-    assert "2.0 % and is off by 0.10 %" in withheld_text([frame])
+    assert "off by 2.00 %; with the effect added it is off by 0.10 %" in withheld_text([frame])
 
 
 def diagnosis(verdict, *effects):
@@ -112,7 +112,7 @@ def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, 
 
 @pytest.mark.parametrize(
     ("hit_from", "needed"),
-    [(0.15, "more contrast"), (0.0, "less contrast"), (None, "do not order")],
+    [(0.15, "more contrast"), (0.0, "less contrast"), (None, "contrast does not tell which")],
 )
 def test_a_missing_a90_says_which_objects_it_needs(hit_from, needed):
     contrasts = np.linspace(0.02, 0.16, 40)

@@ -146,10 +146,10 @@ def _needed(looks: Sequence[Mapping[str, str]]) -> str:
             f"of the quarter with least contrast ({least[0][0]:.3f} to {least[-1][0]:.3f}) {found} of {quarter} were found; an a90"
             " needs objects of less contrast (thinner bones)"
         )
-    hits = sum(hit for _, hit in ordered)
+    missed = [contrast for contrast, hit in ordered if not hit]
     return (
-        f"{hits} of {len(ordered)} were found, and contrast does not tell which; an a90 needs more objects, over a wider range of"
-        " contrast"
+        f"{len(ordered) - len(missed)} of {len(ordered)} were found, and the misses lie at contrasts of {missed[0]:.3f} to"
+        f" {missed[-1]:.3f}; an a90 needs more objects there"
     )
 
 

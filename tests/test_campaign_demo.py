@@ -112,7 +112,7 @@ def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, 
 
 @pytest.mark.parametrize(
     ("hit_from", "needed"),
-    [(0.15, "more contrast"), (0.0, "less contrast"), (None, "contrast does not tell which")],
+    [(0.15, "more contrast"), (0.0, "less contrast"), (None, "needs more objects there")],
 )
 def test_a_missing_a90_says_which_objects_it_needs(hit_from, needed):
     contrasts = np.linspace(0.02, 0.16, 40)

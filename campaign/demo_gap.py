@@ -4,6 +4,7 @@ The same tube and detector stand on a bench of their own, where filtered flats a
 measured. The withheld frames are of another day and of other objects: whole products, which the fit never saw.
 """
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +22,6 @@ from ..generator.twin_io import read_twin
 
 Step = Callable[..., dict[str, Any]]
 
-EFFECT = "object_scatter"
 SESSION, LATER, FOLDER = "bench.h5", "bench_later.h5", "diagnosis"
 # flats and a slab, near the detector and far from it: that is what tells scatter from a beam that is harder than thought
 _SLAB = ("--only", "filtered_flats", "--only", "slab")
@@ -64,6 +64,12 @@ class WithheldFrame:
         return float(np.sqrt(np.mean(z**2)))
 
 
+def planted_effect() -> str:
+    """Id of the effect that the chapter plants, from demo_gap.toml."""
+    found = tomllib.loads((Path(__file__).parent / "demo_gap.toml").read_text(encoding="utf-8"))["effect"]
+    return str(found)
+
+
 def run_gap(directory: Path, plan: GapPlan, *, seed: int, step: Step) -> dict[str, Any]:
     """Measure the bench with the effect in it, diagnose it, and measure other objects on another day.
 
@@ -77,12 +83,14 @@ def run_gap(directory: Path, plan: GapPlan, *, seed: int, step: Step) -> dict[st
         `truth` of the planted effect, `diagnosis` as in diagnosis.json.
     """
 
+    effect = planted_effect()
+
     def lab(name: str, file: str, *words: str) -> dict[str, Any]:
         return step(
             name,
             ["lab", "-o", str(directory / file), "--protocol", "full", "--seed", str(seed), "--family", "none",
              "--no-unkindness", "--size", str(plan.size), "--frames", str(plan.frames),
-             "--effect", f"{EFFECT}={plan.strength:g}", *words],
+             "--effect", f"{effect}={plan.strength:g}", *words],
             outputs=[file],
         )  # fmt: skip
 
@@ -93,7 +101,7 @@ def run_gap(directory: Path, plan: GapPlan, *, seed: int, step: Step) -> dict[st
         outputs=[f"{FOLDER}/twin.h5", f"{FOLDER}/report.html"],
     )
     lab("lab_bench_later", LATER, "--session", "1", *_PRODUCTS)
-    return {"truth": truth["effects"][EFFECT], "diagnosis": diagnosis}
+    return {"truth": {"effect": effect, **truth["effects"][effect]}, "diagnosis": diagnosis}
 
 
 def withheld_frames(directory: Path, *, seed: int) -> tuple[WithheldFrame, ...]:
@@ -153,7 +161,7 @@ def compare_products(acquisition: Path, *, before: Twin, after: Twin, seed: int)
 def answer_text(gap: Mapping[str, Any]) -> str:
     """What the diagnosis found, against what was planted: the chapter's answer in words."""
     diagnosis, truth = gap["diagnosis"], gap["truth"]
-    planted = f"Planted: {title_of(EFFECT).lower()}, {truth['strength']:g} {truth['unit']}."
+    planted = f"Planted: {title_of(truth['effect']).lower()}, {truth['strength']:g} {truth['unit']}."
     sizes = diagnosis["gap"]
     closing = (
         f"On data that the fit did not use, the gap falls from {sizes['before']:.1f} to {sizes['after']:.1f};"

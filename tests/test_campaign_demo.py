@@ -7,7 +7,14 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.campaign.demo_gap import WithheldFrame, answer_text, compare_products, withheld_rows, withheld_text
+from raytwin.campaign.demo_gap import (
+    WithheldFrame,
+    answer_text,
+    compare_products,
+    planted_effect,
+    withheld_rows,
+    withheld_text,
+)
 from raytwin.campaign.figures import plot_gap, plot_withheld
 from raytwin.campaign.report import missing_a90
 from raytwin.generator.effects import AppliedEffect
@@ -103,7 +110,7 @@ def diagnosis(verdict, *effects):
 )
 def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, told, not_told):
     found = diagnosis(verdict, *effects)
-    text = answer_text({"truth": {"strength": 10.0, "unit": "%"}, "diagnosis": found})
+    text = answer_text({"truth": {"effect": planted_effect(), "strength": 10.0, "unit": "%"}, "diagnosis": found})
     assert told in text
     assert not_told not in text
     assert "from 6.6 to 1.0" in text

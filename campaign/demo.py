@@ -20,6 +20,7 @@ import numpy as np
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError, RaytwinError
 from ..files import whole_file
+from .demo_gap import GapPlan, run_gap
 
 Run = Callable[[Sequence[str]], int]
 Tell = Callable[[str], None]
@@ -37,7 +38,8 @@ class DemoPlan:
     paper's line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series;
     products, test_products (images of the two sets); exposures_ms of the fast settings; generated (training pairs an
     exposure); networks an exposure; first_steps, shared_steps (of the one network they all start from: on the least noisy
-    images, then on all exposures), steps (of each network after that); batch; seed.
+    images, then on all exposures), steps (of each network after that); batch; seed; recipe of the training; gap (of the
+    chapter that plants an effect).
     """
 
     size: tuple[int, int] = (96, 128)
@@ -56,6 +58,7 @@ class DemoPlan:
     batch: int = 8
     seed: int = 1
     recipe: str = "raytwin"
+    gap: GapPlan = field(default_factory=GapPlan)
 
     def __post_init__(self) -> None:
         for name in ("products", "test_products", "generated", "networks", "first_steps", "shared_steps", "steps"):
@@ -138,10 +141,12 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
     line = _measured_line(chain, plan)
     _datasets(chain, plan, exposures)
     found = _networks(chain, plan, exposures)
+    gap = run_gap(directory, plan.gap, seed=plan.seed, step=chain.step)
     return {
         "plan": asdict(plan),
         **line,
         **found,
+        "gap": gap,
         "a90_table": a90_table(found["pod"], found["compare"], exposures),
         "noise": {f"{exposure:g}ms": noise_comparison(directory, f"{exposure:g}ms") for exposure in plan.exposures_ms},
         "commands": chain.commands,

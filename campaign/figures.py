@@ -2,18 +2,22 @@
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
+from ..diagnosis.answer import plot_gap_rows
+from ..diagnosis.explanation import axis_text
 from ..errors import RaytwinError
 from ..generator.twin import Twin
 from ..pod.repeats import fit_pod
+from .demo_gap import WithheldFrame
 
-REAL, GENERATED, PUBLISHED = "#1b7f3b", "#c23b22", "#7a7a7a"
+# blue, vermilion and grey of Okabe and Ito, "Color universal design" (2008): told apart by colour-blind readers
+REAL, GENERATED, PUBLISHED = "#0072b2", "#d55e00", "#7a7a7a"
 _DPI = 110
 
 
@@ -242,4 +246,53 @@ def plot_a90(table: Sequence[dict[str, Any]]) -> bytes:
     axis.set(xlabel="exposure, ms", ylabel="contrast at POD 90 %", title="a90 against exposure")
     if axis.get_legend_handles_labels()[0]:
         axis.legend()
+    return png_of(figure)
+
+
+def plot_gap(diagnosis: Mapping[str, Any]) -> bytes:
+    """The gap on data that the fit did not use, before and after the effect was added, by axis; from diagnosis.json. PNG."""
+    gap = diagnosis["gap"]
+    rows = [("everything", gap["before"], gap["after"], gap["floor"])]
+    rows += [(axis_text(one["axis"]), one["before"], one["after"], one["floor"]) for one in diagnosis["held_out"]]
+    figure, axes = figure_with_axes(6.4, 0.42 * len(rows) + 1.4)
+    axis = plot_gap_rows(rows, ax=axes[0, 0])
+    for place, (_, before, after, _) in enumerate(rows):
+        for value, height in ((before, place - 0.18), (after, place + 0.18)):
+            axis.annotate(
+                f"{value:.1f}", (value, height), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8
+            )
+    axis.set_xlim(0.0, 1.12 * max(max(row[1:]) for row in rows))
+    axis.set_xlabel("gap on data not used in the fit (1: noise alone)")
+    handles, labels = axis.get_legend_handles_labels()
+    words = {"floor": "measured against measured"}
+    axis.legend(handles, [words.get(label, label) for label in labels], frameon=False, loc="lower right")
+    axis.spines[["top", "right"]].set_visible(False)
+    return png_of(figure)
+
+
+def plot_withheld(frames: Sequence[WithheldFrame]) -> bytes:
+    """Withheld products at their longest exposure: measured, and measured over expected before and after. PNG."""
+    longest = max(frame.exposure_ms for frame in frames)
+    first = next(frame.series for frame in frames if frame.exposure_ms == longest).split("_")[0]
+    shown = [frame for frame in frames if frame.exposure_ms == longest and frame.series.split("_")[0] == first]
+    figure, axes = figure_with_axes(8.4, 2.75 * len(shown), len(shown), 3)
+    departures = [
+        [100.0 * (frame.measured_DN / expected - 1.0) for expected in (frame.before_DN, frame.after_DN)]
+        for frame in shown
+    ]
+    limit = max(
+        float(np.percentile(np.abs(one[frame.inside]), 95)) for frame, (one, _) in zip(shown, departures, strict=True)
+    )
+    for row, (frame, both) in enumerate(zip(shown, departures, strict=True)):
+        axes[row, 0].imshow(frame.measured_DN, cmap="gray", vmin=float(np.percentile(frame.measured_DN, 2)) * 0.9)
+        axes[row, 0].set_ylabel(f"{frame.kV:g} kV, {frame.exposure_ms:g} ms")
+        for axis, departure in zip(axes[row, 1:], both, strict=True):
+            image = axis.imshow(np.where(frame.inside, departure, np.nan), cmap="RdBu_r", vmin=-limit, vmax=limit)
+    for axis, title in zip(
+        axes[0], ("measured", "measured over twin, before", "measured over twin, after"), strict=True
+    ):
+        axis.set_title(title, fontsize=11)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    figure.colorbar(image, ax=axes, shrink=0.7, label="measured over expected - 1, %")
     return png_of(figure)

@@ -1,6 +1,6 @@
 """The answer of a diagnosis, and its form as a file."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -148,7 +148,12 @@ def _diagnosis_from_fields(values: dict[str, Any]) -> Diagnosis:
 
 def plot_gap(diagnosis: Diagnosis, *, ax: Any) -> Any:
     """See `Diagnosis.plot_gap`."""
-    rows = [("all", diagnosis.gap.before, diagnosis.gap.after, diagnosis.gap.floor), *diagnosis.held_out]
+    gap = diagnosis.gap
+    return plot_gap_rows([("all", gap.before, gap.after, gap.floor), *diagnosis.held_out], ax=ax)
+
+
+def plot_gap_rows(rows: Sequence[tuple[str, float, float, float]], *, ax: Any) -> Any:
+    """The gap before and after with its floor, a bar each, from rows of (name, before, after, floor); returns the axes."""
     for place, (_, before, after, floor) in enumerate(rows):
         first = place == 0
         ax.barh(place - 0.18, before, height=0.34, color="#9aa5b1", label="before" if first else None)

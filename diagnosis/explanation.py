@@ -31,6 +31,11 @@ def title_of(effect: str) -> str:
     return EFFECTS[effect].title if effect in EFFECTS else effect
 
 
+def axis_text(axis: str) -> str:
+    """An axis of the gap in words."""
+    return _AXIS_WORDS.get(axis, axis)
+
+
 def _percent(value: tuple[float, float, float]) -> str:
     return f"{100 * value[0]:.0f} % ({100 * value[1]:.0f} to {100 * value[2]:.0f})"
 
@@ -54,12 +59,12 @@ def location_text(location: str) -> str:
 def _place_text(place: Place) -> str:
     where = location_text(place.location)
     what = f"{place.statistic}, {where}" if where else place.statistic
-    return f"{_AXIS_WORDS.get(place.axis, place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
+    return f"{axis_text(place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
 
 
 def _family_text(axis: str, kind: str, scene: str) -> str:
     """One axis of a kind of series, or of those of a scene."""
-    return f"{_AXIS_WORDS.get(axis, axis)} of {scene or _KIND_WORDS.get(kind, kind)}"
+    return f"{axis_text(axis)} of {scene or _KIND_WORDS.get(kind, kind)}"
 
 
 def _signature_text(diagnosis: Diagnosis) -> str:
@@ -86,7 +91,7 @@ def _signature_text(diagnosis: Diagnosis) -> str:
 def _where_text(places: Sequence[Place]) -> str:
     if not places:
         return "No single probe stands out beyond noise and what calibration leaves open."
-    axes = list(dict.fromkeys(_AXIS_WORDS.get(place.axis, place.axis) for place in places[:12]))
+    axes = list(dict.fromkeys(axis_text(place.axis) for place in places[:12]))
     return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
 
 

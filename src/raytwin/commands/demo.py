@@ -1,4 +1,4 @@
-"""The main job end to end on the virtual lab: calibrate, validate, generate, train, detect, POD, one report.
+"""The main job end to end on the virtual lab: calibrate, validate, generate, train, detect, POD, diagnose, one report.
 
 Small but honest by default (minutes on two cores); --paper-size is the paper's detector, image and network numbers. A
 run that was stopped goes on where it stopped.
@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin demo`."""
     from .. import __version__
     from ..campaign.demo import PAPER_PLAN, DemoPlan, gap_summary, run_demo
+    from ..campaign.demo_gap import answer_text
     from ..campaign.report import summary_text, write_report
     from ..cli import main
     from ..errors import InputError
@@ -74,12 +75,15 @@ def run(arguments: argparse.Namespace) -> int:
         plan, arguments.output, run=main, tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}")
     )
     report = write_report(result, arguments.output, version=__version__)
-    summary = summary_text(result)
+    summary = f"{summary_text(result)} {answer_text(result['gap'])}"
+    found = {name: result["gap"]["diagnosis"][name] for name in ("verdict", "gap", "causes")}
     answer(
         {
             "paths": {
                 "report": report,
                 "twin": arguments.output / "twin.h5",
+                "improved_twin": arguments.output / "diagnosis" / "twin.h5",
+                "diagnosis": arguments.output / "diagnosis" / "diagnosis.json",
                 "directory": arguments.output,
             },
             "a90_table": result["a90_table"],
@@ -88,6 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
                 "coverage": result["validation"]["coverage"],
             },
             "diagnosis": gap_summary(result["validation"]),
+            "planted_effect": {"truth": result["gap"]["truth"], **found},
             "summary": summary,
             "seconds": round(time.monotonic() - started, 1),
         },

@@ -144,21 +144,21 @@ def test_a_fit_is_not_taken_for_a_prediction(session, tmp_path, capsys):
     assert f"{flats} of {flats} series calibrated this twin" in shown[1]
 
 
-def test_no_spectrum_is_computed_once_frames_have_been_read(session, monkeypatch):
+def test_every_spectrum_is_at_hand_before_frames_are_read(session, monkeypatch):
     # SpekPy's own tables and the maps of a large detector would not fit into 400 MB together
-    from raytwin.spectra import _cache, tube
+    from raytwin.spectra import tube
 
     stages: list[str] = []
-    read: list[tuple[str, str]] = []
+    asked: list[tuple[str, float]] = []
 
-    def recorded(name, key, *, size):
-        read.append((stages[-1], name))
-        return _cache.read_kept(name, key, size=size)
+    def recorded(anode, anode_angle_deg, model, kV):
+        asked.append((stages[-1], kV))
+        return found(anode, anode_angle_deg, model, kV)
 
-    monkeypatch.setattr(tube, "read_kept", recorded)
-    for kept in (tube._tube_node, tube._line_offsets):
-        kept.cache_clear()
+    found = tube.packaged_fluence
+    monkeypatch.setattr(tube, "packaged_fluence", recorded)
+    tube._tube_node.cache_clear()
     with open_acquisition(session["path"]) as acquisition:
         calibrate_twin(acquisition, rng=np.random.default_rng(2), progress=stages.append)
-    assert {stage for stage, _ in read} == {"spectra"}
+    assert {stage for stage, _ in asked} == {"spectra"}
     assert stages.index("spectra") < stages.index("darks")

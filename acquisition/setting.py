@@ -16,7 +16,12 @@ def _number(value: float) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
-    """A flat layer in the beam: a material by name and its thickness in mm."""
+    """A flat layer in the beam: a material by name and its thickness in mm.
+
+    Example:
+        >>> print(rt.Filter(material="Cu", thickness_mm=0.1))
+        Cu:0.1
+    """
 
     material: str
     thickness_mm: float
@@ -73,6 +78,11 @@ class Setting:
     averaged into one); source_detector_mm (None: the instrument's); binning (b x b pixels combined into one);
     frame_interval_ms (from the start of one frame or line to the next; None: as fast as the detector goes);
     belt_speed_mm_s (None: unknown or at rest).
+
+    Example:
+        >>> setting = rt.Setting(kV=60, power_W=30, exposure_ms=20, filters=(rt.Filter(material="Cu", thickness_mm=0.1),))
+        >>> print(setting)
+        kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1
     """
 
     kV: float

@@ -242,8 +242,6 @@ def test_values_that_differ_make_results_unequal(inside, capsys):
 
 @pytest.mark.parametrize("name", sorted(rt._HOME))
 def test_every_public_name_has_an_example_that_runs(inside, name):
-    if name in ("Setting", "Filter"):
-        pytest.skip("a plain dataclass of the packages")
     run_examples(getattr(rt, name), name)
 
 

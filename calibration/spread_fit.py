@@ -52,12 +52,12 @@ _STARTS = (
 # the gain by less than a share is known to; where it is known better than that, at steps of its standard deviation.
 _LOG_REACH = (math.log(0.25), math.log(_LONGEST_TAIL_PX))
 _REACH_STEP = math.log(1.5)
-# Whether there is a tail is open; the low-frequency drop of panels with a scintillator is 2 to 20 %, which a beta law of mean 0.1
-# describes; of those with a tail one in ten may have any.
+# Assumed, since no survey of panels says it: a tail (the low-frequency drop of IEC 62220-1) is as likely as none, and its share of
+# the light follows a beta law of mean 0.1, in one case of ten any share.
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
-_LEAST_SD, _MOST_SD = 0.005, 0.15  # of the share between such steps
+_MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be
 # A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
 # deviation of the mean adds an eighth to that, while a spread without a tail is quicker wherever it is used.
 _AS_LIKELY = 2.0 * math.log(10.0)
@@ -578,11 +578,14 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
         share_at = names.index("tail_share")
         for reach_mass, best in _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
-            sd = min(max(math.sqrt(max(variance, 0.0)), _LEAST_SD), _MOST_SD)
+            if variance <= 0.0:
+                yield (1.0 - _NO_TAIL) * reach_mass / len(families), best
+                continue
+            sd = min(math.sqrt(variance), _MOST_SD)
             for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
                 density = (1.0 - _NO_TAIL) * _share_density(share)
                 mass = width * density * reach_mass / len(families)
-                yield mass, best if variance <= 0.0 else _with_share(problem, best, share_at, share)
+                yield mass, _with_share(problem, best, share_at, share)
 
 
 def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]]:

@@ -353,17 +353,24 @@ class _Problem:
             square += precision * mean**2
         return _Normal(matrix, right, square)
 
-    def solve(self, spread: Spread) -> tuple[FloatArray, float]:
-        """Coefficients and chi-square at this spread, with the white part's prior about the gain that the data have."""
-        shapes = self.in_cells(spread)
-        first = self.normal(shapes, None).solved(self.not_negative)[0]
+    def solve(self, spread: Spread, *, also: Sequence[int] = ()) -> tuple[FloatArray, float]:
+        """Coefficients and chi-square at this spread, with the white part's prior about the gain that the data have.
+
+        `also`: further coefficients that are not negative.
+        """
+        shapes, least_0 = self.in_cells(spread), (*self.not_negative, *also)
+        first = self.normal(shapes, None).solved(least_0)[0]
         # the sum is the gain, known even where the two cannot be told apart
-        return self.normal(shapes, self.gains(first)).solved(self.not_negative)
+        return self.normal(shapes, self.gains(first)).solved(least_0)
 
     @property
     def not_negative(self) -> range:
-        """Coefficients that add power: white noise that follows the signal, electronic noise, slow changes."""
-        return range(self.groups, 2 * self.groups + 1 + 2 * len(self.drifting))
+        """Coefficients that add power: white noise that follows the signal, electronic noise.
+
+        Slow changes add power as well, but each series has its own: held at 0 and above, their noise would be taken from the
+        quanta.
+        """
+        return range(self.groups, 2 * self.groups + 1)
 
     def gains(self, coefficients: FloatArray) -> FloatArray:
         """A + W (group,), DN."""
@@ -702,6 +709,9 @@ def fit_spread(
             moved = getattr(item.spread, name) - getattr(chosen.spread, name)
             reach_of_none = name == "tail_px" and min(item.spread.tail_share, chosen.spread.tail_share) == 0
             spread_variance[name] += float(share) * (own + (0.0 if reach_of_none else moved**2))
+    gain_moved, slope_moved, read_moved = _slow_as_power(problem, chosen)
+    gain_variance += gain_moved**2
+    slope_variance += slope_moved**2
     expected = _expected(problem, chosen)
     other = _other_route(problem, chosen, expected)
     gain_variance = gain_variance + max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2) * gain**2
@@ -721,7 +731,7 @@ def fit_spread(
         white_fraction=white / np.where(quantum > 0, quantum, np.nan),
         read_variance_DN2=read + rows + columns,
         read_sd_DN2=math.hypot(
-            math.sqrt(max(inflation * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd
+            math.sqrt(max(inflation * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd, read_moved
         ),
         most_read_DN2=problem.most_read_DN2,
         row_variance_DN2=max(rows, 0.0),
@@ -820,6 +830,20 @@ def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:
         "tail_share": own.get("tail_share", 0.0),
         "tail_px": own.get("log_tail_px", 0.0) * item.spread.tail_px**2,
     }
+
+
+def _slow_as_power(problem: _Problem, item: _Candidate) -> tuple[FloatArray, FloatArray, float]:
+    """What gains and slopes (group,) and read variance change by, DN and DN^2, where slow changes may only add power.
+
+    Left free, their fitted power may fall below 0 at high frequencies, which white noise then makes good; held at 0, their
+    own noise is taken from the quanta. What the choice changes is not known.
+    """
+    first = 2 * problem.groups + 1
+    held, _ = problem.solve(item.spread, also=range(first, first + 2 * len(problem.drifting)))
+    quantum, white = np.split(held[: 2 * problem.groups], 2)
+    slopes = quantum * item.variance_share + white
+    moved_read = float(held[first - 1] - item.coefficients[first - 1])
+    return np.asarray(quantum + white - item.gains), np.asarray(slopes - item.slopes), moved_read
 
 
 def _expected(problem: _Problem, item: _Candidate) -> tuple[FloatArray, ...]:

@@ -26,6 +26,7 @@ BELOW = {
     "lab": {"acquisition"},  # shares no physics with the twin, or agreement would prove nothing
     "spectra": {"acquisition", "materials"},
     "generator": {"acquisition", "materials", "spectra"},
+    "observers": {"acquisition", "materials", "spectra", "generator", "pod"},
     "calibration": {"acquisition", "materials", "spectra", "generator"},
     "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod"},
 }
@@ -305,7 +306,7 @@ def test_help_loads_nothing_heavy():
     assert not loaded_modules(code) & HEAVY
 
 
-@pytest.mark.parametrize("room", ["segmentation", "pod", "lab", "generator", "calibration", "spectra", "materials"])
+@pytest.mark.parametrize("room", ["segmentation", "pod", "lab", "observers", "generator", "calibration", "spectra", "materials"])
 def test_importing_a_room_loads_neither_torch_nor_matplotlib(room):
     assert not loaded_modules(f"import raytwin.{room}") & {"torch", "matplotlib", "dask", "spekpy"}
 

@@ -2,10 +2,10 @@
 
     d_eff^2 = e sum of |signal|^2 over (noise + v)
 
-e, the efficiency, scales all settings alike: what networks lose (or win by looking at whole shapes) everywhere. v, the internal noise,
-is white and the same at every setting: it counts where the image noise is low. Their posterior given ln a90 of the settings, each with
-its own error and a scatter between settings, is summed over a grid; weak priors (ln e = 0 +- 1.5; v^(1/2) = 0 +- twice the noise of the
-combined image) keep a few alike settings from sending them apart. Quoted are the means.
+e, the efficiency, scales all settings alike. It is above 1 where networks use what the observer's image leaves out. v, the internal
+noise, is white and the same at every setting: it counts where the image noise is low. Their posterior given ln a90 of the settings,
+each with its own error and a scatter between settings, is summed over a grid. Weak priors (ln e = 0 +- 1.5; v^(1/2) = 0 +- twice the
+noise of the combined image) keep a few alike settings from sending them apart. Quoted are the means.
 
 The scatter s is that of settings that were left out of the fit: with r_j the departure of setting j from the fit to the others, of
 variance q_j, and the measured error e_j, s^2 solves sum r_j^2 / (e_j^2 + q_j + s^2) = n (0 where the sum is below n). The
@@ -83,7 +83,8 @@ class Efficiency:
     """An observer calibrated to networks.
 
     Fields: observer (with the fitted efficiency and internal noise); covariance of (ln efficiency, internal noise over `unit`) as
-    ((a, b), (b, c)); unit (noise of the combined image, its median over settings and objects); scatter (of ln a90 between settings); left_out (a row a setting); size_name.
+    ((a, b), (b, c)); unit (noise of the combined image, its median over settings and objects); scatter (of ln a90 between
+    settings); left_out (a row a setting); size_name.
     """
 
     observer: Observer

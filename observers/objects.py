@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 TURNS_DEG = (0.0, 30.0, 60.0, 90.0)
 LARGEST_PATCH_PX = 512
 _SMALLEST_PATCH_PX = 32
-_FINE = 8  # points a side of each pixel, of a shape
+_FINE = 8  # points a side of each pixel, of a shape as wide as one; more of thinner ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -208,13 +208,15 @@ def profile_of_shape(shape: Shape, *, length_mm: float, pixel_mm: float, turn_de
     height = shape.height * length_mm if shape.height_mm is None else shape.height_mm
     width = shape.width * length_mm
     half = math.ceil(0.5 * math.hypot(length_mm, width) / pixel_mm) + 1
-    fine = (np.arange(2 * half * _FINE) + 0.5) / _FINE - half
+    # the thinnest part is met by eight points or more
+    points = _FINE * max(1, math.ceil(pixel_mm / min(width, length_mm)))
+    fine = (np.arange(2 * half * points) + 0.5) / points - half
     row, column = np.meshgrid(fine * pixel_mm, fine * pixel_mm, indexing="ij")
     turn = math.radians(turn_deg)
     along = row * math.cos(turn) + column * math.sin(turn)
     across = column * math.cos(turn) - row * math.sin(turn)
     thickness = SHAPES[shape.kind](along, across, length_mm, width, height)
-    return np.asarray(thickness.reshape(2 * half, _FINE, 2 * half, _FINE).mean(axis=(1, 3)))
+    return np.asarray(thickness.reshape(2 * half, points, 2 * half, points).mean(axis=(1, 3)))
 
 
 def objects_of_shape(

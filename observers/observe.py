@@ -73,8 +73,9 @@ class Observed:
     """What an observer finds.
 
     Fields: d_prime, threshold, pod, delta_R (setting, object); a50, a90 (setting,) in the unit of the objects' size, NaN where POD
-    does not reach it within the sizes; a90_of_curve (setting,): the same of a fitted curve, wherever it reaches it; a90_delta_R (setting,): Delta R of the object at a90, NaN where it is not known or the size is
-    the contrast itself; independent_places (setting,): that a search chooses between, median over the objects.
+    does not reach it within the sizes; a90_of_curve (setting,): the same of a fitted curve, wherever it reaches it; a90_delta_R
+    (setting,): Delta R of the object at a90, NaN where it is not known or the size is the contrast itself; independent_places
+    (setting,): that a search chooses between, median over the objects.
     """
 
     d_prime: FloatArray

@@ -7,9 +7,9 @@ the chance
     G(t) = integral from t of phi(z) q(r_r, z) q(r_c, z) dz,    q(r, z) = Phi2(h z, h z; -r^2),    h = ((1 - r) / (1 + r))^(1/2)
 
 (Phi2: bivariate normal distribution; q: both neighbours along an axis lie lower). Maxima above a high threshold are rare and so
-Poisson: the chance of an alarm in A pixels is 1 - exp(-A G(t)). It joins independent pixels (r = 0: G = Q(t), nearly) to smooth fields,
-where it is the expected number of maxima of random-field theory. The number of independent places is N with 1 - (1 - Q(t))^N the same
-chance.
+Poisson: the chance of an alarm in A pixels is 1 - exp(-A G(t)). It joins independent pixels (r = 0: G = Q(t), nearly) to smooth
+fields, where it is the expected number of maxima of random-field theory. The number of independent places is N with
+1 - (1 - Q(t))^N the same chance.
 
 Source: Worsley, NeuroImage 28 (2005) 1056 (discrete local maxima); Adler, The Geometry of Random Fields (1981).
 Checked against: templates over drawn noise (tests/test_observers.py).

@@ -2,7 +2,7 @@
 
     T(f) = A (f / f0)^(-b),    f in cycles/mm, f0 = 0.1 cycles/mm
 
-T is the power of the thickness (mm^2 px^2 a unit of frequency in pixels, so that its mean over all frequencies is a pixel's variance).
+T is the power of the thickness (mm^2; its mean over all frequencies of the pixel grid is the variance of a pixel).
 Outside the measured frequencies the law is continued; below the lowest one it is kept flat.
 
 Source: Burgess, Jacobson & Judy, Med. Phys. 28 (2001) 419 (power laws of natural textures).
@@ -31,7 +31,7 @@ _MOST_PATCHES = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProductTexture:
-    """A power law; fields: amplitude_mm4 (A times the pixel's area), exponent b, lowest_per_mm (flat below), patches (it rests on)."""
+    """A power law. Fields: amplitude_mm4 (A times a pixel's area), exponent b, lowest_per_mm (flat below), patches (read)."""
 
     amplitude_mm4: float
     exponent: float
@@ -39,7 +39,7 @@ class ProductTexture:
     patches: int
 
     def power(self, bins: FrequencyBins, pixel_mm: float) -> FloatArray:
-        """Power of the thickness in the bins (bin,), mm^2 px^2; pixel_mm: pitch in the object's plane."""
+        """Power of the thickness in the bins (bin,), mm^2; pixel_mm: pitch in the object's plane."""
         frequency = np.maximum(np.hypot(bins.row, bins.column) / pixel_mm, self.lowest_per_mm)
         return np.asarray(self.amplitude_mm4 / pixel_mm**2 * (frequency / _F0_PER_MM) ** -self.exponent)
 
@@ -69,7 +69,7 @@ def texture_of_references(
             expected="4 or more",
             remedy="references with product masks",
         )
-    thickness_mm, slope, quantum, white = line.product_at(logs, pair[1], material)
+    _, slope, quantum, white = line.product_at(logs, pair[1], material)
     windowed, gain = _windowed(squares)
     power = np.abs(np.fft.fft2(windowed)) ** 2 / (_PATCH_PX**2 * gain)
     whole = line.noise_power_of_patch(_PATCH_PX)

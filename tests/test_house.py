@@ -306,7 +306,9 @@ def test_help_loads_nothing_heavy():
     assert not loaded_modules(code) & HEAVY
 
 
-@pytest.mark.parametrize("room", ["segmentation", "pod", "lab", "observers", "generator", "calibration", "spectra", "materials"])
+@pytest.mark.parametrize(
+    "room", ["segmentation", "pod", "lab", "observers", "generator", "calibration", "spectra", "materials"]
+)
 def test_importing_a_room_loads_neither_torch_nor_matplotlib(room):
     assert not loaded_modules(f"import raytwin.{room}") & {"torch", "matplotlib", "dask", "spekpy"}
 

@@ -1,4 +1,4 @@
-"""Model observers: closed forms, order of the detectors, matched filters on drawn noise, search, motion, efficiency and its scatter."""
+"""Model observers: closed forms, order of the detectors, matched filters on drawn noise, search, motion, calibration to networks."""
 
 import dataclasses
 import json

@@ -1,9 +1,9 @@
 """Model observers against networks: a90 at settings whose networks took no part in the observer's calibration.
 
 On a line of the virtual lab: its twin, 300 fillets with and without rib bones, and 20 pairs of settings that differ in kV, filter,
-exposure and belt speed. At each `raytwin sweep` trains three networks; they are then tried on other products, each seen several times
-with its own noise, at thresholds that give the same share of marked images without their objects. The observer's two numbers are fitted
-to some settings; a90 of the others is predicted with its interval. A stopped run goes on where it was.
+exposure and belt speed. At each `raytwin sweep` trains three networks. They are then tried on other products, each seen several
+times with its own noise, at thresholds that give the same share of marked images without their objects. The observer's two numbers
+are fitted to some settings; a90 of the others is predicted with its interval. A stopped run goes on where it was.
 
     python validation/observers.py --output build/observers --json build/observers.json
 """

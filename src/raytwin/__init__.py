@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from .api.images import generate as generate
     from .api.images import read_dataset as read_dataset
     from .api.images import train as train
+    from .api.observers import calibrate_observer as calibrate_observer
+    from .api.observers import observe as observe
     from .api.sessions import check as check
     from .api.sessions import diagnose as diagnose
     from .api.sessions import lab_session as lab_session
@@ -45,6 +47,7 @@ _HOME = {
     "Filter": "acquisition.setting",
     "Setting": "acquisition.setting",
     "calibrate": "api.twins",
+    "calibrate_observer": "api.observers",
     "check": "api.sessions",
     "compare": "api.curves",
     "contrast": "api.beams",
@@ -56,6 +59,7 @@ _HOME = {
     "info": "api.about",
     "lab_session": "api.sessions",
     "mu": "api.beams",
+    "observe": "api.observers",
     "open_acquisition": "api.twins",
     "plan": "api.curves",
     "predict": "api.twins",
@@ -77,6 +81,7 @@ __all__ = [
     "Setting",
     "__version__",
     "calibrate",
+    "calibrate_observer",
     "check",
     "compare",
     "contrast",
@@ -88,6 +93,7 @@ __all__ = [
     "info",
     "lab_session",
     "mu",
+    "observe",
     "open_acquisition",
     "plan",
     "predict",

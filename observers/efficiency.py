@@ -74,8 +74,9 @@ class LeftOut:
 
     @property
     def inside(self) -> bool:
-        """Whether the measured a90 lies in the interval."""
-        return self.low <= self.measured <= self.high
+        """Whether the measured a90 lies in the interval widened by its own error, in quadrature."""
+        width = math.hypot(0.5 * math.log(self.high / self.low), 1.959964 * self.log_sd)
+        return abs(math.log(self.measured / self.predicted)) <= width
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,14 +227,14 @@ def fit_efficiency(
     rows = []
     for one, residual, variance, error in zip(known, *outside, errors, strict=True):
         predicted = math.log(one.a90) - residual
-        reach = quantile * math.sqrt(variance + scatter**2)
+        width = quantile * math.sqrt(variance + scatter**2)
         rows.append(
             LeftOut(
                 pair=one.pair,
                 measured=one.a90,
                 predicted=math.exp(predicted),
-                low=math.exp(predicted - reach),
-                high=math.exp(predicted + reach),
+                low=math.exp(predicted - width),
+                high=math.exp(predicted + width),
                 log_sd=float(error),
             )
         )

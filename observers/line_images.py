@@ -283,13 +283,14 @@ class LineImages:
                 )
             )
         low, high = sides
-        one, none = np.ones_like(low[0]), np.zeros_like(low[0])
-        weights = {
-            "residual": (one, -low[2] / high[2]),
-            "quotient": (one, -low[0] / high[0]),
-            "low": (one, none),
-            "high": (none, one),
-        }[image]
+        whole, none = np.ones_like(low[0]), np.zeros_like(low[0])
+        combined: dict[str, tuple[FloatArray, FloatArray]] = {
+            "residual": (whole, -low[2] / high[2]),
+            "quotient": (whole, -low[0] / high[0]),
+            "low": (whole, none),
+            "high": (none, whole),
+        }
+        weights = combined[image]
         return PairImages(
             signal=np.stack([weight * (side[1] - side[0]) for weight, side in zip(weights, sides, strict=True)]),
             quantum=weights[0] ** 2 * low[3] + weights[1] ** 2 * high[3],

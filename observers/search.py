@@ -50,7 +50,7 @@ def _both_lower(z: FloatArray, correlation: float) -> FloatArray:
 
     square = min(correlation**2, 1 - 1e-12)
     at = math.sqrt((1.0 - correlation) / (1.0 + correlation)) * z
-    return np.maximum(ndtr(at) - 2.0 * owens_t(at, math.sqrt((1.0 + square) / (1.0 - square))), 0.0)
+    return np.asarray(np.maximum(ndtr(at) - 2.0 * owens_t(at, math.sqrt((1.0 + square) / (1.0 - square))), 0.0))
 
 
 @lru_cache(maxsize=1)

@@ -30,6 +30,9 @@ FORMAT = "raytwin-runs"
 WEIGHTS_FORMAT = "raytwin-weights"
 STATE_FORMAT = "raytwin-training-state"
 VERSION = 1
+_RECIPE_DEFAULTS = {
+    item.name: item.default for item in dataclasses.fields(Recipe) if item.default is not dataclasses.MISSING
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -315,7 +318,8 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
     for key in ("dataset_sha256", "seed", "started_from", "fresh_noise"):
         if held.get(key) != wanted.get(key):
             different.append(f"{key} ({_short(held.get(key))} there, {_short(wanted.get(key))} now)")
-    old, new = held["recipe"], wanted["recipe"]
+    # a folder of an earlier version lacks fields that did not exist then: they had their defaults
+    old, new = ({**_RECIPE_DEFAULTS, **one["recipe"]} for one in (held, wanted))
     different += [
         f"{key} ({_short(old.get(key))} there, {_short(new.get(key))} now)"
         for key in sorted(set(old) | set(new))

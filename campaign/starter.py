@@ -91,7 +91,9 @@ def make_starter_block(plan: Mapping[str, Any], number: int, twin: Twin, folder:
         except InputError:
             continue  # a drawn object that finds no room in the drawn product
         return path
-    raise InputError(f"block {number}", received=f"{_TRIES} draws without room", expected="objects that fit the products")
+    raise InputError(
+        f"block {number}", received=f"{_TRIES} draws without room", expected="objects that fit the products"
+    )
 
 
 def make_starter_images(
@@ -102,9 +104,7 @@ def make_starter_images(
     from ..generator.twin_io import read_twin
 
     folder.mkdir(parents=True, exist_ok=True)
-    twins = [
-        read_twin(make_starter_line(plan, number, folder)) for number in range(len(plan["lines"]["pixel_mm"]))
-    ]
+    twins = [read_twin(make_starter_line(plan, number, folder)) for number in range(len(plan["lines"]["pixel_mm"]))]
     blocks = []
     for number in range(plan["settings"]["blocks"]):
         blocks.append(make_starter_block(plan, number, twins[number % len(twins)], folder))
@@ -120,7 +120,9 @@ def _settings(ranges: Mapping[str, Any], twin: Twin, rng: np.random.Generator) -
     for _ in range(_TRIES):
         material = str(rng.choice(list(ranges["filter_mm"])))
         most = ranges["filter_mm"][material]
-        filters = (Filter(material=material, thickness_mm=round(float(rng.uniform(0.1, 1.0) * most), 3)),) if most else ()
+        filters = (
+            (Filter(material=material, thickness_mm=round(float(rng.uniform(0.1, 1.0) * most), 3)),) if most else ()
+        )
         exposure_ms = round(float(np.exp(rng.uniform(*np.log(ranges["exposure_ms"])))), 1)
         pair = tuple(
             Setting(
@@ -135,10 +137,12 @@ def _settings(ranges: Mapping[str, Any], twin: Twin, rng: np.random.Generator) -
         for setting in pair:
             mean = predict_flatfield(twin, setting).mean_DN.value
             scale = full_scale(twin, setting, mean)
-            shares.append(mean / (scale[0] if scale is not None else 65535.0))
+            shares.append(mean / (scale[1] if scale is not None else 65535.0))
         if all(ranges["level_share"][0] < share < ranges["level_share"][1] for share in shares):
             return pair[0], pair[1]
-    raise InputError("settings", received=f"{_TRIES} draws outside level_share", expected="exposures that the line can take")
+    raise InputError(
+        "settings", received=f"{_TRIES} draws outside level_share", expected="exposures that the line can take"
+    )
 
 
 def _description(plan: Mapping[str, Any], twin: Twin, number: int, rng: np.random.Generator) -> str:

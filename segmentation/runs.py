@@ -287,11 +287,13 @@ def _state_or_none(runs: Runs, number: int, say: Callable[[str], None]) -> Train
 
 def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
     held, weights = read_weights(path)
-    if (held.scaling, held.classes) != (recipe.scaling, recipe.classes):
+    names = ("scaling", "classes", "architecture", "encoder", "encoder_depth")
+    different = [name for name in names if getattr(held, name) != getattr(recipe, name)]
+    if different:
         raise InputError(
             "start from",
-            received=f"{path}, trained with scaling {held.scaling} and classes {', '.join(held.classes)}",
-            expected=f"scaling {recipe.scaling} and classes {', '.join(recipe.classes)}",
+            received=f"{path}, trained with " + ", ".join(f"{name} {getattr(held, name)}" for name in different),
+            expected=", ".join(f"{name} {getattr(recipe, name)}" for name in different),
             remedy="start from a network of the same recipe",
         )
     return weights

@@ -4,12 +4,15 @@ Each block of images is a file of its own, of one line, one pair of settings, on
 block that is there is not made again. What is drawn depends on the seed and the block's number alone.
 """
 
+import argparse
+import dataclasses
 import math
+import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +20,9 @@ from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..generator.describe import read_description
 from ..generator.twin import Twin
+
+if TYPE_CHECKING:
+    from ..segmentation import Recipe
 
 STARTER_FOLDER = Path(__file__).parents[1] / "data" / "starter"
 _LINE, _BLOCK = 1, 2  # places of the random streams of a seed
@@ -210,6 +216,40 @@ def _description(plan: Mapping[str, Any], twin: Twin, number: int, rng: np.rando
     return "\n".join(lines) + "\n"
 
 
-def with_blocks(plan: Mapping[str, Any], blocks: int) -> dict[str, Any]:
-    """The same plan with another number of blocks."""
-    return {**plan, "settings": {**plan["settings"], "blocks": blocks}}
+def starter_training_recipe(plan: Mapping[str, Any]) -> "Recipe":
+    """How the starter itself is trained: the shipped recipe with the plan's network, steps and rate."""
+    from ..segmentation import RECIPES
+
+    words = plan["training"]
+    return dataclasses.replace(
+        RECIPES["raytwin"],
+        name="starter",
+        architecture=words["architecture"],
+        encoder=words["encoder"],
+        encoder_depth=words["encoder_depth"],
+        steps=words["steps"],
+        batch=words["batch"],
+        learning_rate=words["learning_rate"],
+    )
+
+
+def make_starter(plan: Mapping[str, Any], folder: Path, out: Path, *, tell: Callable[[str], None]) -> None:
+    """Make images and network, and write the weights; what an earlier run left in `folder` is used."""
+    from ..segmentation import open_runs, read_weights, write_safetensors
+    from .trial import train_on_file
+
+    images, runs = folder / "images.h5", folder / "runs"
+    if not images.exists():
+        make_starter_images(plan, folder, images, tell=tell)
+    recipe = starter_training_recipe(plan)
+    train_on_file(images, runs, recipe=recipe, networks=1, seed=plan["training"]["seed"], tell=tell, name="starter")
+    held, weights = read_weights(open_runs(runs).path / "network_000" / "weights.pt")
+    write_safetensors(out, held, weights)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, default=STARTER_FOLDER / "starter.safetensors")
+    parser.add_argument("--folder", type=Path, default=Path("build/starter"), help="of the images and the training")
+    given = parser.parse_args()
+    make_starter(read_starter_plan(), given.folder, given.output, tell=lambda line: print(line, file=sys.stderr))

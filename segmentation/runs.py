@@ -289,11 +289,16 @@ def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
     held, weights = read_weights(path)
     names = ("scaling", "classes", "architecture", "encoder", "encoder_depth")
     different = [name for name in names if getattr(held, name) != getattr(recipe, name)]
+
+    def said(of: Recipe) -> str:
+        values = ((name.replace("_", " "), getattr(of, name)) for name in different)
+        return ", ".join(f"{name} {', '.join(value) if isinstance(value, tuple) else value}" for name, value in values)
+
     if different:
         raise InputError(
             "start from",
-            received=f"{path}, trained with " + ", ".join(f"{name} {getattr(held, name)}" for name in different),
-            expected=", ".join(f"{name} {getattr(recipe, name)}" for name in different),
+            received=f"{path}, trained with {said(held)}",
+            expected=said(recipe),
             remedy="start from a network of the same recipe",
         )
     return weights

@@ -18,7 +18,7 @@ from .recipe import Recipe, recipe_from_mapping
 
 STARTER = "starter"
 STARTER_PATH = Path(__file__).parents[1] / "data" / "starter" / "starter.safetensors"
-_FORMAT = "raytwin-weights"
+_KEY = "raytwin_recipe"
 
 
 def write_safetensors(path: str | os.PathLike[str], recipe: Recipe, weights: Mapping[str, Any]) -> None:
@@ -36,7 +36,8 @@ def write_safetensors(path: str | os.PathLike[str], recipe: Recipe, weights: Map
         name: (value.half() if value.is_floating_point() else value).detach().cpu().contiguous()
         for name, value in weights.items()
     }
-    content = save(packed, metadata={"format": _FORMAT, "recipe": json.dumps(dataclasses.asdict(recipe))})
+    # one key alone: safetensors writes several in an order that changes from run to run
+    content = save(packed, metadata={_KEY: json.dumps(dataclasses.asdict(recipe))})
     with whole_file(path) as temporary:
         temporary.write_bytes(content)
 
@@ -54,7 +55,7 @@ def read_safetensors(path: str | os.PathLike[str]) -> tuple[Recipe, dict[str, An
         with safe_open(str(path), framework="pt") as held:
             metadata = held.metadata() or {}
             weights = {name: held.get_tensor(name) for name in held.keys()}  # noqa: SIM118
-        recipe = recipe_from_mapping(json.loads(metadata["recipe"]))
+        recipe = recipe_from_mapping(json.loads(metadata[_KEY]))
     except (FileNotFoundError, OSError, SafetensorError) as error:
         received = f"a file that cannot be read ({' '.join(str(error).split())[:60]})"
     except (InputError, KeyError, TypeError, ValueError) as error:

@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -96,6 +96,10 @@ stories: $(READY)
 	mkdir -p build/stories/$$story && \
 	(cd build/stories/$$story && PATH=$(CURDIR)/$(BIN):$$PATH sh $(CURDIR)/docs/stories/$$story.sh) || exit 1; done
 
+# the starter network again, from data/starter/starter.toml; about an hour on one core; a stopped run goes on
+starter: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m raytwin.campaign.starter --folder build/starter
+
 # speed and memory as this machine has them, each against its reference in the same run
 benchmark: $(READY)
 	$(BIN)/python benchmarks/predict_settings.py
@@ -103,6 +107,7 @@ benchmark: $(READY)
 	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/generate_pair.py
 	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/project_polychromatic.py
 	$(BIN)/python benchmarks/cost_table.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/training_step.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/pod_bootstrap.py
 
 # peak memory of calibrate at full size, 500 and 5000 frames: 7.3 GB of disk for a while, five minutes

@@ -37,9 +37,10 @@ class DemoPlan:
     Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the
     paper's line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series;
     products, test_products (images of the two sets); exposures_ms of the fast settings; generated (training pairs an
-    exposure); networks an exposure; first_steps, shared_steps (of the one network they all start from: on the least noisy
-    images, then on all exposures), steps (of each network after that); batch; seed; recipe of the training; gap (of the
-    chapter that plants an effect).
+    exposure); networks an exposure; start (`starter`: networks start from the one that comes with raytwin; `shared`: from one
+    that is trained first, with the steps that follow); first_steps, shared_steps (on the least noisy images, then on all
+    exposures); steps (of each network after its start); batch; seed; recipe of the training where the start is `shared`; gap
+    (of the chapter that plants an effect).
     """
 
     size: tuple[int, int] = (96, 128)
@@ -52,6 +53,7 @@ class DemoPlan:
     exposures_ms: tuple[float, ...] = (100.0, 50.0, 20.0)
     generated: int = 144
     networks: int = 3
+    start: str = "shared"
     first_steps: int = 200
     shared_steps: int = 60
     steps: int = 30
@@ -61,6 +63,8 @@ class DemoPlan:
     gap: GapPlan = field(default_factory=GapPlan)
 
     def __post_init__(self) -> None:
+        if self.start not in ("starter", "shared"):
+            raise InputError("start", received=self.start, expected="starter or shared")
         for name in ("products", "test_products", "generated", "networks", "first_steps", "shared_steps", "steps"):
             if getattr(self, name) < 1:
                 raise InputError(name, received=getattr(self, name), expected="1 or more")
@@ -76,6 +80,7 @@ PAPER_PLAN = DemoPlan(
     test_products=84,
     generated=254,
     networks=100,
+    start="shared",
     first_steps=4000,
     shared_steps=2000,
     steps=2000,
@@ -245,26 +250,16 @@ def _datasets(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> None
 def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:
     """Networks trained, tried and compared.
 
-    One shared start, first from the least noisy images (noisier ones teach a new network nothing for hundreds of steps), then
-    from all exposures; a few networks for each exposure after that.
+    Each starts from the network that comes with raytwin, or from one shared by all that is trained before.
     """
     at = chain.path
-    common = ["--recipe", plan.recipe, "--batch", str(plan.batch), "--seed", str(plan.seed)]
-    _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_clear.h5")
-    _mix(chain, [f"train_{exposure:g}ms.h5" for exposure in plan.exposures_ms], "train_mixed.h5")
-    first = chain.step(
-        "train_first",
-        ["train", at("train_clear.h5"), "-o", at("runs_first"), *common, "--networks", "1",
-         "--steps", str(plan.first_steps)],
-        outputs=["runs_first"],
-    )  # fmt: skip
-    shared = chain.step(
-        "train_shared",
-        ["train", at("train_mixed.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
-         "--steps", str(plan.shared_steps), "--start-from", at("runs_first")],
-        outputs=["runs_shared"],
-    )  # fmt: skip
-    training: dict[str, Any] = {"first": first, "shared": shared}
+    common = ["--batch", str(plan.batch), "--seed", str(plan.seed)]
+    training: dict[str, Any] = {}
+    start = "starter"
+    if plan.start == "shared":
+        common += ["--recipe", plan.recipe]
+        training = _shared_start(chain, plan, common)
+        start = at("runs_shared")
     detection: dict[str, Any] = {}
     pod: dict[str, Any] = {}
     compared: dict[str, Any] = {}
@@ -274,7 +269,7 @@ def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict
         training[number] = chain.step(
             f"train_{number}",
             ["train", at(dataset), "-o", at(f"runs_{number}"), *common, "--networks", str(plan.networks),
-             "--steps", str(plan.steps), "--start-from", at("runs_shared")],
+             "--steps", str(plan.steps), "--start-from", start],
             outputs=[f"runs_{number}"],
         )  # fmt: skip
         kinds = ["real"] if exposure == 1000.0 else ["real", "test"]
@@ -289,6 +284,29 @@ def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict
         if len(kinds) == 2:
             compared[number] = _compared(chain, number)
     return {"training": training, "detection": detection, "pod": pod, "compare": compared}
+
+
+def _shared_start(chain: _Chain, plan: DemoPlan, common: Sequence[str]) -> dict[str, Any]:
+    """One network that all others start from, `runs_shared`.
+
+    First from the least noisy images (noisier ones teach a new network nothing for hundreds of steps), then from all exposures.
+    """
+    at = chain.path
+    _mix(chain, ["references.h5", f"train_{max(plan.exposures_ms):g}ms.h5"], "train_clear.h5")
+    _mix(chain, [f"train_{exposure:g}ms.h5" for exposure in plan.exposures_ms], "train_mixed.h5")
+    first = chain.step(
+        "train_first",
+        ["train", at("train_clear.h5"), "-o", at("runs_first"), *common, "--networks", "1",
+         "--steps", str(plan.first_steps)],
+        outputs=["runs_first"],
+    )  # fmt: skip
+    shared = chain.step(
+        "train_shared",
+        ["train", at("train_mixed.h5"), "-o", at("runs_shared"), *common, "--networks", "1",
+         "--steps", str(plan.shared_steps), "--start-from", at("runs_first")],
+        outputs=["runs_shared"],
+    )  # fmt: skip
+    return {"first": first, "shared": shared}
 
 
 def setting_pair(exposure_ms: float) -> tuple[Setting, Setting]:

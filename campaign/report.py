@@ -307,5 +307,7 @@ def _limits(result: Mapping[str, Any]) -> list[str]:
         " in the last table.",
         f"Products are {plan['size'][0]} x {plan['size'][1]} pixels of {plan['pixel_mm']} mm, coarser than the paper's,"
         " with the detector nearer than its photon numbers would have it: the contrasts are not those of the paper's line.",
-        "The networks of all exposures start from one shared network, so they are less independent than networks from scratch.",
+        "The networks of all exposures start from one "
+        + ("that comes with raytwin" if plan["start"] == "starter" else "shared network")
+        + ", so they are less independent than networks from scratch.",
     ]

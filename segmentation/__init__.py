@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .runs_io import NetworkResult, Runs, finished_networks, open_runs, read_result, read_weights
     from .scaling import SCALINGS, crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
     from .training import EpochResult, TrainingState, count_epochs, iterate_training, learning_rate_at
+    from .weights_io import STARTER_PATH, read_safetensors, starter_recipe, write_safetensors
 
 _LAZY = {
     "detection": (
@@ -48,6 +49,7 @@ _LAZY = {
     "runs_io": ("NetworkResult", "Runs", "finished_networks", "open_runs", "read_result", "read_weights"),
     "scaling": ("SCALINGS", "crop_to_shape", "pad_to_multiple", "scale_min_max", "scale_residual"),
     "training": ("EpochResult", "TrainingState", "count_epochs", "iterate_training", "learning_rate_at"),
+    "weights_io": ("STARTER_PATH", "read_safetensors", "starter_recipe", "write_safetensors"),
 }
 _MODULE_OF_NAME = {name: module for module, names in _LAZY.items() for name in names}
 
@@ -57,6 +59,7 @@ __all__ = [
     "MARK_THRESHOLD",
     "RECIPES",
     "SCALINGS",
+    "STARTER_PATH",
     "Detection",
     "EpochResult",
     "Examples",
@@ -83,15 +86,18 @@ __all__ = [
     "predict_probabilities",
     "rate_of_crossed_trials",
     "read_result",
+    "read_safetensors",
     "read_weights",
     "recall_in_mask",
     "recipe_for_fine_tuning",
     "scale_min_max",
     "scale_residual",
     "split_for_training",
+    "starter_recipe",
     "summarise_detections",
     "train_networks",
     "write_detections",
+    "write_safetensors",
 ]
 
 

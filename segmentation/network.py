@@ -1,4 +1,4 @@
-"""The network: DeepLabV3Plus with an EfficientNet-B0 encoder, two channels in. torch is loaded when first used."""
+"""Networks by name, two channels in; DeepLabV3Plus with an EfficientNet-B0 encoder by default. torch is loaded when first used."""
 
 import math
 import warnings
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ._torch import load_segmentation_models, load_torch
-from .recipe import ENCODER, Recipe
+from .recipe import Recipe
 from .scaling import SCALINGS, crop_to_shape, pad_to_multiple
 
-OUTPUT_STRIDE_PX = 16
+_UNET_CHANNELS = (64, 32, 16, 16, 16)
 
 
 def build_network(recipe: Recipe, *, seed: int, pretrained: bool = True) -> Any:
@@ -41,16 +41,22 @@ def build_network(recipe: Recipe, *, seed: int, pretrained: bool = True) -> Any:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                network = models.DeepLabV3Plus(
-                    ENCODER,
-                    encoder_depth=5,
+                network = models.create_model(
+                    recipe.architecture,
+                    recipe.encoder,
+                    encoder_depth=recipe.encoder_depth,
                     encoder_weights=encoder_weights,
                     in_channels=2,
                     classes=len(recipe.classes),
+                    **_decoder_options(recipe),
                 )
         except Exception as error:
             if encoder_weights is None:
-                raise
+                raise InputError(
+                    "network",
+                    received=f"{recipe.architecture} with the encoder {recipe.encoder} ({' '.join(str(error).split())[:90]})",
+                    expected="an architecture and an encoder of segmentation-models-pytorch, such as FPN and resnet18",
+                ) from None
             raise InputError(
                 "encoder weights",
                 received=f"{encoder_weights}, which could not be fetched ({type(error).__name__}: {error})",
@@ -67,6 +73,13 @@ def build_network(recipe: Recipe, *, seed: int, pretrained: bool = True) -> Any:
         odds = recipe.initial_probability / (1.0 - recipe.initial_probability)
         torch.nn.init.constant_(network.segmentation_head[0].bias, math.log(odds))
     return network.to(memory_format=torch.channels_last)
+
+
+def _decoder_options(recipe: Recipe) -> dict[str, Any]:
+    """What an architecture needs to be told so that its decoder fits the encoder's depth."""
+    if recipe.architecture in ("Unet", "UnetPlusPlus", "MAnet"):
+        return {"decoder_channels": _UNET_CHANNELS[: recipe.encoder_depth]}
+    return {}
 
 
 def choose_device(name: str) -> str:
@@ -115,7 +128,7 @@ def probabilities_from_scaled(
     """As `predict_probabilities`, from images that are scaled already."""
     torch = load_torch()
     shape = (int(scaled.shape[-2]), int(scaled.shape[-1]))
-    padded = pad_to_multiple(scaled, multiple=OUTPUT_STRIDE_PX)
+    padded = pad_to_multiple(scaled, multiple=recipe.multiple_px)
     network.eval()
     pieces = []
     with torch.inference_mode():

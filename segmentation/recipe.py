@@ -13,7 +13,9 @@ from .scaling import SCALINGS
 
 FOREIGN_OBJECT = "foreign_object"
 PRODUCT = "product"
+ARCHITECTURE = "DeepLabV3Plus"
 ENCODER = "efficientnet-b0"
+_DILATED = ("DeepLabV3", "DeepLabV3Plus")  # the encoder stops at a sixteenth (DeepLabV3: an eighth) of the resolution
 
 _CHOICES = {
     "scaling": tuple(SCALINGS),
@@ -33,7 +35,9 @@ class Recipe:
     last); optimizer; learning_rate (peak of a one-cycle schedule); weight_decay; schedule; steps or epochs (exactly
     one; an epoch is one pass over the training images, steps are rounded up to whole epochs); batch (images a step, 2
     or more); crop_px (side of the square cut round the foreign object, None = whole images); batch_norm_momentum (None
-    = the encoder's own 0.01); initial_probability (of a marked pixel before training, None = 0.5); encoder_weights.
+    = the encoder's own 0.01); initial_probability (of a marked pixel before training, None = 0.5); encoder_weights;
+    architecture and encoder (names of segmentation-models-pytorch, such as `FPN` and `resnet18`); encoder_depth (halvings of
+    the resolution, 3 to 5).
     """
 
     name: str
@@ -52,6 +56,9 @@ class Recipe:
     batch_norm_momentum: float | None = None
     initial_probability: float | None = None
     encoder_weights: str | None = None
+    architecture: str = ARCHITECTURE
+    encoder: str = ENCODER
+    encoder_depth: int = 5
 
     def __post_init__(self) -> None:
         for field, choices in _CHOICES.items():
@@ -75,6 +82,8 @@ class Recipe:
             value = getattr(self, field)
             if value is not None and value < least:
                 raise InputError(field, received=value, expected=f"a whole number, {least} or more")
+        if not 3 <= self.encoder_depth <= 5:
+            raise InputError("encoder depth", received=self.encoder_depth, expected="3, 4 or 5")
         for field in ("batch_norm_momentum", "initial_probability"):
             value = getattr(self, field)
             if value is not None and not 0 < value < 1:
@@ -84,6 +93,11 @@ class Recipe:
     def foreign_object_channel(self) -> int:
         """Index of the network's output channel that marks the foreign object."""
         return len(self.classes) - 1
+
+    @property
+    def multiple_px(self) -> int:
+        """Rows and columns of what the network is given are multiples of it."""
+        return 16 if self.architecture in _DILATED else 2**self.encoder_depth
 
 
 # The paper does not say so, but the authors' code starts its encoder from ImageNet, its library's default: the option

@@ -287,11 +287,18 @@ def _state_or_none(runs: Runs, number: int, say: Callable[[str], None]) -> Train
 
 def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
     held, weights = read_weights(path)
-    if (held.scaling, held.classes) != (recipe.scaling, recipe.classes):
+    names = ("scaling", "classes", "architecture", "encoder", "encoder_depth")
+    different = [name for name in names if getattr(held, name) != getattr(recipe, name)]
+
+    def said(of: Recipe) -> str:
+        values = ((name.replace("_", " "), getattr(of, name)) for name in different)
+        return ", ".join(f"{name} {', '.join(value) if isinstance(value, tuple) else value}" for name, value in values)
+
+    if different:
         raise InputError(
             "start from",
-            received=f"{path}, trained with scaling {held.scaling} and classes {', '.join(held.classes)}",
-            expected=f"scaling {recipe.scaling} and classes {', '.join(recipe.classes)}",
+            received=f"{path}, trained with {said(held)}",
+            expected=said(recipe),
             remedy="start from a network of the same recipe",
         )
     return weights

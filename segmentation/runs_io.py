@@ -25,11 +25,15 @@ from ..files import sha256_of_file, whole_file
 from ._torch import load_torch
 from .recipe import Recipe, recipe_from_mapping
 from .training import EpochResult, TrainingState
+from .weights_io import STARTER, STARTER_PATH, read_safetensors
 
 FORMAT = "raytwin-runs"
 WEIGHTS_FORMAT = "raytwin-weights"
 STATE_FORMAT = "raytwin-training-state"
 VERSION = 1
+_RECIPE_DEFAULTS = {
+    item.name: item.default for item in dataclasses.fields(Recipe) if item.default is not dataclasses.MISSING
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -267,11 +271,13 @@ def read_result(runs: Runs, network: int) -> NetworkResult:
 
 
 def read_weights(path: str | os.PathLike[str]) -> tuple[Recipe, dict[str, Any]]:
-    """Recipe and weights of a finished network, from its weights.pt.
+    """Recipe and weights of a finished network, from its weights.pt or a safetensors file.
 
     Raises:
         FileFormatError: not there, truncated, or another kind of file.
     """
+    if Path(path).suffix == ".safetensors":
+        return read_safetensors(path)
     held = _load(Path(path), format_name=WEIGHTS_FORMAT)
     try:
         recipe = recipe_from_mapping(json.loads(held["recipe"]))
@@ -286,13 +292,14 @@ def starting_weights_files(path: str | os.PathLike[str], networks: Iterable[int]
     """Which weights file each network starts from; key -1 stands for one shared by all.
 
     Args:
-        path: a weights.pt, or a RUNS folder: its only network for all, else the network of the same number.
+        path: `starter` (the network that comes with raytwin), a weights.pt or .safetensors file, or a RUNS folder: its only
+            network for all, else the network of the same number.
         networks: numbers of the networks to be trained.
 
     Raises:
         InputError: the folder has no finished network, or none of a number.
     """
-    source = Path(path)
+    source = STARTER_PATH if str(path) == STARTER else Path(path)
     if not source.is_dir():
         return {-1: source}
     runs = open_runs(source)
@@ -315,7 +322,8 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
     for key in ("dataset_sha256", "seed", "started_from", "fresh_noise"):
         if held.get(key) != wanted.get(key):
             different.append(f"{key} ({_short(held.get(key))} there, {_short(wanted.get(key))} now)")
-    old, new = held["recipe"], wanted["recipe"]
+    # a folder of an earlier version lacks fields that did not exist then: they had their defaults
+    old, new = ({**_RECIPE_DEFAULTS, **one["recipe"]} for one in (held, wanted))
     different += [
         f"{key} ({_short(old.get(key))} there, {_short(new.get(key))} now)"
         for key in sorted(set(old) | set(new))

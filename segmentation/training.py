@@ -18,7 +18,7 @@ from .augmentation import AUGMENTATIONS, crop_around_object
 from .detection import DETECTION_RECALL, MARK_THRESHOLD, recall_in_mask
 from .examples import Examples
 from .losses import LOSSES
-from .network import OUTPUT_STRIDE_PX, build_network, tensor_from_array
+from .network import build_network, tensor_from_array
 from .recipe import Recipe
 from .scaling import crop_to_shape, pad_to_multiple
 
@@ -215,7 +215,7 @@ def _augmented(
     image, masks = AUGMENTATIONS[recipe.augmentation](*example, generator=generator)
     if recipe.crop_px is not None:
         image, masks = crop_around_object(image, masks, size_px=recipe.crop_px, generator=generator)
-    return pad_to_multiple(image, multiple=OUTPUT_STRIDE_PX), pad_to_multiple(masks, multiple=OUTPUT_STRIDE_PX)
+    return pad_to_multiple(image, multiple=recipe.multiple_px), pad_to_multiple(masks, multiple=recipe.multiple_px)
 
 
 def _batches(count: int, batch: int, generator: np.random.Generator) -> list[NDArray[np.intp]]:
@@ -237,8 +237,8 @@ def _validate(
     with torch.inference_mode():
         for first in range(0, len(validation), _VALIDATION_BATCH):
             pairs = [validation[number] for number in range(first, min(first + _VALIDATION_BATCH, len(validation)))]
-            images = np.stack([pad_to_multiple(image, multiple=OUTPUT_STRIDE_PX) for image, _ in pairs])
-            masks = np.stack([pad_to_multiple(mask, multiple=OUTPUT_STRIDE_PX) for _, mask in pairs])
+            images = np.stack([pad_to_multiple(image, multiple=recipe.multiple_px) for image, _ in pairs])
+            masks = np.stack([pad_to_multiple(mask, multiple=recipe.multiple_px) for _, mask in pairs])
             logits = network(tensor_from_array(images, device=device))
             # Weighted by images, so that a short last batch does not count for more.
             losses += [float(loss_function(logits, tensor_from_array(masks, device=device)))] * len(pairs)

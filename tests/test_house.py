@@ -30,7 +30,10 @@ BELOW = {
     "calibration": {"acquisition", "materials", "spectra", "generator"},
     "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod"},
 }
-SHIPPED = {"raytwin.data.calibration": "data/calibration"}  # a folder of data without modules
+SHIPPED = {
+    "raytwin.data.calibration": "data/calibration",
+    "raytwin.data.starter": "data/starter",
+}  # a folder of data without modules
 ABOVE = {"api", "commands", "explore"}  # in src/raytwin, above every room
 COMPOSERS = {"campaign", "commands", "api", "explore"}  # may import every room
 MAY_IMPORT_LAB = {"lab", *COMPOSERS}

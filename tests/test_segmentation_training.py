@@ -507,7 +507,7 @@ def test_starting_from_a_network_of_another_recipe_is_refused(dataset_file, trai
     recipe = dataclasses.replace(QUICK, scaling="min_max")
     with read_dataset(dataset_file) as dataset:
         start = trained[0] / "network_000" / "weights.pt"
-        with pytest.raises(InputError, match=r"trained with scaling residual .* expected scaling min_max"):
+        with pytest.raises(InputError, match=r"trained with scaling residual; expected scaling min_max"):
             train_networks(dataset, tmp_path / "r", recipe=recipe, start_from=start)
     assert not (tmp_path / "r").exists()
 

@@ -512,13 +512,15 @@ def train(
     output: PathLike,
     *,
     networks: int = 1,
-    recipe: "Recipe | str" = "raytwin",
+    recipe: "Recipe | str | None" = None,
     epochs: int | None = None,
     steps: int | None = None,
     batch: int | None = None,
     learning_rate: float | None = None,
     crop_px: int | None = None,
     encoder_weights: str | None = None,
+    architecture: str | None = None,
+    encoder: str | None = None,
     start_from: PathLike | None = None,
     fresh_noise: "Twin | PathLike | None" = None,
     low: "Setting | str | None" = None,
@@ -534,11 +536,14 @@ def train(
         dataset: a dataset file, an open one, or what `generate` returned.
         output: folder of networks of one dataset, recipe, seed and start, new or to go on with.
         networks: how many the folder holds at the end.
-        recipe: `raytwin`, `as_published`, or a `Recipe`; the arguments up to encoder_weights change it.
+        recipe: `raytwin`, `as_published`, or a `Recipe`; the arguments up to encoder change it. None: `raytwin`, or that of
+            the starter where networks start from it.
         epochs, steps: passes over the training images, or training steps.
         batch, learning_rate, crop_px: of a step.
         encoder_weights: `imagenet` (downloaded once).
-        start_from: a folder of networks or a weights.pt to start from; steps and learning rate are then smaller.
+        architecture, encoder: names of segmentation-models-pytorch, such as `FPN` and `resnet18`.
+        start_from: `starter` (comes with raytwin), a folder of networks, a weights.pt or a .safetensors file; steps
+            and learning rate are then smaller.
         fresh_noise: a twin that draws other noise for every epoch, at the settings `low` and `high`; `dataset` holds references.
         device: `auto`, `cpu`, `cuda` or `mps`.
         threads: processor threads; None: all.
@@ -568,6 +573,8 @@ def train(
             "learning_rate": learning_rate,
             "crop_px": crop_px,
             "encoder_weights": encoder_weights,
+            "architecture": architecture,
+            "encoder": encoder,
         },
     )
     if (fresh_noise is None, low is None, high is None) not in ((True,) * 3, (False,) * 3):
@@ -607,10 +614,14 @@ def train(
 
 
 def _recipe(
-    recipe: "Recipe | str", *, start_from: Any, length: Mapping[str, Any], changes: Mapping[str, Any]
+    recipe: "Recipe | str | None", *, start_from: Any, length: Mapping[str, Any], changes: Mapping[str, Any]
 ) -> "Recipe":
-    from ..segmentation import RECIPES, recipe_for_fine_tuning
+    from ..segmentation import RECIPES, recipe_for_fine_tuning, starter_recipe
 
+    if recipe is None and str(start_from) == "starter":
+        recipe = starter_recipe()
+        start_from = None  # its steps and rate are those of fine-tuning already
+    recipe = "raytwin" if recipe is None else recipe
     if isinstance(recipe, str):
         if recipe not in RECIPES:
             raise InputError("recipe", received=recipe, expected="one of " + ", ".join(RECIPES))

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 EXAMPLE = """example:
   raytwin train images.h5 -o networks --networks 5 --seed 1
   raytwin train images_20ms.h5 -o networks_20ms --start-from networks
+  raytwin train images.h5 -o quick --start-from starter          # has learnt already: 60 steps of a small network
   raytwin train references.h5 -o fresh_20ms --fresh-noise twin.h5 \
     --low kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05 --high kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05
 """
@@ -32,7 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--networks", type=int, default=1, help="how many networks the folder holds at the end (1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of all randomness (0)")
-    parser.add_argument("--recipe", default="raytwin", help="raytwin (default) or as_published")
+    parser.add_argument(
+        "--recipe",
+        help="raytwin (default), as_published; with --start-from starter its own, a small network, by default",
+    )
+    parser.add_argument("--architecture", help="of segmentation-models-pytorch, such as FPN or Unet (DeepLabV3Plus)")
+    parser.add_argument("--encoder", help="of segmentation-models-pytorch, such as resnet18 (efficientnet-b0)")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--epochs", type=int, help="passes over the training images")
     length.add_argument("--steps", type=int, help="training steps, rounded up to whole passes")
@@ -41,8 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--crop-px", type=int, help="train on squares of this side round the foreign objects")
     parser.add_argument(
         "--start-from",
-        metavar="RUNS|WEIGHTS",
-        help="start from trained networks: a folder (its only network, or the one of the same number) or a weights.pt;"
+        metavar="starter|RUNS|WEIGHTS",
+        help="start from trained networks: starter (comes with raytwin), a folder (its only network, or the one of"
+        " the same number) or a weights file;"
         " without --epochs or --steps a quarter of the recipe's steps, without --learning-rate a third of its rate",
     )
     parser.add_argument(
@@ -82,6 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
             learning_rate=arguments.learning_rate,
             crop_px=arguments.crop_px,
             encoder_weights=None if arguments.encoder_weights == "none" else arguments.encoder_weights,
+            architecture=arguments.architecture,
+            encoder=arguments.encoder,
             start_from=arguments.start_from,
             fresh_noise=arguments.fresh_noise,
             low=arguments.low,

@@ -136,6 +136,24 @@ class Setting:
         current = self.tube_current_mA
         return None if current is None else current * self.exposure_ms / 1000.0
 
+    def stated_load_mAs(self) -> float:
+        """Charge of one frame (mAs).
+
+        Raises:
+            InputError: neither current nor power is known.
+
+        Example:
+            >>> from raytwin.acquisition.setting import Setting
+            >>> Setting(kV=40, power_W=20, exposure_ms=20).stated_load_mAs()
+            10.0
+        """
+        load = self.tube_load_mAs
+        if load is None:
+            raise InputError(
+                "setting", received=str(self), expected="a tube load", remedy="give power_w=... or current_ma=..."
+            )
+        return load
+
     def __str__(self) -> str:
         words = [f"kv={_number(self.kV)}"]
         if self.power_W is not None:

@@ -494,10 +494,7 @@ def _check_pair(pair: Pair) -> None:
             expected="one speed for both images: there is one belt",
         )
     for setting in pair:
-        if setting.tube_load_mAs is None:
-            raise InputError(
-                "setting", received=str(setting), expected="a tube load", remedy="give power_w=... or current_ma=..."
-            )
+        setting.stated_load_mAs()
         for layer in setting.filters:
             material_from_name(layer.material)
 

@@ -264,11 +264,7 @@ def _beam_of_twin(
 
 
 def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | None, intervals: bool = False) -> _Beam:
-    load = setting.tube_load_mAs
-    if load is None:
-        raise InputError(
-            "setting", received=str(setting), expected="a tube load", remedy="give power_w=... or current_ma=..."
-        )
+    load = setting.stated_load_mAs()
     if line.tube is None:
         energies, bare, photons = _photons_of_line(line, setting, library)
         warnings: tuple[str, ...] = ()

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
 from ..generator.binning import refuse_binning
+from ..generator.line_limits import broken_limits
+from ..generator.predict import full_scale
 from ..generator.predict_many import Levels, predict_levels
 from ..generator.present_line import present_line
 from ..generator.psf import whole_spectrum
@@ -223,11 +225,6 @@ class LineImages:
         )
 
     def _levels(self, settings: Sequence[Setting]) -> Levels:
-        for one in settings:
-            if one.tube_load_mAs is None:
-                raise InputError(
-                    "setting", received=str(one), expected="a tube load", remedy="give power_w=... or current_ma=..."
-                )
         distance = {one.source_detector_mm for one in settings}
         if len(distance) > 1:
             raise InputError(
@@ -237,10 +234,29 @@ class LineImages:
             self.twin,
             kV=[one.kV for one in settings],
             filters=[one.filters for one in settings],
-            load_mAs=[one.tube_load_mAs or 0.0 for one in settings],
+            load_mAs=[one.stated_load_mAs() for one in settings],
             averaged=[one.averaged for one in settings],
             source_detector_mm=distance.pop(),
         )
+
+    def reasons_against(self, pairs: Sequence[Pair]) -> tuple[str, ...]:
+        """Why images at each pair (pair,) cannot be taken; empty: they can.
+
+        A limit of tube, readout or belt is broken, or the open field, which every image is divided by, saturates.
+        """
+        reasons = [""] * len(pairs)
+        for side in (0, 1):
+            settings = [pair[side] for pair in pairs]
+            for number, (one, mean_DN) in enumerate(zip(settings, self._levels(settings).mean_DN, strict=True)):
+                broken = broken_limits(self.twin.instrument, one)
+                held = full_scale(self.twin, one, float(mean_DN))
+                if broken:
+                    reasons[number] = reasons[number] or str(broken[0])
+                elif held is not None and held[0] > held[1]:
+                    reasons[number] = reasons[number] or (
+                        f"the open field saturates at {one}: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN"
+                    )
+        return tuple(reasons)
 
     def pair_images(self, pairs: Sequence[Pair], objects: ForeignObjects, *, image: str = "residual") -> PairImages:
         """Signals and noise of one combined image at every pair of settings; see the module.

@@ -39,8 +39,8 @@ class Observer:
     """Who looks.
 
     Fields: detector (a key of `DETECTORS`); image (a key of `line_images.IMAGES`); false_alarm_rate (share of images without object
-    that show an alarm); efficiency (0 to 1, of d'^2); internal_noise (standard deviation in a pixel of the combined log image,
-    added white); link and log_size of curves that are fitted to sampled objects.
+    that show an alarm); efficiency (of d'^2; above 1 where networks use more than this image); internal_noise (standard deviation
+    in a pixel of the combined log image, added white); link and log_size of curves that are fitted to sampled objects.
 
     Example:
         >>> from raytwin.observers import Observer

@@ -150,7 +150,9 @@ def test_matched_filters_on_drawn_noise_find_what_the_curve_says(line):
     images = line.pair_images([pair], objects)
     rng = np.random.default_rng(2)
     cells, count = 64, 4000
-    for number in np.flatnonzero(np.abs(found.pod[0] - 0.5) < 0.45)[:3]:
+    tried = np.flatnonzero(np.abs(found.pod[0] - 0.5) < 0.45)[:3]
+    assert len(tried) == 3
+    for number in tried:
         place = number // 4
         profile = profile_of_shape(
             Shape(kind="rod", width=0.2, height=0.2),
@@ -163,13 +165,11 @@ def test_matched_filters_on_drawn_noise_find_what_the_curve_says(line):
         transfer = line.twin.noise.spread.value.transfer(frequency[:, None], frequency[None, :])
         contrast = images.signal[:, 0, number].sum() / objects.object_mm[number]
         spectrum = np.fft.fft2(profile, s=(cells, cells)) * transfer * contrast
-        template = np.fft.ifft2(spectrum).real
         power = images.quantum[0, number] * whole_spectrum(line.twin.noise.spread.value.noise_power(cells))
         power += images.white[0, number]
         noise = np.fft.fft2(rng.standard_normal((count, cells, cells))) * np.sqrt(power)
         values = np.fft.ifft2((noise + spectrum) * np.conj(spectrum)).real[:, 0, 0]
         values /= math.sqrt(np.sum(np.abs(spectrum) ** 2 * power) / cells**2)
-        assert template.shape == (cells, cells)
         hits = float((values > found.threshold[0, number]).mean())
         pod = float(found.pod[0, number])
         assert hits == pytest.approx(pod, abs=4 * math.sqrt(pod * (1 - pod) / count) + 0.01)
@@ -338,3 +338,17 @@ def test_a_calibrated_observer_is_read_back_as_written(line, tmp_path):
         read_efficiency(tmp_path / "cut.json")
     with pytest.raises(InputError, match="4 or more"):
         fit_efficiency(line, measured[:3], objects, observer=Observer())
+
+
+def test_a_setting_that_the_line_cannot_have_gets_no_number(line, make_model_twin):
+    import raytwin as rt
+
+    words = {"product": "chicken_breast:16", "foreign_object": "rib_bone"}
+    found = rt.observe(line.twin, [pair_at(20), pair_at(60000)], **words)
+    assert found.rows[0]["a90"] is not None and 0 < found.pod[0][-1] <= 1
+    assert found.rows[1]["a50"] is None and found.rows[1]["a90"] is None and found.rows[1]["a90_delta_R"] is None
+    assert all(math.isnan(one) for one in found.pod[1])
+    assert sum("saturates" in text for text in found.warnings) == 1
+    weak = dataclasses.replace(line.twin, instrument=dataclasses.replace(line.twin.instrument, maximum_kV=80.0))
+    refused = rt.observe(weak, pair_at(20), **words)
+    assert refused.rows[0]["a90"] is None and any("kV" in text for text in refused.warnings)

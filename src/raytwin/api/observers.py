@@ -127,7 +127,9 @@ class CalibratedObserver(Result):
             f" {one.observer.internal_noise:.3g}; settings left out are met to {100 * one.left_out_rms:.1f} % (rms)"
         )
         return Table(
-            title=title, header=("a90 of networks", "predicted", "95 % interval", "inside", "setting"), rows=rows
+            title=title,
+            header=("a90 of networks", "predicted", "95 % interval", "agrees within both errors", "setting"),
+            rows=rows,
         )
 
 
@@ -157,7 +159,8 @@ def observe(
     A linear observer reads them off the twin: the object's signal in the log images, the noise of quanta and electronics with its
     correlations, the belt's motion, and a threshold for a search of the whole image. Without `calibrated` it is the detector itself:
     an order of settings, and what signal and noise allow in its image. With it, a90 is what networks as in the calibration reach,
-    with a 95 % interval. Scatter and effects in images are left out.
+    with a 95 % interval. Scatter and effects in images are left out. A setting that the line cannot have, or whose open field
+    saturates, gets no number; `warnings` say why.
 
     Args:
         twin: a calibrated line with a spectral part.
@@ -185,6 +188,8 @@ def observe(
         >>> 1 < found.rows[0]["a90"]["value"] < 30
         True
     """
+    import numpy as np
+
     from ..observers import LineImages, Observer, observe_settings, predicted_sizes
 
     pairs = _pairs(settings)
@@ -231,7 +236,8 @@ def observe(
         )
     found = observe_settings(line, pairs, objects, observer=observer, texture=texture)
     expected = None if efficiency is None else predicted_sizes(line, pairs, objects, efficiency, texture=texture)
-    warnings = list(line.warnings)
+    against = line.reasons_against(pairs)
+    warnings = [*line.warnings, *(reason for reason in against if reason)]
     largest = float(objects.size.max())
     if efficiency is None:
         warnings.append(
@@ -239,9 +245,9 @@ def observe(
         )
     rows = []
     for number, pair in enumerate(pairs):
-        a90 = float(found.a90[number])
+        a90 = math.nan if against[number] else float(found.a90[number])
         known = math.isfinite(a90)
-        if not known:
+        if not known and not against[number]:
             beyond = float(found.a90_of_curve[number])
             where = f"; the curve would reach it at {beyond:.3g}" if math.isfinite(beyond) else ""
             warnings.append(f"{pair[0]};{pair[1]}: POD does not pass 90 % within the sizes, up to {largest:.3g}{where}")
@@ -249,13 +255,14 @@ def observe(
         rows.append(
             {
                 "setting": f"{pair[0]};{pair[1]}",
-                "a50": float(found.a50[number]),
+                "a50": math.nan if against[number] else float(found.a50[number]),
                 "a90": {"value": a90, "low": ends[0], "high": ends[1]} if known else None,
-                "a90_delta_R": float(found.a90_delta_R[number]),
+                "a90_delta_R": float(found.a90_delta_R[number]) if known else math.nan,
                 "independent_places": float(found.independent_places[number]),
             }
         )
-    sizes, curves = _curves(found.pod, objects)
+    pod = np.where(np.array([bool(reason) for reason in against])[:, None], np.nan, found.pod)
+    sizes, curves = _curves(pod, objects)
     words = {
         name: getattr(observer, name)
         for name in ("detector", "image", "false_alarm_rate", "efficiency", "internal_noise")

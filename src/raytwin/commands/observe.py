@@ -125,7 +125,7 @@ def _text(result: dict[str, Any]) -> str:
     ]
 
     def sized(value: float | None) -> str:
-        return "not within the sizes" if value is None else f"{value:.4g} {unit}".rstrip()
+        return "none" if value is None else f"{value:.4g} {unit}".rstrip()
 
     a90 = row["a90"]
     interval = "" if a90 is None or a90["low"] is None else f" (95 %: {a90['low']:.4g} to {a90['high']:.4g})"
@@ -133,7 +133,7 @@ def _text(result: dict[str, Any]) -> str:
     lines.append(f"a90                {sized(None if a90 is None else a90['value'])}{interval}")
     if row["a90_delta_R"] is not None:
         lines.append(f"a90 in Delta R     {row['a90_delta_R']:.4g}")
-    if result["size"] == "size_mm":
+    if result["size"] == "size_mm" and None not in result["curve"]["pod"][0]:
         lines.append("size (mm)  POD")
         curve = result["curve"]
         step = max(1, len(curve["size"]) // 12)

@@ -77,6 +77,7 @@ def make_starter_block(plan: Mapping[str, Any], number: int, twin: Twin, folder:
     path = folder / f"block_{number:04d}.h5"
     if path.exists():
         return path
+    refused = ""
     for attempt in range(_TRIES):
         rng = np.random.default_rng([plan["seed"], _BLOCK, number, attempt])
         low, high = _settings(plan["settings"], twin, rng)
@@ -94,11 +95,14 @@ def make_starter_block(plan: Mapping[str, Any], number: int, twin: Twin, folder:
                 supersampling=2,
                 with_counts=False,
             )
-        except InputError:
-            continue  # a drawn object that finds no room in the drawn product
+        except InputError as error:
+            refused = str(error)  # as a rule a drawn object that finds no room in the drawn product
+            continue
         return path
     raise InputError(
-        f"block {number}", received=f"{_TRIES} draws without room", expected="objects that fit the products"
+        f"block {number}",
+        received=f"{_TRIES} draws that were refused, the last one for: {refused}",
+        expected="objects that fit the products",
     )
 
 

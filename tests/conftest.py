@@ -1,6 +1,10 @@
 """Settings of all tests: one compiled thread a worker, no deadline for hypothesis, and examples that do not vary."""
 
+import hashlib
+import importlib.metadata
+import inspect
 import os
+from functools import lru_cache
 
 import pytest
 from hypothesis import settings
@@ -10,6 +14,41 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 settings.register_profile("house", deadline=None, derandomize=True)
 settings.load_profile("house")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_lab_spectra(pytestconfig):
+    """SpekPy's spectra of the lab's tubes (two seconds each), kept by pytest's cache for other workers and other runs.
+
+    They hang on SpekPy's version and on the code that asks for them: of another version or other code, none is used.
+    """
+    import numpy as np
+
+    from raytwin.lab import tube
+
+    if not hasattr(pytestconfig, "cache"):
+        yield
+        return
+    folder = pytestconfig.cache.mkdir("lab_spectra")
+    made_by = importlib.metadata.version("spekpy") + inspect.getsource(tube._bare_spectrum.__wrapped__)
+    made_by += f"{tube.BIN_KEV} {tube.LOWEST_KEV}"
+
+    @lru_cache(maxsize=256)
+    def kept_spectrum(*tube_is):
+        name = hashlib.sha256(f"{made_by} {tube_is}".encode()).hexdigest()
+        path = folder / f"{name[:32]}.npy"
+        if not path.exists():
+            partial = folder / f"{name[:32]}.{os.getpid()}.npy"
+            np.save(partial, np.stack(made(*tube_is)))
+            os.replace(partial, path)
+        energies, photons = np.load(path)
+        for values in (energies, photons):
+            values.setflags(write=False)
+        return energies, photons
+
+    made, tube._bare_spectrum = tube._bare_spectrum, kept_spectrum
+    yield
+    tube._bare_spectrum = made
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,10 @@
 """Bad input through the command line: exit 2, one line on standard error, nothing on standard output, no file left."""
 
+import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
+from raytwin.generator.twin_io import write_twin
 
 SHAPE = (24, 28)
 EXPOSURE_MS = 20.0
@@ -43,11 +46,11 @@ def write_session(path, *, darks=True, level_per_W=60.0, bits=16, top=None, shap
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """A good session, its twin, and a set of small products to go with them."""
+def files(tmp_path_factory, make_model_twin):
+    """A good session, a twin of its line, and a set of small products to go with them."""
     folder = tmp_path_factory.mktemp("good")
     session, twin = write_session(folder / "session.h5"), folder / "twin.h5"
-    assert main(["calibrate", str(session), "-o", str(twin), "--json"]) == 0
+    write_twin(twin, make_model_twin(SHAPE, pixel_mm=0.45, source_object_mm=2970.0, source_detector_mm=3177.0))
     products = folder / "products.h5"
     rng = np.random.default_rng(1)
     with write_acquisition(products, Instrument(bits=16)) as writer:
@@ -280,10 +283,13 @@ def test_a_lab_session_that_cannot_be(tmp_path, capsys, words, word):
     refused(capsys, tmp_path, ["lab", "-o", tmp_path / "a.h5", *words, "--json"], mentions=word)
 
 
-def test_an_output_that_cannot_be_written(files, tmp_path, capsys):
-    folder = tmp_path / "a_folder"
-    folder.mkdir()
-    refused(capsys, tmp_path, ["calibrate", files["session"], "-o", folder, "--json"], mentions="a_folder")
+def test_an_output_that_cannot_be_written_is_told_before_the_work(tmp_path, capsys):
+    (tmp_path / "a_folder").mkdir()
+    (tmp_path / "a_file").write_text("")
+    for output in ("a_folder", "a_file/twin.h5", "a_file/below/twin.h5"):
+        # the acquisition is not there either: what is told first was looked at first
+        words = ["calibrate", tmp_path / "absent.h5", "-o", tmp_path / output, "--json"]
+        refused(capsys, tmp_path, words, mentions=f"{output}: got a ")
 
 
 def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
@@ -385,7 +391,9 @@ def test_a_library_that_dies_at_a_file_is_one_line_too(files, tmp_path):
         command = [sys.executable, "-c", DYING, *map(str, words)]
         return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
-    (tmp_path / ".twin.h5.abc.part").write_text("half")
+    half = tmp_path / ".twin.h5.abc.part"
+    half.write_text("half")
+    os.utime(half, (time.time() + 600, time.time() + 600))  # as if written after the command began, however late that is
     died = run("calibrate", files["session"], "-o", tmp_path / "twin.h5")
     assert died.returncode == 2
     assert died.stdout == ""

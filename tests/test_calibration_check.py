@@ -15,6 +15,7 @@ from raytwin.calibration.check import check_acquisition
 from raytwin.calibration.findings import Finding, FindingCode
 from raytwin.cli import main
 from raytwin.errors import InputError
+from raytwin.generator.twin_io import write_twin
 
 FOLDER = Path(__file__).parents[1] / "validation"
 
@@ -148,13 +149,11 @@ def test_bare_images_get_a_draft_of_a_sidecar(tmp_path, capsys):
     assert [item.code for item in result.findings] == [FindingCode.NO_SIDECAR]
 
 
-def test_a_twin_tells_its_levels_and_what_it_reaches(session, tmp_path, capsys):
-    twin = tmp_path / "twin.h5"
-    assert main(["calibrate", str(session), "-o", str(twin), "--json"]) == 0
-    levels = json.loads(capsys.readouterr().out)["levels"]
-    result = check_acquisition(twin)
+def test_a_twin_tells_its_levels(series_line, tmp_path):
+    write_twin(tmp_path / "twin.h5", series_line)
+    result = check_acquisition(tmp_path / "twin.h5")
     assert result.what == "twin"
-    assert len(result.series) == len(levels)
+    assert len(result.series) == len(series_line.levels)
 
 
 def test_code_steps_averages_zeros_and_tops_are_read_off_the_numbers():

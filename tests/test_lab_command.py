@@ -13,14 +13,14 @@ from raytwin.lab.protocols import run_protocol, system_of_seed, truth_path
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory):
     path = tmp_path_factory.mktemp("lab") / "calibration.h5"
-    truth = run_protocol(path, protocol="calibration", seed=4, rows=24, columns=32, frames=3)
+    truth = run_protocol(path, protocol="calibration", seed=4, rows=24, columns=32, frames=3, families=())
     return path, truth
 
 
 @pytest.fixture(scope="module")
 def second_set(tmp_path_factory):
     path = tmp_path_factory.mktemp("lab") / "products.h5"
-    truth = run_protocol(path, protocol="set2", seed=4, rows=48, columns=64, products=4)
+    truth = run_protocol(path, protocol="set2", seed=4, rows=48, columns=64, products=4, families=())
     return path, truth
 
 
@@ -107,7 +107,9 @@ def test_the_same_seed_gives_the_same_frames_and_another_day_others(tmp_path):
     taken = {}
     for name, session in (("a", 0), ("b", 0), ("c", 1)):
         path = tmp_path / f"{name}.h5"
-        truth = run_protocol(path, protocol="set2", seed=9, rows=24, columns=24, products=2, session=session)
+        truth = run_protocol(
+            path, protocol="set2", seed=4, rows=24, columns=24, products=2, session=session, families=()
+        )
         with open_acquisition(path) as acquisition:
             taken[name] = b"".join(series.read_frames().tobytes() for series in acquisition.series)
         taken[name + "_psf"] = truth["psf_sigma_px"]
@@ -116,7 +118,8 @@ def test_the_same_seed_gives_the_same_frames_and_another_day_others(tmp_path):
 
 
 def test_the_command_prints_the_truth_as_json(tmp_path, capsys):
-    words = ["lab", "-o", str(tmp_path / "s.h5"), "--protocol", "set1", "--seed", "2", "--size", "40x48"]
+    words = ["lab", "-o", str(tmp_path / "s.h5"), "--protocol", "set1", "--seed", "4", "--size", "40x48"]
+    words += ["--family", "none"]
     assert main([*words, "--products", "3", "--json"]) == 0
     answered = capsys.readouterr()
     assert json.loads(answered.out)["protocol"] == "set1"
@@ -126,7 +129,7 @@ def test_the_command_prints_the_truth_as_json(tmp_path, capsys):
 
 def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys):
     words = ["lab", "-o", str(tmp_path / "s.h5"), "--protocol", "short", "--seed", "4", "--size", "48", "--frames", "4"]
-    words += ["--products", "1", "--geometry", "coarse", "--leave-out", "high_kV", "--json"]
+    words += ["--products", "1", "--geometry", "coarse", "--leave-out", "high_kV", "--family", "none", "--json"]
     assert main([*words, "--effect", "row_noise=0.4@calibration", "--effect", "unknown:rts_pixels=2"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["geometry"] == "coarse"

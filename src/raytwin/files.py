@@ -11,6 +11,23 @@ from pathlib import Path
 from .errors import InputError
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Refuse a file that could not be written, before the work that makes it; nothing is made.
+
+    Raises:
+        InputError: `path` is a folder, or lies where nothing can be written.
+    """
+    final = Path(path).absolute()
+    if final.is_dir():
+        raise InputError(str(path), received="a folder", expected="the name of a file to write")
+    place = next(folder for folder in final.parents if folder.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK):
+        reason = "Permission denied" if place.is_dir() else "Not a directory"
+        raise InputError(
+            str(path), received=f"a place that cannot be written ({reason})", expected="a file in a folder of yours"
+        )
+
+
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside `path` that becomes `path` when the block succeeds and disappears when it fails.

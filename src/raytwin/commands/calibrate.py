@@ -80,7 +80,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin calibrate`."""
     from ..api._progress import Bar
     from ..api.twins import calibrate
+    from ..files import check_writable
 
+    check_writable(arguments.output)
     spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")

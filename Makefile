@@ -20,7 +20,7 @@ $(READY): pyproject.toml
 	touch $(READY)
 
 demo: $(READY)
-	$(BIN)/raytwin demo -o demo
+	OMP_WAIT_POLICY=passive $(BIN)/raytwin demo -o demo
 
 DOCS_READY := $(VENV)/.docs-ready
 

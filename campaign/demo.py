@@ -39,8 +39,9 @@ class DemoPlan:
     products, test_products (images of the two sets); exposures_ms of the fast settings; generated (training pairs an
     exposure); networks an exposure; start (`starter`: networks start from the one that comes with raytwin; `shared`: from one
     that is trained first, with the steps that follow); first_steps, shared_steps (on the least noisy images, then on all
-    exposures); steps (of each network after its start); batch; seed; recipe of the training where the start is `shared`; gap
-    (of the chapter that plants an effect).
+    exposures); steps (of each network after its start); batch; threads of each training and trial (None: all; networks this
+    small spend longer waiting for a second thread than it saves, and the weights depend on the number); seed; recipe of the
+    training where the start is `shared`; gap (of the chapter that plants an effect).
     """
 
     size: tuple[int, int] = (96, 128)
@@ -58,6 +59,7 @@ class DemoPlan:
     shared_steps: int = 60
     steps: int = 30
     batch: int = 8
+    threads: int | None = 1
     seed: int = 1
     recipe: str = "raytwin"
     gap: GapPlan = field(default_factory=GapPlan)
@@ -85,6 +87,7 @@ PAPER_PLAN = DemoPlan(
     shared_steps=2000,
     steps=2000,
     batch=2,
+    threads=None,
 )
 
 
@@ -253,7 +256,8 @@ def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict
     Each starts from the network that comes with raytwin, or from one shared by all that is trained before.
     """
     at = chain.path
-    common = ["--batch", str(plan.batch), "--seed", str(plan.seed)]
+    threads = [] if plan.threads is None else ["--threads", str(plan.threads)]
+    common = ["--batch", str(plan.batch), "--seed", str(plan.seed), *threads]
     training: dict[str, Any] = {}
     start = "starter"
     if plan.start == "shared":
@@ -277,7 +281,16 @@ def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict
             name = f"{kind}_{number}"
             detection[name] = chain.step(
                 f"detect_{name}",
-                ["detect", at(f"runs_{number}"), at(f"{name}.h5"), "--split", "all", "-o", at(f"hits_{name}.csv")],
+                [
+                    "detect",
+                    at(f"runs_{number}"),
+                    at(f"{name}.h5"),
+                    "--split",
+                    "all",
+                    "-o",
+                    at(f"hits_{name}.csv"),
+                    *threads,
+                ],
                 outputs=[f"hits_{name}.csv"],
             )
             pod[name] = _pod(chain, name)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import settings
 
 # small frames spend their time waiting for threads, and the workers of the test run fill the cores already
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+for _threads in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
 
 settings.register_profile("house", deadline=None, derandomize=True)
 settings.load_profile("house")

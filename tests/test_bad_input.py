@@ -393,7 +393,9 @@ def test_a_library_that_dies_at_a_file_is_one_line_too(files, tmp_path):
 
     half = tmp_path / ".twin.h5.abc.part"
     half.write_text("half")
-    os.utime(half, (time.time() + 600, time.time() + 600))  # as if written after the command began, however late that is
+    os.utime(
+        half, (time.time() + 600, time.time() + 600)
+    )  # as if written after the command began, however late that is
     died = run("calibrate", files["session"], "-o", tmp_path / "twin.h5")
     assert died.returncode == 2
     assert died.stdout == ""

@@ -7,29 +7,43 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
+from raytwin.diagnosis.assemble import build_problem
+from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose_session import diagnose
 from raytwin.diagnosis.next_series import FRAMES, _separation, best_measurement, measurements_lacking, proposal_text
+from raytwin.diagnosis.preparation import prepare_session
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")
+STRENGTHS = {"focal_spot": 0.6, "mtf_tail": 5.0, "image_lag": 0.3, "dark_drift": 3.0}
 
 
 @pytest.fixture(scope="module")
-def diagnosis(tmp_path_factory):
+def session(tmp_path_factory):
+    """A short session with products, whose focal spot grew."""
     path = tmp_path_factory.mktemp("next") / "session.h5"
-    words = [
-        "--protocol",
-        "short",
-        "--geometry",
-        "fine",
-        "--seed",
-        "2502",
-        "--products",
-        "3",
-        "--effect",
-        "focal_spot=0.6",
-    ]
-    assert main(["lab", "--family", "none", "-o", str(path), *words, "--size", "48", "--frames", "10"]) == 0
-    with open_acquisition(path) as acquisition:
+    words = ["--protocol", "short", "--geometry", "fine", "--seed", "2502", "--products", "3", "--size", "48"]
+    words += ["--frames", "10", "--family", "none", "--effect", "focal_spot=0.6"]
+    assert main(["lab", "-o", str(path), *words]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def problem(session):
+    """The session against its twin, with the four effects that these tests set against each other."""
+    wanted = [item for item in catalogue_variants() if item.effect in STRENGTHS]
+    with open_acquisition(session) as acquisition:
+        prepared = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
+        return build_problem(prepared.acquisition, prepared.twin, variants=wanted)
+
+
+def at_strength(problem, effect):
+    curve = next(item for item in problem.curves if item.effect == effect)
+    return {effect: (curve, STRENGTHS[effect])}
+
+
+@pytest.fixture(scope="module")
+def diagnosis(session):
+    with open_acquisition(session) as acquisition:
         return diagnose(acquisition, rng=np.random.default_rng(0))
 
 
@@ -70,25 +84,20 @@ def test_an_edge_or_disc_is_asked_for_where_blur_of_the_source_ties_with_blur_of
     assert other.separation_then == pytest.approx(found.separation_then, rel=0.1)
 
 
-def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(diagnosis):
-    curves = {}
-    for effect, strength in (("image_lag", 0.3), ("dark_drift", 3.0)):
-        curve = next(item for item in diagnosis.problem.curves if item.effect == effect)
-        curves[effect] = {effect: (curve, strength)}
-    found = best_measurement(diagnosis.problem, curves["image_lag"], curves["dark_drift"], rng=np.random.default_rng(3))
+def test_beam_off_frames_are_asked_for_where_lag_ties_with_a_drifting_dark(problem):
+    lag, drift = (at_strength(problem, effect) for effect in ("image_lag", "dark_drift"))
+    found = best_measurement(problem, lag, drift, rng=np.random.default_rng(3))
     assert found.measurement.name == "afterglow"
     assert found.separation_then > 5.0
 
 
-def test_an_explanation_lies_nowhere_from_itself_at_another_strength(diagnosis):
-    first = explanation(diagnosis, "focal_spot")
+def test_an_explanation_lies_nowhere_from_itself_at_another_strength(problem):
+    first = at_strength(problem, "focal_spot")
     same = {effect: (curve, 1.0000001 * strength) for effect, (curve, strength) in first.items()}
-    assert _separation(diagnosis.problem, None, np.zeros(0, dtype=np.intp), first, same) < 1e-3
+    assert _separation(problem, None, np.zeros(0, dtype=np.intp), first, same) < 1e-3
 
 
-def test_nothing_is_planned_for_a_session_that_states_no_tube_load(diagnosis):
-    problem = diagnosis.problem
-
+def test_nothing_is_planned_for_a_session_that_states_no_tube_load(problem):
     def silent(view):
         request = view.session.request
         if request.setting is None:
@@ -96,7 +105,8 @@ def test_nothing_is_planned_for_a_session_that_states_no_tube_load(diagnosis):
         setting = replace(request.setting, power_W=None, current_mA=None)
         return replace(view, session=replace(view.session, request=replace(request, setting=setting)))
 
+    assert measurements_lacking(problem)
     unknown = replace(problem, views=tuple(silent(view) for view in problem.views))
     assert measurements_lacking(unknown) == ()
-    first, second = explanation(diagnosis, "focal_spot"), explanation(diagnosis, "mtf_tail")
+    first, second = (at_strength(problem, effect) for effect in ("focal_spot", "mtf_tail"))
     assert best_measurement(unknown, first, second, rng=np.random.default_rng(0)) is None

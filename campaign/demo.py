@@ -34,30 +34,32 @@ HIGH = Setting(kV=90, power_W=45, exposure_ms=100, averaged=10, filters=_FILTERS
 class DemoPlan:
     """How large the demo is.
 
-    Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the
-    paper's line, whatever the pixel); bones_mm of the test set (None: the paper's two); calibration_frames a series;
-    products, test_products (images of the two sets); exposures_ms of the fast settings; generated (training pairs an
-    exposure); networks an exposure; start (`starter`: networks start from the one that comes with raytwin; `shared`: from one
-    that is trained first, with the steps that follow); first_steps, shared_steps (on the least noisy images, then on all
-    exposures); steps (of each network after its start); batch; threads of each training and trial (None: all; networks this
-    small spend longer waiting for a second thread than it saves, and the weights depend on the number); seed; recipe of the
-    training where the start is `shared`; gap (of the chapter that plants an effect).
+    Fields: size (row, column) and pixel_mm of the detector; source_detector_mm (None: as many photons a pixel as the paper's
+    line, whatever the pixel); bones_mm of the test set, each bone as thick as it is drawn (None: the paper's two);
+    calibration_frames a series; products, test_products (images of the two sets); exposures_ms of the fast settings; generated
+    (training pairs an exposure); networks an exposure; start (`starter`: networks start from the one that comes with raytwin;
+    `shared`: from one that is trained first, with first_steps on the least noisy images, then shared_steps on all exposures);
+    steps (of each network after its start; from the starter those at 1 s, doubled for each shorter exposure); rate (of
+    learning, peak, from the starter); batch; threads of each training and trial (None: all; networks this small wait longer for
+    a second thread than it saves, and the weights depend on the number); seed; recipe of the training where the start is
+    `shared`; gap (of the chapter that plants an effect).
     """
 
     size: tuple[int, int] = (96, 128)
     pixel_mm: float = 0.45
     source_detector_mm: float | None = 2000.0
-    bones_mm: tuple[float, ...] | None = (4.0, 7.0)
+    bones_mm: tuple[float, ...] | None = 2 * (1.5, 2.5, 4.0, 7.0, 11.0, 15.0)
     calibration_frames: int = 16
     products: int = 72
-    test_products: int = 72
+    test_products: int = 86
     exposures_ms: tuple[float, ...] = (100.0, 50.0, 20.0)
     generated: int = 144
-    networks: int = 3
-    start: str = "shared"
+    networks: int = 2
+    start: str = "starter"
     first_steps: int = 200
     shared_steps: int = 60
-    steps: int = 30
+    steps: int = 15
+    rate: float = 2e-3
     batch: int = 8
     threads: int | None = 1
     seed: int = 1
@@ -253,27 +255,31 @@ def _datasets(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> None
 def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:
     """Networks trained, tried and compared.
 
-    Each starts from the network that comes with raytwin, or from one shared by all that is trained before.
+    Each starts from the network that comes with raytwin, or from one shared by all that is trained before. From the one that
+    comes with raytwin, noisier images take longer: each shorter exposure twice the steps.
     """
     at = chain.path
     threads = [] if plan.threads is None else ["--threads", str(plan.threads)]
     common = ["--batch", str(plan.batch), "--seed", str(plan.seed), *threads]
     training: dict[str, Any] = {}
     start = "starter"
-    if plan.start == "shared":
+    if plan.start == "starter":
+        common += ["--learning-rate", f"{plan.rate:g}"]
+    else:
         common += ["--recipe", plan.recipe]
         training = _shared_start(chain, plan, common)
         start = at("runs_shared")
     detection: dict[str, Any] = {}
     pod: dict[str, Any] = {}
     compared: dict[str, Any] = {}
-    for exposure in exposures:
+    for place, exposure in enumerate(exposures):
         number = f"{exposure:g}ms"
+        steps = plan.steps * (2**place if plan.start == "starter" else 1)
         dataset = "references.h5" if exposure == 1000.0 else f"train_{number}.h5"
         training[number] = chain.step(
             f"train_{number}",
             ["train", at(dataset), "-o", at(f"runs_{number}"), *common, "--networks", str(plan.networks),
-             "--steps", str(plan.steps), "--start-from", start],
+             "--steps", str(steps), "--start-from", start],
             outputs=[f"runs_{number}"],
         )  # fmt: skip
         kinds = ["real"] if exposure == 1000.0 else ["real", "test"]

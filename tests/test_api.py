@@ -80,7 +80,7 @@ def write_hits(path, hits):
 def folder(tmp_path_factory, make_sweep_line):
     """A lab session of 24 x 24 pixels with its twin; a line of 64 x 64 pixels with references and a campaign; hit tables."""
     place = make_sweep_line(tmp_path_factory.mktemp("api"))
-    rt.lab_session(place / "session.h5", protocol="calibration", seed=1, size=24, frames=3)
+    rt.lab_session(place / "session.h5", protocol="calibration", seed=1, size=24, frames=3, families=())
     with h5py.File(place / "session.h5", "r+") as file:  # a few of its series, to be quick
         for name in [name for name in file["series"] if not any(word in name for word in KEPT)]:
             del file[f"series/{name}"]
@@ -162,8 +162,11 @@ RESULTS = {
     "sweep plan": (lambda: rt.sweep("campaign.toml", plan_only=True), ["sweep", "campaign.toml", "--plan"]),
     "diagnosis": (lambda: rt.diagnose("session.h5", seed=0), ["diagnose", "session.h5", "-o", "diagnosis"]),
     "lab session": (
-        lambda: rt.lab_session("lab.h5", protocol="calibration", seed=1, size=16, frames=2),
-        ["lab", "-o", "lab.h5", "--protocol", "calibration", "--seed", "1", "--size", "16", "--frames", "2"],
+        lambda: rt.lab_session("lab.h5", protocol="calibration", seed=1, size=16, frames=2, families=()),
+        [
+            *("lab", "-o", "lab.h5", "--protocol", "calibration", "--seed", "1", "--size", "16", "--frames", "2"),
+            *("--family", "none"),
+        ],
     ),
     "check": (lambda: rt.check("session.h5"), ["check", "session.h5"]),
     "info": (rt.info, ["info"]),
@@ -339,7 +342,7 @@ def test_paths_open_files_lists_and_frames_are_taken_alike(inside, capsys):
     for table in (frame, HITS, Path("hits.csv")):
         assert rt.fit_pod(table, link="logit").fit == curve.fit
     with rt.open_acquisition("session.h5") as session:
-        assert rt.calibrate(session, seed=0) == rt.calibrate(["session.h5"], seed=0)
+        assert rt.calibrate([session], seed=0) == made("twin", capsys)
         assert len(session.series[0].read_frames(0, 1)) == 1, "an open file stays open"
     setting = rt.Setting(kV=60, power_W=30, exposure_ms=20, filters=(rt.Filter(material="Cu", thickness_mm=0.1),))
     words = "kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1"

@@ -182,7 +182,9 @@ def stand_in(monkeypatch):
     return limits, trained
 
 
-def test_task_tries_both_twins_and_the_measured_images_on_the_same_objects(line, twin, tmp_path, stand_in):
+def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_same_objects(
+    line, twin, tmp_path, stand_in
+):
     after = with_effect(twin, "object_scatter", 10.0)
     found = run_task(twin, after, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=TaskPlan())
     assert set(found["curves"]) == {f"{networks}_on_{images}" for networks, images in task_module.TRIALS}
@@ -203,11 +205,6 @@ def test_task_tries_both_twins_and_the_measured_images_on_the_same_objects(line,
     assert json.loads(json.dumps(found)) == found
     assert "measured" in task_text(found)
     assert plot_task(found).startswith(b"\x89PNG")
-
-
-def test_images_of_the_two_twins_differ_by_the_effect(line, twin, tmp_path, stand_in):
-    after = with_effect(twin, "object_scatter", 10.0)
-    run_task(twin, after, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=TaskPlan())
     paths = [tmp_path / "task" / f"{name}_test.h5" for name in ("before", "after")]
     with read_dataset(paths[0]) as one, read_dataset(paths[1]) as two:
         lower = [(one.images(k) - two.images(k))[:, one.product_masks(k)].mean() for k in range(len(one))]

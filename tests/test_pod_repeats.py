@@ -149,10 +149,10 @@ def test_without_effects_the_crossed_curve_is_the_pooled_one():
 
 
 def test_crossed_fit_finds_the_effects_that_made_the_data():
-    fit = fit_pod(**crossed_data(7, networks=60, images=200, link="logit"), repeats="crossed", link="logit")
+    fit = fit_pod(**crossed_data(7, networks=30, images=120, link="logit"), repeats="crossed", link="logit")
     # standard error of a standard deviation from k levels: some sd / sqrt(2 k), more for hits and misses
-    assert fit.crossed.sd_network == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(2 * 60))
-    assert fit.crossed.sd_image == pytest.approx(0.8, abs=4 * 0.8 / math.sqrt(2 * 200))
+    assert fit.crossed.sd_network == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(2 * 30))
+    assert fit.crossed.sd_image == pytest.approx(0.8, abs=4 * 0.8 / math.sqrt(2 * 120))
     assert abs(fit.c1 - 20.0) < 4 * fit.se1
 
 

@@ -17,6 +17,7 @@ from raytwin.campaign.demo_gap import (
 )
 from raytwin.campaign.figures import plot_gap, plot_withheld
 from raytwin.campaign.report import missing_a90
+from raytwin.cli import main
 from raytwin.generator.effects import AppliedEffect
 from raytwin.lab.protocols import run_protocol
 from raytwin.lab.unkindness import NONE
@@ -130,3 +131,10 @@ def test_a_missing_a90_says_which_objects_it_needs(hit_from, needed):
     (line,) = missing_a90(table, {"real_20ms": rows})
     assert line.startswith("20 ms, measured: ")
     assert needed in line
+
+
+def test_options_of_the_shared_start_belong_to_the_papers_size(tmp_path, capsys):
+    assert main(["demo", "-o", str(tmp_path / "demo"), "--first-steps", "3"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--first-steps: got without --paper-size" in line
+    assert not (tmp_path / "demo").exists()

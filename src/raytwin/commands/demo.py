@@ -1,7 +1,7 @@
 """The main job end to end on the virtual lab: calibrate, validate, generate, train, detect, POD, diagnose, one report.
 
-Small but honest by default (minutes on two cores); --paper-size is the paper's detector, image and network numbers. A
-run that was stopped goes on where it stopped.
+Small but honest by default (minutes on two cores), with networks that start from the one that comes along; --paper-size is the
+paper's detector, image and network numbers. A run that was stopped goes on where it stopped.
 """
 
 import argparse
@@ -28,10 +28,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--generated", type=int, help="training pairs generated for each exposure")
     parser.add_argument("--networks", type=int, help="networks for each exposure")
     parser.add_argument(
-        "--first-steps", type=int, help="training steps of the shared network on the least noisy images"
+        "--first-steps",
+        type=int,
+        help="with --paper-size: training steps of the network that all start from, on the least noisy images",
     )
-    parser.add_argument("--shared-steps", type=int, help="its further steps on all exposures")
-    parser.add_argument("--steps", type=int, help="training steps of each network after that")
+    parser.add_argument("--shared-steps", type=int, help="with --paper-size: its further steps on all exposures")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        help="training steps of each network after that; without --paper-size of those at 1 s, doubled for each shorter"
+        " exposure",
+    )
     parser.add_argument("--batch", type=int, help="images a step")
     parser.add_argument("--seed", type=int, help="seed of everything (default 1)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -47,7 +54,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ..errors import InputError
     from ..segmentation import choose_device
 
-    choose_device("auto")  # says at once how to install torch where it is missing
     changes = {
         name: value
         for name in (
@@ -69,7 +75,15 @@ def run(arguments: argparse.Namespace) -> int:
         if not (cross and rows.isdigit() and columns.isdigit()):
             raise InputError("--size", received=arguments.size, expected="ROWSxCOLUMNS, for example 96x128")
         changes["size"] = (int(rows), int(columns))
+    ignored = [name for name in ("first_steps", "shared_steps") if name in changes]
+    if ignored and not arguments.paper_size:
+        raise InputError(
+            f"--{ignored[0].replace('_', '-')}",
+            received="without --paper-size",
+            expected="--paper-size with it: the small demo's networks start from the one that comes with raytwin",
+        )
     plan = dataclasses.replace(PAPER_PLAN if arguments.paper_size else DemoPlan(), **changes)
+    choose_device("auto")  # says at once how to install torch where it is missing
     started = time.monotonic()
     result = run_demo(
         plan, arguments.output, run=main, tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}")

@@ -23,7 +23,9 @@ SIZE = 48
 
 
 def taken(path, **more):
-    return run_protocol(path, **{"protocol": "full", "seed": 6, "rows": SIZE, "frames": 4, "products": 2, **more})
+    return run_protocol(
+        path, **{"protocol": "full", "seed": 6, "rows": SIZE, "frames": 4, "products": 2, "families": (), **more}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +271,14 @@ def test_a_case_can_be_measured_as_it_is(tmp_path):
     sealed = tmp_path / "elsewhere" / "label.json"
     sealed.parent.mkdir()
     truth = run_protocol(
-        tmp_path / "case.h5", seed=6, rows=SIZE, frames=4, products=1, truth_file=sealed, **case.arguments()
+        tmp_path / "case.h5",
+        seed=6,
+        rows=SIZE,
+        frames=4,
+        products=1,
+        families=(),
+        truth_file=sealed,
+        **case.arguments(),
     )
     assert json.loads(sealed.read_text(encoding="utf-8")) == json.loads(json.dumps(truth))
     assert not truth_path(tmp_path / "case.h5").exists()

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
 from ..files import whole_file
@@ -37,6 +37,9 @@ from .sweep_trial import (
     start_key,
     start_task,
 )
+
+if TYPE_CHECKING:
+    from .sweep_screening import Screened
 
 UNITS = {"contrast": "", "size_mm": "mm"}
 _MARKER = "campaign.json"
@@ -70,6 +73,10 @@ COLUMNS = (
     "photons_high",
     "delta_R",
     "cnr_object",
+    "predicted_a90",
+    "predicted_low",
+    "predicted_high",
+    "decided",
     "extrapolated",
     "pareto",
     "recommended",
@@ -148,7 +155,6 @@ def run_sweep(
             progress.tell(another)
         data = (directory / "references").resolve()
         tasks: dict[str, Task] = {}
-        errors: dict[str, str] = {}
         if any(one.kept for one in found):
             if not campaign.described:
                 prepare_references(campaign, data, basis)
@@ -167,23 +173,49 @@ def run_sweep(
             rows[text] = row
             return row
 
-        left = {text: task for text, task in tasks.items() if not is_done(task)}
-        progress.begin(len(tasks), len(tasks) - len(left))
-        for text in tasks:
-            if text not in left:
-                complete(text, "")
-
         def done(task: Task, error: str) -> None:
-            text = f"{task['low']};{task['high']}"
-            if error:
-                errors[text] = error
-            progress.advance(complete(text, error))
+            progress.advance(complete(f"{task['low']};{task['high']}", error))
 
-        runner.run(list(left.values()), done)
-        answer = _answer(campaign, directory, list(rows.values()), basis, tasks, progress)
+        def work(texts: Sequence[str], *, before: int) -> None:
+            """Do what is left of these settings; `before` others are complete."""
+            left = [text for text in texts if not is_done(tasks[text])]
+            progress.begin(before + len(texts), before + len(texts) - len(left))
+            for text in texts:
+                if text not in left:
+                    complete(text, "")
+            runner.run([tasks[text] for text in left], done)
+
+        screened = None
+        if campaign.screening is None or not tasks:
+            work(list(tasks), before=0)
+        else:
+            screened = _screened(campaign, data, found, rows, work, progress)
+        answer = _answer(campaign, directory, list(rows.values()), basis, tasks, screened, progress)
         _write_json(directory / "sweep.json", answer)
         write_table(directory / "sweep.csv", answer["rows"])
     return answer
+
+
+def _screened(
+    campaign: Campaign,
+    data: Path,
+    outlooks: Sequence[Outlook],
+    rows: dict[str, dict[str, Any]],
+    work: Callable[..., None],
+    progress: Progress,
+) -> "Screened":
+    """Train what the observer leaves undecided, round by round, and say in the rows of the others why they were not trained."""
+    from .sweep_screening import Screen, screened_rows
+
+    screen = Screen(campaign, data / "test.h5", outlooks)
+    asked: list[str] = []
+    while chosen := screen.next(rows, asked):
+        if asked:
+            left = len(screen.kept) - len(asked) - len(chosen)
+            progress.tell(f"{len(chosen)} undecided settings are trained next; {left} others wait for the observer")
+        work(chosen, before=len(asked))
+        asked += chosen
+    return screened_rows(screen, rows, asked)
 
 
 def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -209,7 +241,11 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         for row in rows:
             flat = dict(row)
             rate, dose = row["false_alarm_rate"] or {}, row["dose_uGy"] or {}
+            predicted = row["predicted"] or {}
             flat |= {
+                "predicted_a90": predicted.get("value"),
+                "predicted_low": predicted.get("low"),
+                "predicted_high": predicted.get("high"),
                 "false_alarm_rate": rate.get("value"),
                 "false_alarm_low": rate.get("low"),
                 "false_alarm_high": rate.get("high"),
@@ -315,6 +351,8 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
         "delta_R": outlook.delta_R,
         "cnr_object": outlook.cnr_object,
         "extrapolated": outlook.extrapolated,
+        "predicted": None,
+        "decided": None,
         "points": [],
         "line": None,
         "folder": "",
@@ -359,11 +397,11 @@ def _answer(
     rows: list[dict[str, Any]],
     basis: Mapping[str, Any],
     tasks: Mapping[str, Task],
+    screened: "Screened | None",
     progress: Progress,
 ) -> dict[str, Any]:
-    limits = campaign.limits
-    most = limits.maximum_false_alarm_rate
-    choice = choose(rows, goal=limits.a90, most_false_alarms=most)
+    goal, most = campaign.goal, campaign.most_false_alarms
+    choice = choose(rows, goal=goal, most_false_alarms=most)
     front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
     for number, row in enumerate(rows):
         ratio, alike = None, False
@@ -396,7 +434,7 @@ def _answer(
         **basis,
         "size": campaign.curve.size,
         "unit": unit,
-        "goal": limits.a90,
+        "goal": goal,
         "maximum_false_alarm_rate": most,
         "networks": campaign.training.networks,
         "settings": len(rows),
@@ -407,7 +445,8 @@ def _answer(
         "meets_goal": choice.meets,
         "pareto": [str(rows[number]["setting"]) for number in sorted(front)],
         "alike": [str(row["setting"]) for row in rows if row["alike"]],
-        "sentence": sentence(rows, choice, goal=limits.a90, unit=unit, most_false_alarms=most),
+        "screening": None if screened is None else screened.answer,
+        "sentence": sentence(rows, choice, goal=goal, unit=unit, most_false_alarms=most),
         "rows": rows,
     }
     return dict(plain(result))

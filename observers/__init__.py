@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .observe import Observed as Observed
     from .observe import Observer as Observer
     from .observe import observe_settings as observe_settings
+    from .reference_objects import objects_and_texture as objects_and_texture
     from .search import independent_places as independent_places
     from .search import search_threshold as search_threshold
     from .texture import ProductTexture as ProductTexture
@@ -43,6 +44,7 @@ _HOME = {
     "frequency_bins": "frequencies",
     "independent_places": "search",
     "object_spectrum": "frequencies",
+    "objects_and_texture": "reference_objects",
     "objects_of_references": "objects",
     "objects_of_shape": "objects",
     "observe_settings": "observe",

@@ -22,7 +22,8 @@ from ..files import whole_file
 from ..generator.twin_io import read_twin
 from ._once import only_one
 from ._plain import digest, plain, read_object
-from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
+from .decision import Change, Verdict, decide, judge_row
+from .sweep_choice import alike_text, choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
 from .sweep_settings import Outlook, Scout, keep_best, labels_of
@@ -31,6 +32,7 @@ from .sweep_trial import (
     basis_of,
     common_words,
     is_done,
+    other_size,
     prepare_references,
     setting_key,
     setting_task,
@@ -56,6 +58,7 @@ COLUMNS = (
     "a90_low",
     "a90_high",
     "a90_upper",
+    "a90_other_size",
     "n",
     "n_hits",
     "objects",
@@ -77,6 +80,7 @@ COLUMNS = (
     "predicted_low",
     "predicted_high",
     "decided",
+    "verdict",
     "extrapolated",
     "pareto",
     "recommended",
@@ -243,6 +247,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             rate, dose = row["false_alarm_rate"] or {}, row["dose_uGy"] or {}
             predicted = row["predicted"] or {}
             flat |= {
+                "a90_other_size": (row["other_size"] or {}).get("a90"),
                 "predicted_a90": predicted.get("value"),
                 "predicted_low": predicted.get("low"),
                 "predicted_high": predicted.get("high"),
@@ -353,6 +358,8 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
         "extrapolated": outlook.extrapolated,
         "predicted": None,
         "decided": None,
+        "verdict": None,
+        "other_size": None,
         "points": [],
         "line": None,
         "folder": "",
@@ -380,7 +387,14 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
         "objects": curve["objects"],
         "false_alarm_rate": None
         if alarms is None
-        else {"value": alarms["rate"], "low": alarms["low"], "high": alarms["high"], "n": alarms["n"]},
+        else {
+            "value": alarms["rate"],
+            "low": alarms["low"],
+            "high": alarms["high"],
+            "n": alarms["n"],
+            "effective_n": alarms["effective_n"],
+        },
+        "other_size": curve["other_size"],
         "points": curve["points"],
         "line": curve["line"],
         "warnings": [*row["warnings"], *curve["warnings"]],
@@ -401,6 +415,13 @@ def _answer(
     progress: Progress,
 ) -> dict[str, Any]:
     goal, most = campaign.goal, campaign.most_false_alarms
+    verdicts: list[Verdict] = []
+    changes_by = ""
+    if campaign.requirement is not None:
+        changes, changes_by = _changes(campaign, directory, rows, screened)
+        for row in rows:
+            verdicts.append(judge_row(row, campaign.requirement, changes=changes.get(str(row["setting"]), ())))
+            row["verdict"] = verdicts[-1].verdict
     choice = choose(rows, goal=goal, most_false_alarms=most)
     front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
     for number, row in enumerate(rows):
@@ -429,11 +450,21 @@ def _answer(
     def named(number: int | None) -> str | None:
         return None if number is None else str(rows[number]["setting"])
 
+    decision = None
+    if campaign.requirement is not None:
+        decision = decide(
+            rows, campaign.requirement, verdicts, recommended=choice.recommended, unit=unit, changes_by=changes_by
+        )
+        said = decision["sentence"] + alike_text(rows, choice, most)
+    else:
+        said = sentence(rows, choice, goal=goal, unit=unit, most_false_alarms=most)
     result = {
         "campaign": campaign.path.name,
         **basis,
         "size": campaign.curve.size,
         "unit": unit,
+        "other_size": other_size(campaign.curve.size),
+        "other_unit": UNITS[other_size(campaign.curve.size)],
         "goal": goal,
         "maximum_false_alarm_rate": most,
         "networks": campaign.training.networks,
@@ -446,10 +477,36 @@ def _answer(
         "pareto": [str(rows[number]["setting"]) for number in sorted(front)],
         "alike": [str(row["setting"]) for row in rows if row["alike"]],
         "screening": None if screened is None else screened.answer,
-        "sentence": sentence(rows, choice, goal=goal, unit=unit, most_false_alarms=most),
+        "decision": decision,
+        "sentence": said if screened is None else f"{said} {screened.sentence}",
         "rows": rows,
     }
     return dict(plain(result))
+
+
+def _changes(
+    campaign: Campaign, directory: Path, rows: Sequence[Mapping[str, Any]], screened: "Screened | None"
+) -> tuple[dict[str, tuple[Change, ...]], str]:
+    """What changes of each setting would do to its a90, and who says so: an observer brought to the networks, or one that is not."""
+    from .sweep_screening import Screen, outlooks_of_rows
+
+    if campaign.described:
+        return {}, "nobody: an observer needs reference images"
+    if not any(row["feasible"] for row in rows):
+        return {}, "nobody: no setting can be"
+    try:
+        if screened is None:
+            screen = Screen(campaign, directory / "references" / "test.h5", outlooks_of_rows(rows))
+            screen.calibrate({str(row["setting"]): row for row in rows if row["trained"]})
+        else:
+            screen = screened.screen
+        factors = screen.changes()
+    except InputError as error:
+        return {}, f"nobody: {error}"
+    found = {
+        text: tuple(Change(kind=kind, factor=value) for kind, value in one.items()) for text, one in factors.items()
+    }
+    return found, "a calibrated observer" if screen.efficiency is not None else "an observer that is not calibrated"
 
 
 def _apart(best: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

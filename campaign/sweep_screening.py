@@ -24,7 +24,7 @@ from ..acquisition.setting import Setting, setting_from_text
 from ..errors import FitError, InputError
 from ..generator.twin_io import read_twin
 from .sweep_choice import paces, takes_part
-from .sweep_file import Campaign, Pair
+from .sweep_file import Campaign, Pair, Screening
 from .sweep_settings import Outlook, open_references
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ class Screen:
     """The observer of a sweep: what it expects at each setting, calibrated anew when more of them are trained.
 
     Args:
-        campaign: with a table [screening].
+        campaign: without a table [screening] as with an empty one.
         tests: dataset of the references that networks are tried on.
         outlooks: of every setting.
 
@@ -207,9 +207,7 @@ class Screen:
     def __init__(self, campaign: Campaign, tests: Path, outlooks: Sequence[Outlook]) -> None:
         from ..observers import LineImages, Observer, objects_and_texture, read_efficiency
 
-        screening = campaign.screening
-        if screening is None:
-            raise ValueError("a campaign without [screening]")
+        screening = campaign.screening or Screening()
         self.campaign, self._screening = campaign, screening
         self.first_count = 0
         self.efficiency: Efficiency | None = None
@@ -303,6 +301,20 @@ class Screen:
                 found[text] = Expected(value=float(ends[0]), low=float(ends[1]), high=float(ends[2]))
         return found
 
+    def changes(self) -> dict[str, dict[str, float]]:
+        """What changes of each setting would do to its a90, as factors by the change's name; for every feasible setting's text."""
+        from ..observers import factors_of_changes
+
+        if not self._pairs:
+            return {}
+        factors = factors_of_changes(
+            self.line, list(self._pairs.values()), self.objects, observer=self.observer, texture=self.texture
+        )
+        return {
+            text: {name: float(values[number]) for name, values in factors.items() if math.isfinite(values[number])}
+            for number, text in enumerate(self._pairs)
+        }
+
     def candidates(
         self, rows: Mapping[str, Mapping[str, Any]], asked: Sequence[str], expected: Mapping[str, Expected]
     ) -> dict[str, Candidate]:
@@ -338,6 +350,21 @@ class Screened:
 
     screen: Screen
     answer: Mapping[str, Any]
+
+    @property
+    def sentence(self) -> str:
+        """How many settings were trained, and what became of the others, in words."""
+        trained, decided, left = (self.answer[name] for name in ("trained", "screened", "undecided"))
+        text = f"{trained} settings were trained; the observer decided {decided} without training"
+        return f"{text}." if not left else f"{text} and left {left} undecided."
+
+
+def outlooks_of_rows(rows: Sequence[Mapping[str, Any]]) -> list[Outlook]:
+    """Rows as an observer asks for them: settings that can be, and whether they were trained."""
+    return [
+        Outlook(pair=pair_of_row(row), reason="" if row["feasible"] else str(row["reason"]), kept=bool(row["trained"]))
+        for row in rows
+    ]
 
 
 def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Sequence[str]) -> Screened:

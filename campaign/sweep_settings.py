@@ -29,6 +29,7 @@ from ..generator.twin import Twin
 from .sweep_file import Campaign, Limits, Pair, Requirement, Timing, text_of_pair
 
 if TYPE_CHECKING:
+    from ..generator.contrast import SlabContrasts
     from ..generator.describe import Description
 
 _STRICTER = ("maximum_kV", "maximum_current_mA", "maximum_power_w")
@@ -86,6 +87,7 @@ class Scout:
         self.twin = replace(twin, instrument=limited_instrument(twin.instrument, campaign.limits))
         self._datasets: list[Dataset] = []
         self._descriptions: list[Description] = []
+        self._contrasts: SlabContrasts | None = None  # beams that several settings share are computed once
         for word, path in (("references", campaign.references), ("test_references", campaign.test_references)):
             if path is None:
                 continue
@@ -150,7 +152,7 @@ class Scout:
         return tuple(found)
 
     def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float]:
-        from ..generator.contrast import compute_contrast_map
+        from ..generator.contrast import SlabContrasts
 
         slabs = self.campaign.slabs
         if slabs is None:
@@ -158,14 +160,15 @@ class Scout:
         if self.twin.spectral is None:
             warnings.append("no contrast-to-noise: the twin has no spectral part")
             return {}
-        found = compute_contrast_map(
-            replace(self.twin, effects=()),
-            [[pair]],
-            product=slabs.product,
-            foreign_object=slabs.foreign_object,
-            object_pixels=slabs.object_pixels,
-            displaces=slabs.displaces,
-        )[0][0]
+        if self._contrasts is None:
+            self._contrasts = SlabContrasts(
+                replace(self.twin, effects=()),
+                product=slabs.product,
+                foreign_object=slabs.foreign_object,
+                object_pixels=slabs.object_pixels,
+                displaces=slabs.displaces,
+            )
+        found = self._contrasts.contrast(*pair, intervals=False)
         warnings += [line for line in found.warnings if line not in warnings]
         return {"delta_R": found.delta_R.value, "cnr_object": found.cnr_object}
 

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .changes import factors_of_changes as factors_of_changes
     from .detectors import DETECTORS as DETECTORS
     from .efficiency import Efficiency as Efficiency
     from .efficiency import MeasuredSize as MeasuredSize
@@ -40,6 +41,7 @@ _HOME = {
     "Observer": "observe",
     "ProductTexture": "texture",
     "Shape": "objects",
+    "factors_of_changes": "changes",
     "fit_efficiency": "efficiency",
     "frequency_bins": "frequencies",
     "independent_places": "search",

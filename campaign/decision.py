@@ -13,8 +13,8 @@ A requirement has up to four parts. Each is met where the data show it, failed w
 
 The margin is the share of the requirement that is left at the bound, negative where the bound is beyond it: 1 - bound / asked, of
 throughput value / asked - 1. A setting meets the requirement where it meets all parts, and fails where it fails one. A setting that a
-model observer looked at in place of networks never meets it: it is likely to, where the upper end of what is expected is at most the size
-asked for and no part fails.
+model observer looked at in place of networks never meets it: it is likely to, where the upper end of what is expected is at most the
+size asked for and no part fails.
 
 Source: MIL-HDBK-1823A (2009) (a90/95; n of n found); Clopper & Pearson, Biometrika 26 (1934) 404 (rates).
 """
@@ -33,7 +33,7 @@ MEETS, LIKELY, OPEN, FAILS, IMPOSSIBLE = "meets", "likely", "open", "fails", "ca
 _ONE_SIDED = 0.95
 _POD = 0.9
 _SURELY = 1e-9
-_NO_CHANGE = 0.9995  # as a factor: what shows in no printed digit
+_NO_CHANGE = 0.995  # as a factor: what a whole percent does not show
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +41,8 @@ class Criterion:
     """One part of a requirement at one setting.
 
     Fields: name (detection, false_alarms, throughput, dose); required; value; bound (what the verdict rests on); margin (share of the
-    requirement that is left at the bound); verdict (`meets`, `likely`, `open`, `fails`); predicted (an observer's in place of networks'). None:
-    unknown.
+    requirement that is left at the bound); verdict (`meets`, `likely`, `open`, `fails`); predicted (by an observer, not by networks).
+    None: unknown.
     """
 
     name: str
@@ -66,8 +66,7 @@ class Change:
 class Verdict:
     """A setting against the requirement.
 
-    Fields: setting, label; verdict (`meets`, `likely`, `open`, `fails`, `cannot be`); criteria; changes (largest gain first); limited_by (names
-    of the criteria that are not met, failed ones first).
+    Fields: setting, label; verdict (`meets`, `likely`, `open`, `fails`, `cannot be`); criteria; changes (largest gain first).
     """
 
     setting: str
@@ -349,7 +348,7 @@ def criterion_text(one: Criterion, *, unit: str) -> str:
     shown: Callable[[float], str] = {
         "detection": lambda value: f"{value:.3g} {unit}".rstrip(),
         "false_alarms": lambda value: f"{100 * value:.2g} %",
-        "throughput": lambda value: f"{60 * value:.3g} a minute",
+        "throughput": lambda value: f"{60 * value:.0f} a minute" if value >= 1 else f"{60 * value:.3g} a minute",
         "dose": lambda value: f"{value:.3g} uGy",
     }[one.name]
     asked = shown(one.required)
@@ -360,6 +359,11 @@ def criterion_text(one: Criterion, *, unit: str) -> str:
     what = ": a90 expected up to" if one.predicted else ": a90 at most" if one.name == "detection" else " at most"
     margin = "" if one.margin is None else f" ({_margin_text(one.margin)})"
     return f"{name}{what} {shown(one.bound)}, asked for {asked}{margin}"
+
+
+def change_text(one: Change) -> str:
+    """A change and what it would do, in words."""
+    return f"{CHANGES[one.kind]}: a90 {100 * (one.factor - 1):+.0f} %"
 
 
 def _margin_text(margin: float) -> str:

@@ -23,7 +23,7 @@ from ..generator.twin_io import read_twin
 from ._once import only_one
 from ._plain import digest, plain, read_object
 from .decision import Change, Verdict, decide, judge_row
-from .sweep_choice import alike_text, choose, indistinct, pareto_front, sentence, takes_part
+from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
 from .sweep_settings import Outlook, Scout, keep_best, labels_of
@@ -455,7 +455,7 @@ def _answer(
         decision = decide(
             rows, campaign.requirement, verdicts, recommended=choice.recommended, unit=unit, changes_by=changes_by
         )
-        said = decision["sentence"] + alike_text(rows, choice, most)
+        said = decision["sentence"]
     else:
         said = sentence(rows, choice, goal=goal, unit=unit, most_false_alarms=most)
     result = {

@@ -139,11 +139,10 @@ def sentence(
         text = (
             f"No setting is shown to reach a90 = {_sized(goal, unit)}; {smallest} is that of {row['label']} ({facts})."
         )
-    return text + alike_text(rows, choice, most_false_alarms)
+    return text + _alike_text(rows, choice, most_false_alarms)
 
 
-def alike_text(rows: Sequence[Row], choice: Choice, most_false_alarms: float | None) -> str:
-    """Which settings are not shown to be worse than the best, in words, with a blank before; nothing where none has an a90."""
+def _alike_text(rows: Sequence[Row], choice: Choice, most_false_alarms: float | None) -> str:
     best = choice.best
     if best is None:
         return ""

@@ -403,22 +403,18 @@ def screened_rows(screen: Screen, rows: Mapping[str, dict[str, Any]], asked: Seq
 
 def _why(decided: Decided, expected: Expected | None, campaign: Campaign) -> str:
     """Why a setting was not trained, in words."""
-    size = "" if campaign.curve.size == "contrast" else " mm"
-    seen = (
-        "not trained: the observer expects nothing here"
-        if expected is None
-        else f"not trained: the observer expects a90 {expected.value:.3g}{size} ({expected.low:.3g} to {expected.high:.3g})"
-    )
     chance = 0.0 if decided.chance is None else decided.chance
     told = f"{100 * chance:.2g} %" if chance >= 0.001 else "less than 0.1 %"
     if decided.kind == "worse":
-        return f"{seen}; smaller than the best with a chance of {told}"
+        return f"not trained: a90 is smaller than that of the best with a chance of {told}"
     if decided.kind == "misses":
-        return f"{seen}; below the goal with a chance of {told}"
+        return f"not trained: a90 is below the goal with a chance of {told}"
     if decided.kind == "slower":
-        return f"{seen}; the recommended setting reaches the goal and is faster, or as fast at a lower dose"
+        return "not trained: one that reaches the goal is faster, or as fast at a lower dose"
     most = None if campaign.screening is None else campaign.screening.most
-    return f"{seen}; undecided, and most = {most} settings are trained"
+    return f"not trained: undecided, and most = {most} settings are trained" + (
+        "" if expected else "; nothing is expected"
+    )
 
 
 def _at_own_distance(setting: Setting, own: float | None) -> Setting:

@@ -66,14 +66,13 @@ def run(arguments: argparse.Namespace) -> int:
 
             def told(stage: str, done: int, total: int | None) -> None:
                 bar(stage, done, total)
-                if stage == "settings" and bar.hidden and not counts:
-                    counts.extend((done, total or 0))
-                    if done:
+                if stage == "settings" and bar.hidden:
+                    if not counts and done:
                         say(f"{done} of {total} settings are done already")
+                    counts[:] = (done, total or 0)  # a screened sweep learns round by round how many there are
 
             def finished(row: Mapping[str, Any]) -> None:
                 if bar.hidden and counts:
-                    counts[0] += 1
                     say(f"[{counts[0]}/{counts[1]}] {row['label']}: {_told(row)}")
 
             found = sweep(
@@ -98,7 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
         count = f"{len(rows)} setting{'s' * (len(rows) != 1)}"
         lines = [*_plan_lines(rows), f"{count}, {result['feasible']} feasible, {result['to_train']} to train"]
     else:
-        lines = [*_result_lines(result["rows"]), result["sentence"], f"report: {result['paths']['report']}"]
+        lines = [*_result_lines(result["rows"], result["other_size"]), result["sentence"]]
+        lines += _measurement_lines(result["decision"])
+        lines.append(f"report: {result['paths']['report']}")
     answer(result, as_json=arguments.json, text="\n".join(lines))
     return 0
 
@@ -147,10 +148,11 @@ def _plan_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     )
 
 
-def _result_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _result_lines(rows: Sequence[Mapping[str, Any]], other_size: str) -> list[str]:
     body, notes = [], []
     for row in rows:
         alarms = row["false_alarm_rate"]
+        expected, other = row["predicted"] or {}, row["other_size"] or {}
         body.append(
             [
                 str(row["label"]),
@@ -158,11 +160,35 @@ def _result_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
                 _shown(row["a90_low"]),
                 _shown(row["a90_high"]),
                 _shown(row["a90_upper"]),
+                _shown(other.get("a90")),
+                _shown(expected.get("value")),
                 "-" if alarms is None else f"{100 * alarms['value']:.3g} %",
                 *_costs(row),
             ]
         )
         marks = [word for word in ("recommended", "pareto", "alike") if row[word]]
-        notes.append(str(row["reason"]) or ", ".join(marks))
-    header = ("setting", "a90", "low", "high", "a90/95", "false al.", "products/s", "motion px", "dose uGy", "CNR")
-    return _table(header, body, notes)
+        verdict = (
+            []
+            if row["verdict"] is None
+            else [f"{row['verdict']} the requirement" if row["verdict"] == "meets" else row["verdict"]]
+        )
+        notes.append(", ".join([*([str(row["reason"])] if row["reason"] else []), *verdict, *marks]))
+    other_name = "a90 mm" if other_size == "size_mm" else "a90 contrast"
+    header = ["setting", "a90", "low", "high", "a90/95", other_name, "expected"]
+    header += ["false al.", "products/s", "motion px", "dose uGy", "CNR"]
+    # columns that no setting fills are left out
+    kept = [
+        0,
+        *(
+            column
+            for column in range(1, len(header))
+            if column not in (5, 6) or any(line[column] != "-" for line in body)
+        ),
+    ]
+    return _table([header[column] for column in kept], [[line[column] for column in kept] for line in body], notes)
+
+
+def _measurement_lines(decision: Mapping[str, Any] | None) -> list[str]:
+    if decision is None:
+        return []
+    return ["To be surer, measure on the real line:", *(f"  {one['text']}" for one in decision["measurements"])]

@@ -172,7 +172,7 @@ def plot_left_out(rows: Sequence[Mapping[str, Any]]) -> bytes:
         axis.plot([row["predicted"]] * 2, [low, high], color=REAL, linewidth=1)
         axis.plot([row["low"], row["high"]], [row["measured"]] * 2, color=REAL, linewidth=1)
         axis.plot([row["predicted"]], [row["measured"]], "o", color=REAL, markersize=5)
-        ends += [row["measured"], row["predicted"], row["low"], row["high"]]
+        ends += [low, high, row["predicted"], row["low"], row["high"]]
     span = [0.9 * min(ends), 1.1 * max(ends)]
     axis.plot(span, span, color=PUBLISHED, linewidth=0.8, linestyle=":")
     axis.set(xlabel="a90 that the observer expects", ylabel="a90 of networks", xlim=span, ylim=span)

@@ -30,13 +30,14 @@ def decision_section(answer: Mapping[str, Any]) -> str:
     if decision is None and screening is None and both is None:
         return ""
     front = [] if decision is None else [_front_row(row) for row in decision["front"]]
-    return template.render(
+    section: str = template.render(
         decision=None if decision is None else _decision(decision, answer["unit"]),
         front=front,
         front_figure=_inline(plot_front_with_expected(answer)) if front else "",
         both=None if both is None else {"label": both["label"], "figure": _inline(plot_both_sizes(both, answer))},
         screening=None if screening is None else _screening(screening),
     )
+    return section
 
 
 def _inline(png: bytes) -> str:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import FitError, InputError, RaytwinError
 from ..files import whole_file
 from ..generator.twin_io import read_twin
+from ..observers import write_efficiency
 from ._once import only_one
 from ._plain import digest, plain, read_object
 from .decision import Change, Verdict, decide, judge_row
@@ -136,6 +137,8 @@ def run_sweep(
 ) -> dict[str, Any]:
     """Do what is left of a sweep and write sweep.json and sweep.csv; returns what sweep.json holds.
 
+    A screened sweep also writes observer.json, the observer as calibrated last.
+
     Args:
         campaign: what is asked.
         directory: of the sweep, new or begun before, with this campaign or another one.
@@ -194,6 +197,8 @@ def run_sweep(
             work(list(tasks), before=0)
         else:
             screened = _screened(campaign, data, found, rows, work, progress)
+            if screened.screen.efficiency is not None:
+                write_efficiency(directory / "observer.json", screened.screen.efficiency)
         answer = _answer(campaign, directory, list(rows.values()), basis, tasks, screened, progress)
         _write_json(directory / "sweep.json", answer)
         write_table(directory / "sweep.csv", answer["rows"])

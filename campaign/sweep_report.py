@@ -52,9 +52,7 @@ def write_report(
         version=version,
         answer=answer,
         sentence=answer["sentence"],
-        decision=jinja2.utils.markupsafe.Markup(
-            decision_section(answer)
-        ),  # its texts are escaped where they are written
+        decision=decision_section(answer),
         size=_size_label(answer),
         other_size="contrast" if answer["other_size"] == "contrast" else "mm",
         trained=[_trained_row(row, seconds) for row in _in_order(rows) if row["trained"]],

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import raytwin as rt
+from raytwin.acquisition.setting import setting_from_text
 from raytwin.campaign.sweep import Progress, look_ahead, run_sweep
 from raytwin.campaign.sweep_file import read_campaign
 from raytwin.campaign.sweep_screening import (
@@ -20,7 +22,10 @@ from raytwin.campaign.sweep_screening import (
 )
 from raytwin.campaign.sweep_trial import basis_of, prepare_references
 from raytwin.errors import InputError
+from raytwin.explore.seen_size import Eye, read_networks_observer
+from raytwin.explore.state import first_state
 from raytwin.files import sha256_of_file
+from raytwin.generator.twin_io import read_twin
 from raytwin.observers import observe_settings
 
 CAMPAIGN = """
@@ -102,8 +107,7 @@ class FakeNetworks:
             "false_alarms": {"rate": 0.1, "low": 0.05, "high": 0.2, "n": 50, "effective_n": 50.0},
             "points": [],
             "line": None,
-            "other_size": {name: None for name in ("a50", "a90", "a90_low", "a90_high", "a90_upper", "line")}
-            | {"points": []},
+            "other_size": dict.fromkeys(("a50", "a90", "a90_low", "a90_high", "a90_upper", "line")) | {"points": []},
             "warnings": [],
         }
         (folder / "pod.json").write_text(json.dumps(curve))
@@ -140,6 +144,31 @@ def test_the_recommendation_is_that_of_training_all_at_a_third_of_the_cost(line,
     assert screened["screening"]["trained"] == len(networks.trained)
     observer = screened["screening"]["observer"]["observer"]
     assert observer["efficiency"] == pytest.approx(0.5, rel=0.4)
+
+
+def test_the_observer_of_a_sweep_is_kept_and_says_the_same_elsewhere(line, ahead, tmp_path):
+    answer, _ = swept(line, ahead, tmp_path / "kept")
+    file = tmp_path / "kept" / "observer.json"
+    twin, references = read_twin(line / "twin.h5"), tmp_path / "kept" / "references" / "test.h5"
+    row = answer["rows"][3]
+    pair = (setting_from_text(row["low"]), setting_from_text(row["high"]))
+    told = rt.observe(twin, pair, references=references, calibrated=file).rows[0]["a90"]
+    assert told is None  # beyond the largest object, where only a sweep asks
+    networks = read_networks_observer(str(file), str(references), twin)
+    state = replace(
+        first_state(twin),
+        kV_low=pair[0].kV,
+        kV_high=pair[1].kV,
+        power_low_W=pair[0].power_W,
+        power_high_W=pair[1].power_W,
+        filters_low=pair[0].filters,
+        filters_high=pair[1].filters,
+        exposure_ms=pair[0].exposure_ms,
+    )
+    seen = Eye(twin, networks=networks).see(state)
+    assert seen.size_name == "contrast"
+    for end in ("value", "low", "high"):
+        assert getattr(seen.networks, end) == pytest.approx(row["predicted"][end], rel=1e-6)
 
 
 def test_bytes_depend_neither_on_the_order_nor_on_a_stop(line, ahead, tmp_path):

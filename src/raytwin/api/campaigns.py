@@ -171,20 +171,19 @@ class Sweep(Result):
         return _scatter(self.rows, ax=ax, what="a90", against=against)
 
     def _table(self) -> Table:
+        seen = any(row["predicted"] is not None for row in self.rows)
         rows = tuple(
             (
                 str(row["label"]),
                 number_text(row["a90"]),
                 f"{number_text(row['a90_low'])} to {number_text(row['a90_high'])}" if row["a90"] is not None else "",
-                _expected_text(row["predicted"]),
+                *([_expected_text(row["predicted"])] if seen else []),
                 number_text(row["throughput_per_s"]),
                 str(row["reason"]) or ", ".join(word for word in ("recommended", "pareto", "alike") if row[word]),
             )
             for row in self.rows
         )
-        header = ("setting", "a90", "95 % interval", "observer", "products/s", "")
-        if not any(cells[3] for cells in rows):
-            header, rows = header[:3] + header[4:], tuple(cells[:3] + cells[4:] for cells in rows)
+        header = ("setting", "a90", "95 % interval", *(["expected"] if seen else []), "products/s", "")
         return Table(title=str(self.answer["sentence"]), header=header, rows=rows)
 
 

@@ -237,9 +237,25 @@ def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
     return found
 
 
-def outlook_row(outlook: Outlook, label: str) -> dict[str, Any]:
-    """An outlook as a row, for people and JSON."""
-    return _row(outlook, label, None, "")
+def outlook_rows(campaign: Campaign, outlooks: Sequence[Outlook]) -> list[dict[str, Any]]:
+    """Outlooks as rows, for people and JSON.
+
+    With a calibrated observer under [screening] each has the a90 that it expects, over the objects of the references; with a
+    [requirement] the verdict as far as it is known.
+    """
+    labels = labels_of([one.pair for one in outlooks])
+    rows = [_row(one, label, None, "") | {"kept": one.kept} for one, label in zip(outlooks, labels, strict=True)]
+    if campaign.screening is not None and campaign.screening.observer is not None:
+        from .sweep_screening import Screen
+
+        expected = Screen(campaign, campaign.test_references or campaign.references, outlooks).expected()
+        for row in rows:
+            one = expected.get(str(row["setting"]))
+            row["predicted"] = None if one is None else one.as_dict()
+    if campaign.requirement is not None:
+        for row in rows:
+            row["verdict"] = judge_row(row, campaign.requirement).verdict
+    return rows
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

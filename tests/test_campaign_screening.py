@@ -169,6 +169,19 @@ def test_the_observer_of_a_sweep_is_kept_and_says_the_same_elsewhere(line, ahead
     assert seen.size_name == "contrast"
     for end in ("value", "low", "high"):
         assert getattr(seen.networks, end) == pytest.approx(row["predicted"][end], rel=1e-6)
+    # a plan with this observer says what is expected everywhere, over the objects of all references
+    asked = f'[screening]\nobserver = "{file}"\n[requirement]\ncontrast = 1.0\n'
+    (line / "plan.toml").write_text(CAMPAIGN.replace("[screening]\nround = 3\n", asked))
+    plan = rt.sweep(line / "plan.toml", plan_only=True)
+    for one, theirs in zip(plan.rows, answer["rows"], strict=True):
+        assert one["predicted"]["value"] == pytest.approx(theirs["predicted"]["value"], rel=0.3)
+        assert one["verdict"] == (
+            "likely" if one["predicted"]["high"] <= 1 else "fails" if one["predicted"]["low"] > 1 else "open"
+        )
+    assert "expected a90" in repr(plan)
+    # and a sweep with it calibrates on no setting
+    again, networks = swept(line, ahead, tmp_path / "again", text=(line / "plan.toml").read_text())
+    assert again["screening"]["calibrating"] == [] and again["recommended"] in networks.trained
 
 
 def test_bytes_depend_neither_on_the_order_nor_on_a_stop(line, ahead, tmp_path):

@@ -27,7 +27,10 @@ _LABELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class SweepPlan(Result):
-    """What is known of every setting of a campaign before training: rows with feasibility, dose, throughput, contrast to noise."""
+    """What is known of every setting of a campaign before training: rows with feasibility, dose, throughput, contrast to noise.
+
+    Where the campaign names a calibrated observer, also the a90 that it expects of networks.
+    """
 
     rows: tuple[Mapping[str, Any], ...]
 
@@ -52,19 +55,22 @@ class SweepPlan(Result):
         return _scatter(self.rows, ax=ax, what="cnr_object", against=against)
 
     def _table(self) -> Table:
+        seen = any(row["predicted"] is not None for row in self.rows)
         rows = tuple(
             (
                 str(row["label"]),
                 "yes" if row["feasible"] else "no",
                 number_text(row["throughput_per_s"]),
                 number_text(row["cnr_object"]),
+                *([_expected_text(row["predicted"])] if seen else []),
                 str(row["reason"]),
             )
             for row in self.rows
         )
+        expected = ["expected a90"] if seen else []
         answer = self.to_dict()
         title = f"{answer['settings']} settings, {answer['feasible']} feasible, {answer['to_train']} to train"
-        return Table(title=title, header=("setting", "feasible", "products/s", "CNR", "reason"), rows=rows)
+        return Table(title=title, header=("setting", "feasible", "products/s", "CNR", *expected, "reason"), rows=rows)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -285,13 +291,9 @@ def sweep(
 
 
 def _plan(campaign: "Campaign", telling: Telling) -> SweepPlan:
-    from ..campaign.sweep import outlook_row
-    from ..campaign.sweep_settings import labels_of
+    from ..campaign.sweep import outlook_rows
 
-    outlooks = _looked_at(campaign, telling)
-    labels = labels_of([one.pair for one in outlooks])
-    rows = [outlook_row(one, label) | {"kept": one.kept} for one, label in zip(outlooks, labels, strict=True)]
-    return SweepPlan(rows=tuple(plain(rows)))
+    return SweepPlan(rows=tuple(plain(outlook_rows(campaign, _looked_at(campaign, telling)))))
 
 
 def _looked_at(campaign: "Campaign", telling: Telling) -> "tuple[Outlook, ...]":

@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan",
         action="store_true",
-        help="train nothing: print feasibility, dose, throughput and contrast-to-noise of every setting",
+        help="train nothing: print feasibility, dose, throughput and contrast-to-noise of every setting, and the a90 that an observer"
+        " named under [screening] expects",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -141,11 +142,22 @@ def _costs(row: Mapping[str, Any]) -> list[str]:
 
 
 def _plan_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    return _table(
-        ("setting", "products/s", "motion px", "dose uGy", "CNR"),
-        [[str(row["label"]), *_costs(row)] for row in rows],
-        [str(row["reason"]) for row in rows],
-    )
+    header = ["setting", "products/s", "motion px", "dose uGy", "CNR"]
+    seen = any(row["predicted"] is not None for row in rows)
+    if seen:
+        header += ["a90", "low", "high"]
+    body = []
+    for row in rows:
+        expected = row["predicted"] or {}
+        ends = [_shown(expected.get(name)) for name in ("value", "low", "high")] if seen else []
+        body.append([str(row["label"]), *_costs(row), *ends])
+    return _table(header, body, [_note(row, []) for row in rows])
+
+
+def _note(row: Mapping[str, Any], marks: Sequence[str]) -> str:
+    """Why a setting has no a90, its verdict on the requirement, and other marks."""
+    verdict = {None: "", "meets": "meets the requirement"}.get(row["verdict"], str(row["verdict"]))
+    return ", ".join(part for part in (str(row["reason"]), verdict, *marks) if part)
 
 
 def _result_lines(rows: Sequence[Mapping[str, Any]], other_size: str) -> list[str]:
@@ -167,12 +179,7 @@ def _result_lines(rows: Sequence[Mapping[str, Any]], other_size: str) -> list[st
             ]
         )
         marks = [word for word in ("recommended", "pareto", "alike") if row[word]]
-        verdict = (
-            []
-            if row["verdict"] is None
-            else [f"{row['verdict']} the requirement" if row["verdict"] == "meets" else row["verdict"]]
-        )
-        notes.append(", ".join([*([str(row["reason"])] if row["reason"] else []), *verdict, *marks]))
+        notes.append(_note(row, marks))
     other_name = "a90 mm" if other_size == "size_mm" else "a90 contrast"
     header = ["setting", "a90", "low", "high", "a90/95", other_name, "expected"]
     header += ["false al.", "products/s", "motion px", "dose uGy", "CNR"]

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..files import whole_file
+from ._ticks import few_ticks
+from .decision_report import decision_section
 from .figures import figure_with_axes, figure_with_panels, png_of
 from .sweep_choice import paces
 from .sweep_file import Campaign
@@ -19,7 +21,6 @@ _TAKEN, _ALIKE, _OTHER, _FRONT = "#1b7f3b", "#335588", "#8a8a8a", "#c23b22"
 _MOST_CURVES = 8
 _CURVES_A_LINE = 4
 _MOST_BARS = 60
-_FEWEST_TICKS = 3
 
 
 def write_report(
@@ -51,11 +52,14 @@ def write_report(
         version=version,
         answer=answer,
         sentence=answer["sentence"],
+        decision=decision_section(answer),
         size=_size_label(answer),
+        other_size="contrast" if answer["other_size"] == "contrast" else "mm",
         trained=[_trained_row(row, seconds) for row in _in_order(rows) if row["trained"]],
         columns={
             name: any(row[name] is not None for row in rows if row["trained"]) for name in ("motion_px", "cnr_object")
-        },
+        }
+        | {"other": any(row["other_size"]["a90"] is not None for row in rows if row["trained"])},
         left_out=[_left_out_row(row) for row in rows if not row["trained"]],
         bars=_MOST_BARS if len(shown) > _MOST_BARS else 0,
         curves=_MOST_CURVES if sum(bool(row["line"] or row["points"]) for row in rows) > _MOST_CURVES else 0,
@@ -148,7 +152,7 @@ def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
             axis.plot([value], [row["a90"]], "o", color=colour, markersize=9 if row["recommended"] else 6)
         axis.set(xscale="log", xlabel=title, ylabel=f"{size} at POD 90 %" if column == 0 else "")
         axis.set_ylim(0, top)
-        _few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
+        few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
     others = [row for row in rows if not row["recommended"]]
     kinds = [
         ("recommended", _TAKEN, len(others) < len(rows)),
@@ -161,22 +165,6 @@ def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
     # of the whole figure: a legend of one panel would make that panel narrower
     figure.legend(fontsize=8, loc="outside upper left", ncols=3, frameon=False)
     return png_of(figure)
-
-
-def _few_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers."""
-    if not values:
-        return
-    lowest, highest = min(values) / 1.25, max(values) * 1.25
-    decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
-    inside: list[float] = []
-    for steps in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9)):
-        if len(inside) < _FEWEST_TICKS:
-            ticks = [step * 10.0**power for power in decades for step in steps]
-            inside = [tick for tick in ticks if lowest <= tick <= highest]
-    axis.set_xticks(inside, [f"{tick:g}" for tick in inside])
-    axis.minorticks_off()
-    axis.set_xlim(lowest, highest)
 
 
 def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
@@ -268,6 +256,7 @@ def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[s
         "recommended": row["recommended"],
         "a90": _DASH if row["a90"] is None else f"{row['a90']:.3g} ({_interval(row['a90_low'], row['a90_high'])})",
         "upper": _number(row["a90_upper"]),
+        "other": _other_size(row["other_size"]),
         "ratio": _ratio(ratio),
         "hits": f"{row['n_hits']}/{row['n']}",
         "alarms": _DASH
@@ -281,6 +270,10 @@ def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[s
         "seconds": _DASH if spent is None else f"{spent:.0f}",
         "marks": "; ".join(marks),
     }
+
+
+def _other_size(other: Mapping[str, Any]) -> str:
+    return _DASH if other["a90"] is None else f"{other['a90']:.3g} ({_interval(other['a90_low'], other['a90_high'])})"
 
 
 def _left_out_row(row: Mapping[str, Any]) -> dict[str, str]:

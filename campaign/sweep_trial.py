@@ -28,7 +28,7 @@ from ..errors import FileFormatError, InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
 from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
-from .sweep_file import Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
+from .sweep_file import SIZES, Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
 from .sweep_settings import open_references, start_pair, twin_at
 from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
 
@@ -100,7 +100,7 @@ def setting_key(basis: Mapping[str, Any], training: Training, trying: Trying, pa
 
 def curve_key(key: str, curve: CurveOptions) -> str:
     """Hash of what decides the POD of a setting."""
-    return digest({"hits": key, "curve": asdict(curve)})
+    return digest({"hits": key, "curve": asdict(curve), "sizes": SIZES})
 
 
 # ------------------------------------------------------------------------------------------------ tasks
@@ -347,15 +347,32 @@ def _run_setting(task: Task, tell: Tell) -> None:
             return
     if not task["keep_images"]:
         _remove(folder / "train.h5", folder / "test.h5")
-    curve = curve_of_table(
-        folder / "hits.csv",
-        task["curve"]["size"],
-        link=task["curve"]["link"],
-        log_size=task["curve"]["log_size"],
-        method=task["curve"]["method"],
+    words = {name: task["curve"][name] for name in ("link", "log_size", "method")}
+    curve = curve_of_table(folder / "hits.csv", task["curve"]["size"], **words)
+    curve["other_size"] = _of_other_size(
+        curve_of_table(folder / "hits.csv", other_size(task["curve"]["size"]), **words)
     )
     with whole_file(folder / "pod.json") as temporary:
         temporary.write_bytes(canonical({"key": task["curve_key"], **curve}))
+
+
+def other_size(size: str) -> str:
+    """The size that objects have beside the campaign's: contrast and length in mm."""
+    return next(name for name in SIZES if name != size)
+
+
+def _of_other_size(curve: Mapping[str, Any]) -> dict[str, Any]:
+    """What is kept of the curve over the other size; nothing is fitted where that is not known."""
+    interval = curve["a90_95_interval"]
+    return {
+        "a50": curve["a50"],
+        "a90": curve["a90"],
+        "a90_low": interval["low"],
+        "a90_high": interval["high"],
+        "a90_upper": curve["a90_95"],
+        "line": curve["line"],
+        "points": curve["points"],
+    }
 
 
 def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:

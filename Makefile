@@ -5,7 +5,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod segmentation spectra
+ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
 .PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean

@@ -13,7 +13,7 @@ from raytwin.campaign import task as task_module
 from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
 from raytwin.cli import main
 from raytwin.diagnosis.explanation import task_text
-from raytwin.diagnosis.figures import plot_task
+from raytwin.diagnosis.figures import task_charts
 from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.known_scenes import KnownScenes
@@ -202,7 +202,9 @@ def test_task_tries_both_twins_and_the_measured_images_on_the_same_objects(line,
     # an answer is JSON, and it can be said and drawn
     assert json.loads(json.dumps(found)) == found
     assert "measured" in task_text(found)
-    assert plot_task(found).startswith(b"\x89PNG")
+    drawn = task_charts(found)
+    assert [chart.name for chart in drawn] == ["pod_expected", "pod_tried"]
+    assert all("twin before" in chart.numbers_csv() for chart in drawn)
 
 
 def test_images_of_the_two_twins_differ_by_the_effect(line, twin, tmp_path, stand_in):

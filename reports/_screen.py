@@ -1,4 +1,4 @@
-"""Charts that answer to the pointer, by Bokeh: hover, zoom, and a click that opens a part of the page. No request leaves the page."""
+"""Charts that answer to the pointer, by Bokeh: hover, zoom, a click that shows a point's row and images; no request leaves the page."""
 
 import importlib.util
 import re
@@ -12,15 +12,16 @@ from .chart import Band, Bars, Chart, Figure, Line, Picture, Rule
 _MARKERS = {"circle": "circle", "square": "square", "triangle": "triangle", "diamond": "diamond"}
 _TOOLS = "pan,box_zoom,wheel_zoom,reset,save"
 _OPEN = """
-const names = source.data.anchor, chosen = source.selected.indices
+const chosen = source.selected.indices
 if (chosen.length > 0) {
-  const part = document.getElementById(names[chosen[0]])
-  if (part != null) {
+  const name = source.data.anchor[chosen[0]]
+  const parts = ['images-' + name, name].map((one) => document.getElementById(one)).filter((one) => one != null)
+  document.querySelectorAll('.chosen').forEach((one) => one.classList.remove('chosen'))
+  for (const part of parts) {
     for (let one = part; one != null; one = one.parentElement) { if (one.tagName == 'DETAILS') { one.open = true } }
-    document.querySelectorAll('.chosen').forEach((one) => one.classList.remove('chosen'))
     part.classList.add('chosen')
-    part.scrollIntoView({behavior: 'smooth', block: 'center'})
   }
+  if (parts.length > 0) { parts[0].scrollIntoView({behavior: 'smooth', block: 'center'}) }
   source.selected.indices = []
 }
 """
@@ -198,7 +199,8 @@ def _draw(plot: Any, chart: Chart, mark: Any) -> None:
             Span(location=at, dimension=dimension, line_color=mark.colour, line_dash="dotted", line_width=1.4)
         )
         if label:
-            plot.line([], [], color=mark.colour, line_dash="dotted", **label)
+            nowhere = [float("nan")] * 2
+            plot.line(nowhere, nowhere, color=mark.colour, line_dash="dotted", **label)
         return
     if isinstance(mark, Band):
         low, high = chart.place(mark.low, "y"), chart.place(mark.high, "y")

@@ -1,4 +1,4 @@
-"""Charts that answer to the pointer, by Bokeh: hover, zoom, a click that shows a point's row and images; no request leaves the page."""
+"""Charts that answer to the pointer, by Bokeh: hover, zoom, a click that shows a point's row and images; without any request."""
 
 import importlib.util
 import re

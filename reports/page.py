@@ -1,7 +1,7 @@
 """One self-contained page: a template of its own, the base that all pages share, figures with their numbers."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,72 @@ class SortedTable:
     words: frozenset[int] = frozenset({0})
     anchors: tuple[str, ...] = ()
     marked: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """What a reader can do next: a sentence, and the command that does it."""
+
+    text: str
+    command: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyFigure:
+    """A number that stands out, and what it is."""
+
+    value: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """A part of a page: sentences, figures, a table and a list, in this order; folded away where few readers want it."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    figures: tuple[Figure, ...] = ()
+    table: SortedTable | None = None
+    items: tuple[str, ...] = ()
+    folded: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultPage:
+    """The page of one result.
+
+    Fields: heading; answer (sentences); key_figures; proof (the figures that show the answer); steps (what to do next);
+    sections; doubtful (the answer is a warning); made_from (hashes, seed).
+    """
+
+    heading: str
+    answer: tuple[str, ...]
+    key_figures: tuple[KeyFigure, ...] = ()
+    proof: tuple[Figure, ...] = ()
+    steps: tuple[Step, ...] = ()
+    sections: tuple[Section, ...] = ()
+    doubtful: bool = False
+    made_from: str = ""
+
+
+def write_result_page(path: Path, page: ResultPage, *, version: str, interactive: bool | None = None) -> Path:
+    """Write the page of one result; arguments as for `write_page`."""
+    figures = {f"proof_{number}": item for number, item in enumerate(page.proof)}
+    sections = []
+    for number, part in enumerate(page.sections):
+        names = {f"section_{number}_{place}": item for place, item in enumerate(part.figures)}
+        figures |= names
+        sections.append({"part": part, "figures": list(names)})
+    return write_page(
+        path,
+        Path(__file__).parent / "result.html",
+        version=version,
+        figures=figures,
+        interactive=interactive,
+        page=page,
+        proof=[name for name in figures if name.startswith("proof_")],
+        sections=sections,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,11 +169,6 @@ def write_page(
     with whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
-
-
-def table_of(header: Sequence[str], rows: Sequence[Sequence[Any]], **options: Any) -> SortedTable:
-    """A `SortedTable` from anything that has a text."""
-    return SortedTable(header=tuple(header), rows=tuple(tuple(str(cell) for cell in row) for row in rows), **options)
 
 
 def _data(content: bytes, kind: str) -> str:

@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
     "explore": ("explore", "a page of settings in the browser: what changes with kV, filter, exposure, product"),
     "export": ("export", "a twin for other simulators, images for other trainers and viewers"),
+    "report": ("report", "a twin, a dataset or a table of hits as one page"),
     "info": ("info", "what is installed; or a twin in a table"),
 }
 
@@ -73,6 +74,7 @@ READING = frozenset(
         "detect",
         "explore",
         "export",
+        "report",
     }
 )
 

@@ -22,7 +22,7 @@ def dataset_page(dataset: Dataset, *, warnings: Sequence[str] = ()) -> ResultPag
     rows_px, columns_px = dataset.shape
     settings = list(dict.fromkeys(row.setting for row in rows if row.setting))
     lines = [f"{len(rows)} pairs of {rows_px} x {columns_px} pixels, {len(with_object)} with a foreign object."]
-    lines.append(", ".join(f"{splits[name]} {name}" for name in SPLITS if splits[name]) + ".")
+    lines.append("Split: " + ", ".join(f"{splits[name]} {name}" for name in SPLITS if splits[name]) + ".")
     key = [
         KeyFigure(value=str(len(rows)), text="image pairs"),
         KeyFigure(value=str(len(with_object)), text="with a foreign object"),

@@ -298,7 +298,7 @@ def validation_page(found: Validation) -> ResultPage:
         error, coverage = answer["median_abs_error_percent"], answer["coverage"]
         key += _scores("level", error["mean"], coverage["mean"])
         if error["sd"] is not None:
-            key += _scores("noise", error["sd"], coverage["sd"])
+            key += _scores("noise level", error["sd"], coverage["sd"])
         lines.append(f"{coverage['rows']} flat series were compared. Intervals that are right hold 95 % of them.")
         seen = sum(row.used_in_calibration for row in found.rows)
         if seen:

@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip || echo "pip stays as it is"
 	for try in 1 2 3 4; do \
-	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,fits,dicom,meshes,develop]' && break; \
+	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,fits,dicom,fabio,meshes,zarr,develop]' && break; \
 	  test $$try != 4 || exit 1; echo "the install broke off; once more in $$((try * 15)) s (what is complete is kept)"; sleep $$((try * 15)); done
 	$(BIN)/python -m pip install --quiet --no-deps 'msfc-ccd==1.2.0' || echo "msfc-ccd could not be had: the test of its camera's frames is skipped"
 	touch $(READY)

@@ -154,7 +154,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         protocol="full",
         effects={"object_scatter": 15.0},
         seed=3,
-        size=32,
+        size=48,
+        frames=6,
         only=("filtered_flats", "slab"),
     ).path
     found = rt.diagnose(session, seed=0)

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import whole_file
+from ..files import only_one, whole_file
 from ..generator.twin_io import read_twin
-from ._once import only_one
 from ._plain import digest, plain, read_object
 from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair

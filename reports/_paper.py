@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .chart import Band, Bars, Chart, Figure, Line, Picture, Points, Rule
+from .chart import Band, Bars, Chart, Figure, Line, Picture, Points, Rule, wrapped
 
 _DPI = 150
 _WIDTH, _WIDE = 4.8, 9.6  # inches: at 360 css pixels, a phone's width, the letters are 10 pixels high
@@ -59,7 +59,7 @@ def _draw_chart(canvas: Any, axis: Any, chart: Chart) -> None:
             getattr(axis, f"set_{name}lim")(*chart.place(ends, name))  # type: ignore[arg-type]
         if ticks is not None:
             places = chart.place(list(ticks), name)  # type: ignore[arg-type]
-            getattr(axis, f"set_{name}ticks")(places, list(ticks.values()))
+            getattr(axis, f"set_{name}ticks")(places, [wrapped(text) for text in ticks.values()], fontsize=8.5)
             getattr(axis, f"{name}axis").set_minor_locator(_no_ticks())
     if chart.downwards:
         axis.invert_yaxis()

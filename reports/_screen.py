@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .chart import Band, Bars, Chart, Figure, Line, Picture, Rule
+from .chart import Band, Bars, Chart, Figure, Line, Picture, Rule, wrapped
 
 _MARKERS = {"circle": "circle", "square": "square", "triangle": "triangle", "diamond": "diamond"}
 _TOOLS = "pan,box_zoom,wheel_zoom,reset,save"
@@ -143,7 +143,7 @@ def _chart(chart: Chart) -> Any:
             axis.ticker = FixedTicker(ticks=places, minor_ticks=[])
             # Bokeh looks a label up by the number itself; whole numbers are looked up without their point
             axis.major_label_overrides = {
-                (int(place) if place.is_integer() else place): text
+                (int(place) if place.is_integer() else place): wrapped(text)
                 for place, text in zip(places, ticks.values(), strict=True)
             }
     for name, box, ends in (("x", plot.x_range, chart.x_ends), ("y", plot.y_range, chart.y_ends)):

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
@@ -231,6 +232,11 @@ def _rows(mark: Mark, number: int) -> Iterator[dict[str, str]]:
 
 def _plain(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def wrapped(text: str) -> str:
+    """The text of a tick in lines of at most some 24 letters: a phone has no room for more beside a figure."""
+    return "\n".join(textwrap.wrap(text, 24, break_long_words=True)) or text
 
 
 def asinh_ticks(largest: float, *, linear_within: float) -> dict[float, str]:

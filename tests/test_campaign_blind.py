@@ -508,7 +508,6 @@ def test_labels_are_not_opened_while_an_answer_is_missing(tmp_path):
 
 
 def test_two_runs_do_not_work_in_one_folder(tmp_path):
-    pytest.importorskip("fcntl")
     folder = tmp_path / "check"
     options = BlindOptions(cases=1, seed=FRESH)
     _, cases = begin_check(folder, options)

@@ -63,7 +63,7 @@ def twin_page(twin: Twin | TubeTwin) -> ResultPage:
         proof=(*charts, gain_picture(twin)),
         steps=_steps(answer),
         sections=(
-            Section(title="Parameters", table=_parameters(answer)),
+            Section(title="Parameters", table=_parameters(twin, answer)),
             Section(title="Levels", table=_levels(answer)),
             *(
                 [Section(title=f"Warnings ({len(answer['warnings'])})", items=tuple(answer["warnings"]))]
@@ -85,7 +85,7 @@ def _tube_page(twin: TubeTwin, answer: Mapping[str, Any]) -> ResultPage:
         answer=("A tube without a detector: spectra and doses can be predicted, images cannot.",),
         steps=_steps(answer),
         sections=(
-            Section(title="Parameters", table=_parameters(answer)),
+            Section(title="Parameters", table=_parameters(twin, answer)),
             *([warnings] if twin.warnings else []),
             *_spectral_sections(twin),
         ),
@@ -124,7 +124,7 @@ def _steps(answer: Mapping[str, Any]) -> tuple[Step, ...]:
     return tuple(found)
 
 
-def _parameters(answer: Mapping[str, Any]) -> SortedTable:
+def _parameters(twin: Twin | TubeTwin, answer: Mapping[str, Any]) -> SortedTable:
     units = {
         "dark": ("dark_DN", "DN"),
         "read noise": ("read_noise_DN", "DN"),
@@ -133,10 +133,9 @@ def _parameters(answer: Mapping[str, Any]) -> SortedTable:
         "flux over the spectrum model's": ("flux_scale", ""),
     }
     rows = [(name, _interval(answer[key], unit)) for name, (key, unit) in units.items() if key in answer]
-    if answer["bad_pixels"] is not None:
-        bad = answer["bad_pixels"]
-        reasons = ", ".join(f"{count} {reason}" for reason, count in bad["reasons"].items() if count)
-        rows.append(("bad pixels", f"{bad['count']} ({bad['share_percent']:.3g} %){': ' + reasons if reasons else ''}"))
+    if isinstance(twin, Twin):
+        bad = twin.maps.bad_pixels > 0
+        rows.append(("bad pixels", f"{int(bad.sum())} ({100.0 * float(bad.mean()):.3g} %)"))
     return SortedTable(header=("quantity", "value (95 %)"), rows=tuple(rows), words=frozenset({0, 1}))
 
 

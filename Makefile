@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs wheel-check bounds-check lock stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -43,6 +43,15 @@ wheel-check: $(READY)
 	cd build/wheel && venv/bin/raytwin predict virtual_lab --kv 60 --filter Cu:0.1 --power-w 30 --exposure-ms 20
 	cd build/wheel && venv/bin/raytwin pod $(CURDIR)/tests/pod_examples/hdbk_ex3.csv
 	cd build/wheel && venv/bin/python -c "import importlib.util as u; assert u.find_spec('torch') is None and u.find_spec('sphinx') is None"
+
+# the oldest and the newest libraries that pyproject.toml allows, each in an environment of its own; half an hour
+bounds-check:
+	PYTHON=$(PYTHON) .ci/bounds oldest newest
+
+# the versions that `Containerfile` installs; again after a change of pyproject.toml
+lock: $(READY)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/python -m uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --extra explore --extra fits --extra dicom --extra fabio --extra meshes --extra zarr pyproject.toml -o requirements.lock
 
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'

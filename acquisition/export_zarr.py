@@ -99,7 +99,10 @@ def _copy_array(name: str, item: Any, target: Any, count: Callable[[int], None])
         target.attrs[name] = _plain(np.asarray(item.asstr()[()], dtype=object))
         return
     if item.ndim < 2:
-        target.create_array(name, data=np.asarray(item[()])).attrs.update(_attributes(item))
+        values = np.asarray(item[()])
+        plain = target.create_array(name, shape=values.shape, dtype=values.dtype)
+        plain[...] = values
+        plain.attrs.update(_attributes(item))
         return
     leading = ("image", "beam") if item.ndim == 4 else ("image",) if item.ndim == 3 else ()
     chunk = (*(1 for _ in item.shape[:-2]), *item.shape[-2:])

@@ -276,12 +276,12 @@ def hypotheses_chart(diagnosis: Diagnosis) -> Chart:
 def task_charts(task: Mapping[str, Any]) -> list[Chart]:
     """Share of objects detected against their size: the two twins' networks on their own images, and measured ones."""
     real = "measured_on_measured" if task["real_networks"] == "measured" else "after_on_measured"
-    left = (
+    left: tuple[tuple[str, str, str, Shape], ...] = (
         ("before_on_before", "twin before", BEFORE, "square"),
         ("after_on_after", "twin after", AFTER, "circle"),
         (real, "measured", MEASURED, "triangle"),
     )
-    right = (
+    right: tuple[tuple[str, str, str, Shape], ...] = (
         ("before_on_measured", "learnt from the twin before", BEFORE, "square"),
         ("after_on_measured", "learnt from the twin after", AFTER, "circle"),
         ("measured_on_measured", "learnt from measured images", MEASURED, "triangle"),
@@ -306,7 +306,7 @@ def task_charts(task: Mapping[str, Any]) -> list[Chart]:
             marks.append(
                 Points(
                     x=[one["size"] for one in points], y=share, colour=colour, shape=shape, label=without, names=told
-                )  # type: ignore[arg-type]
+                )
             )
         charts.append(
             Chart(

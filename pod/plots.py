@@ -268,7 +268,11 @@ def grouped_hits(table: Trials, *, log_size: bool) -> dict[str, Array]:
     filled = weight > 0
     hits = np.bincount(where, weights=table.hits[order], minlength=groups)[filled]
     middle = np.bincount(where, weights=x[order] * total, minlength=groups)[filled] / weight[filled]
-    return {"size": np.exp(middle) if log_size else middle, "hits": hits, "n": weight[filled]}
+    return {
+        "size": np.exp(middle) if log_size else middle,
+        "hits": hits.astype(float),
+        "n": weight[filled].astype(float),
+    }
 
 
 def _untransformed(values: Array, box_cox: float) -> Array:

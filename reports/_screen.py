@@ -179,7 +179,7 @@ def _source(chart: Chart, mark: Any) -> Any:
     for name in ("x", "y"):
         ends = getattr(mark, f"{name}_ends", None)
         if ends is not None:
-            columns |= {f"{name}_low": chart.place(ends[0], name), f"{name}_high": chart.place(ends[1], name)}  # type: ignore[arg-type]
+            columns |= {f"{name}_low": chart.place(ends[0], name), f"{name}_high": chart.place(ends[1], name)}
             columns[f"{name}_told"] = [f"{a:.4g} to {b:.4g}" for a, b in zip(*map(np.atleast_1d, ends), strict=True)]
     names = getattr(mark, "names", ())
     columns["name"] = list(names) if len(names) else [mark.label] * len(columns["x"])

@@ -169,7 +169,7 @@ class Picture:
     @property
     def square(self) -> int:
         """Pixels along each side of what is one point of the picture."""
-        return max(1, math.ceil(max(self.values.shape) / _MOST_POINTS))
+        return max(1, -(-int(max(self.values.shape)) // _MOST_POINTS))
 
     def shown(self) -> Array:
         """Means of squares of pixels (row, column), at most 160 a side; what is not finite is left out of them."""

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import whole_file
+from ..files import only_one, whole_file
 from ..generator.twin_io import read_twin
 from ..observers import write_efficiency
-from ._once import only_one
 from ._plain import digest, plain, read_object
 from .decision import Change, Verdict, decide, judge_row
 from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part

@@ -5,6 +5,7 @@ Within an SSH session the command that brings the page to you is printed. Ctrl+C
 """
 
 import argparse
+import os
 from pathlib import Path
 
 from ..errors import InputError
@@ -15,6 +16,9 @@ EXAMPLE = """examples:
   raytwin explore twin.h5
   raytwin explore virtual_lab --pod hits.csv --campaign campaign.toml --no-browser --port 5010
 """
+
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin explore`."""
+    # an answer is many small sums, which threads would make longer; the libraries read these words when they are loaded
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
     from ..explore.server import listen, serve
 
     if arguments.observer is not None and arguments.references is None:

@@ -1,7 +1,8 @@
 """Networks that were made elsewhere: a torch module, an ONNX file, or any function of images, tried as raytwin's own are.
 
 One protocol: a segmenter is called with log images (image, 2, row, column), -log(I/I0), low kV first, float32, and gives the
-probability of a foreign object in each pixel (image, row, column), 0 to 1. Masks from another program are a function that returns them.
+probability of a foreign object in each pixel (image, row, column), 0 to 1. Masks from another program come from a function that
+returns them.
 """
 
 import os

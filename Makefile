@@ -5,16 +5,16 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod segmentation spectra
+ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo docs wheel-check stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
+.PHONY: demo docs wheel-check bounds-check lock stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip || echo "pip stays as it is"
 	for try in 1 2 3 4; do \
-	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,fits,dicom,meshes,develop]' && break; \
+	  $(BIN)/python -m pip install --quiet -e '.[segmentation,cluster,explore,fits,dicom,fabio,meshes,zarr,develop]' && break; \
 	  test $$try != 4 || exit 1; echo "the install broke off; once more in $$((try * 15)) s (what is complete is kept)"; sleep $$((try * 15)); done
 	$(BIN)/python -m pip install --quiet --no-deps 'msfc-ccd==1.2.0' || echo "msfc-ccd could not be had: the test of its camera's frames is skipped"
 	touch $(READY)
@@ -44,13 +44,22 @@ wheel-check: $(READY)
 	cd build/wheel && venv/bin/raytwin pod $(CURDIR)/tests/pod_examples/hdbk_ex3.csv
 	cd build/wheel && venv/bin/python -c "import importlib.util as u; assert u.find_spec('torch') is None and u.find_spec('sphinx') is None"
 
+# the oldest and the newest libraries that pyproject.toml allows, each in an environment of its own; half an hour
+bounds-check:
+	PYTHON=$(PYTHON) .ci/bounds oldest newest
+
+# the versions that `Containerfile` installs; again after a change of pyproject.toml
+lock: $(READY)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/python -m uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --extra explore --extra fits --extra dicom --extra fabio --extra meshes --extra zarr pyproject.toml -o requirements.lock
+
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
 
-# the page of `raytwin explore` in Debian's Chromium (apt-get install chromium), some minutes
+# the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes
 test-page: $(READY)
 	$(BIN)/python -m pip install --quiet playwright
-	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py
+	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow

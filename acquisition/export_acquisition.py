@@ -72,7 +72,7 @@ def export_acquisition(
     writers = {"tiff": _write_tiffs, "nxtomo": _write_nxtomo, "dicom": _write_dicom}
     if to not in writers:
         raise InputError(
-            "to", received=repr(to), expected="one of " + ", ".join(ACQUISITION_FORMATS) + " for an acquisition"
+            "to", received=repr(to), expected="one of " + ", ".join(ACQUISITION_FORMATS) + ", zarr for an acquisition"
         )
     total = sum(series.n_frames for series in acquisition.series)
     done = 0

@@ -70,7 +70,9 @@ def export_dataset(
         InputError: another form, a folder with something in it.
     """
     if to not in DATASET_FORMATS:
-        raise InputError("to", received=repr(to), expected="one of " + ", ".join(DATASET_FORMATS) + " for a dataset")
+        raise InputError(
+            "to", received=repr(to), expected="one of " + ", ".join(DATASET_FORMATS) + ", zarr for a dataset"
+        )
     if labels not in LABELS:
         raise InputError("labels", received=repr(labels), expected="one of " + ", ".join(LABELS))
     if bits is not None and bits not in _GREY_BITS:

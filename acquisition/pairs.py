@@ -414,7 +414,8 @@ def dataset_from_acquisition(
     texts: set[str] = set()
     names: dict[str, int] = {}
     images = foreign = 0
-    with write_dataset(out, shape=usable[0][0].low.shape, provenance=provenance) as writer:
+    stated = {"pixel_mm": acquisition.instrument.pixel_mm, **(provenance or {})}
+    with write_dataset(out, shape=usable[0][0].low.shape, provenance=stated) as writer:
         for done, (pair, scene) in enumerate(usable):
             reference = _reference(pairs, pair, contrast_from)
             truth = _truth(corrector, reference, scene, dilations=dilations, notes=notes)

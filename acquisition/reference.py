@@ -220,7 +220,8 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
         products = {name: rows.get(name, {}).get("product") or name for name in names}
         splits = split_by_product(products, validation=validation, test=test, rng=rng)
     raw = raw_layout_of(tables, where=NAME)
-    notes = list(_ring_note(wanted.dilations, instrument_of(tables, where=NAME).pixel_mm))
+    pixel_mm = instrument_of(tables, where=NAME).pixel_mm
+    notes = list(_ring_note(wanted.dilations, pixel_mm))
     counted = 0
     shape: tuple[int, int] | None = None
 
@@ -238,7 +239,8 @@ def _from_images(folder: Path, out: str | os.PathLike[str], tables: Mapping[str,
 
     first = log_image(patterns["low"][names[0]])
     shape = (first.shape[0], first.shape[1])
-    with write_dataset(out, shape=shape, provenance={"source": folder.name, "values": values}) as writer:
+    provenance = {"source": folder.name, "values": values, "pixel_mm": pixel_mm}
+    with write_dataset(out, shape=shape, provenance=provenance) as writer:
         for done, name in enumerate(names):
             image = np.stack([log_image(patterns[word][name]) for word in ("low", "high")])
             foreign = _mask(patterns["foreign_object_mask"].get(name), shape)

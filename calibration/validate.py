@@ -459,7 +459,7 @@ def plot_validation(result: Validation) -> "Figure":
     """Errors of predicted level, noise and transmission in per cent, with their 95 % intervals, row by row."""
     from matplotlib.figure import Figure
 
-    groups = _compared(result)
+    groups = compared(result)
     tallest = max(len(mine) for mine in groups.values())
     figure = Figure(figsize=(4.6 * len(groups), 1.2 + tallest * min(0.22, 12.0 / tallest)), layout="constrained")
     for axes, what in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
@@ -474,7 +474,7 @@ def plot_validation(result: Validation) -> "Figure":
 
 def plot_errors(result: Validation, *, ax: Any, what: str | None = None) -> Any:
     """Errors of one quantity in per cent on the axes given; see `Validation.plot`."""
-    groups = _compared(result)
+    groups = compared(result)
     if what is not None and what not in groups:
         raise InputError("what", received=repr(what), expected="one of " + ", ".join(groups))
     chosen = what or next(iter(groups))
@@ -494,8 +494,8 @@ def plot_errors(result: Validation, *, ax: Any, what: str | None = None) -> Any:
     return ax
 
 
-def _compared(result: Validation) -> dict[str, list[tuple[str, float, Estimate, str]]]:
-    """Quantity -> (name, measured, predicted, kind) of each row that has it."""
+def compared(result: Validation) -> dict[str, list[tuple[str, float, Estimate, str]]]:
+    """Quantity (`level`, `noise`, `transmission`) -> (name, measured, predicted, kind) of each row that has it."""
     groups: dict[str, list[tuple[str, float, Estimate, str]]] = {}
 
     def add(what: str, name: str, measured: float | None, predicted: Estimate, kind: str) -> None:

@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, RaytwinError
-from ..files import sha256_of_file, whole_file
+from ..files import only_one, sha256_of_file, whole_file
 from ._children import THREAD_VARIABLES, ChildError, Children, KilledError, StoppedError
-from ._once import only_one
 from ._plain import canonical, digest
 from .blind_cases import BlindCase, draw_cases, is_development_seed, names_of_sets, seal_of, sealed_text
 from .blind_code import check_frozen_code, code_digest, freeze_code, same_code

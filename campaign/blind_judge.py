@@ -7,7 +7,6 @@ another process, opening a connection or reading what belongs to another process
 import argparse
 import json
 import re
-import resource
 import sys
 import time
 from dataclasses import replace
@@ -88,7 +87,7 @@ def judge_session(
             problem = found.compared
             result["answer"] = diagnosis_answer(found, inputs={"seed": _SEED})
         result["seconds"] = time.perf_counter() - start
-        result["peak_memory_MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        result["peak_memory_MB"] = _peak_memory_MB()
         # from here on nothing touches the answer any more
         try:
             if without and not features_only:
@@ -102,6 +101,15 @@ def judge_session(
         except Exception as error:
             result["statistics_error"] = f"{type(error).__name__}: {error}"
     return result
+
+
+def _peak_memory_MB() -> float | None:
+    """Of this process so far; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def main() -> int:

@@ -1,11 +1,10 @@
 """A blind check as one self-contained HTML page."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..files import whole_file
+from ..reports import write_page
 from .blind_figures import (
     plot_accuracy,
     plot_confusion,
@@ -82,8 +81,6 @@ def summary_text(result: CheckResult) -> str:
 
 def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: Path, *, version: str) -> Path:
     """Write the page; returns its path."""
-    import jinja2
-
     scores = result.scores
     outcomes = result.outcomes
     full, every = scores["full_measurement_set"], scores["scores"]
@@ -97,10 +94,10 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         "unknown": plot_unknown(outcomes),
     }
     wrong = [row for row, outcome in zip(rows, outcomes, strict=True) if not exactly_right(outcome)]
-    template = jinja2.Template(
-        (Path(__file__).parent / "blind_report.html").read_text(encoding="utf-8"), autoescape=True
-    )
-    page = template.render(
+    return write_page(
+        path,
+        Path(__file__).parent / "blind_report.html",
+        figures=figures,
         version=version,
         summary=summary_text(result),
         development=scores["development_seed"],
@@ -144,11 +141,7 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
         n_first_wrong=sum(not top1_right(item) for item in outcomes),
         seconds=every["seconds"],
         memory=every["peak_memory_MB"],
-        figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},
     )
-    with whole_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    return path
 
 
 def _value(row: Mapping[str, Any]) -> str:

@@ -1,13 +1,12 @@
 """The demo's results as one self-contained HTML page."""
 
-import base64
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..files import whole_file
 from ..generator.twin import Twin
 from ..generator.twin_io import read_twin
+from ..reports import write_page
 from .demo import read_hits
 from .demo_gap import WithheldFrame, answer_text, withheld_frames, withheld_rows, withheld_text
 from .figures import (
@@ -22,13 +21,13 @@ from .figures import (
     plot_withheld,
 )
 
-_DASH = "&ndash;"
+_DASH = "–"
 _SHARED_NAMES = {"first": "1 s and the longest exposure (first)", "shared": "all exposures (shared start)"}
 
 
 def write_report(result: Mapping[str, Any], directory: Path, *, version: str) -> Path:
     """Write DIR/report.html from the result of `run_demo` and the files it left in DIR; returns its path."""
-    import jinja2
+    from markupsafe import Markup
 
     twin = read_twin(directory / "twin.h5")
     exposures = [row["exposure_ms"] for row in result["a90_table"]]
@@ -45,8 +44,10 @@ def write_report(result: Mapping[str, Any], directory: Path, *, version: str) ->
         "pod": plot_pod(hits, result["pod"], exposures),
         "a90": plot_a90(result["a90_table"]),
     }
-    template = jinja2.Template((Path(__file__).parent / "report.html").read_text(), autoescape=False)
-    page = template.render(
+    return write_page(
+        directory / "report.html",
+        Path(__file__).parent / "report.html",
+        figures=figures,
         version=version,
         plan=result["plan"],
         summary=summary_text(result),
@@ -62,16 +63,11 @@ def write_report(result: Mapping[str, Any], directory: Path, *, version: str) ->
         validation_text=_validation_text(result["validation"]),
         noise_rows=_noise_rows(result["noise"], exposures),
         network_rows=_network_rows(result["training"], hits),
-        limits=_limits(result),
+        limits=[Markup(line) for line in _limits(result)],  # written below, with commands as code
         commands=result["commands"],
         total_seconds=f"{sum(command['seconds'] for command in result['commands']):.0f}",
         warnings=result["calibration"]["warnings"],
-        figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},
     )
-    path = directory / "report.html"
-    with whole_file(path) as temporary:
-        temporary.write_text(page)
-    return path
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -174,7 +170,7 @@ def _key_figures(result: Mapping[str, Any], withheld: Sequence[WithheldFrame]) -
     gap = result["gap"]["diagnosis"]["gap"]
     figures.append(
         {
-            "value": f"{gap['before']:.1f} &rarr; {gap['after']:.1f}",
+            "value": f"{gap['before']:.1f} → {gap['after']:.1f}",
             "text": "gap between line and twin, before and after the diagnosis added what was missing (1: noise alone)",
         }
     )

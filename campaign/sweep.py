@@ -15,13 +15,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
-from ..files import whole_file
+from ..files import only_one, whole_file
 from ..generator.twin_io import read_twin
-from ._once import only_one
+from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
+from .decision import Change, Verdict, decide, judge_row
 from .sweep_choice import choose, indistinct, pareto_front, sentence, takes_part
 from .sweep_file import Campaign, CurveOptions, Pair
 from .sweep_runners import Runner
@@ -31,12 +32,16 @@ from .sweep_trial import (
     basis_of,
     common_words,
     is_done,
+    other_size,
     prepare_references,
     setting_key,
     setting_task,
     start_key,
     start_task,
 )
+
+if TYPE_CHECKING:
+    from .sweep_screening import Screened
 
 UNITS = {"contrast": "", "size_mm": "mm"}
 _MARKER = "campaign.json"
@@ -53,6 +58,7 @@ COLUMNS = (
     "a90_low",
     "a90_high",
     "a90_upper",
+    "a90_other_size",
     "n",
     "n_hits",
     "objects",
@@ -70,6 +76,11 @@ COLUMNS = (
     "photons_high",
     "delta_R",
     "cnr_object",
+    "predicted_a90",
+    "predicted_low",
+    "predicted_high",
+    "decided",
+    "verdict",
     "extrapolated",
     "pareto",
     "recommended",
@@ -125,6 +136,8 @@ def run_sweep(
 ) -> dict[str, Any]:
     """Do what is left of a sweep and write sweep.json and sweep.csv; returns what sweep.json holds.
 
+    A screened sweep also writes observer.json, the observer as calibrated last.
+
     Args:
         campaign: what is asked.
         directory: of the sweep, new or begun before, with this campaign or another one.
@@ -148,7 +161,6 @@ def run_sweep(
             progress.tell(another)
         data = (directory / "references").resolve()
         tasks: dict[str, Task] = {}
-        errors: dict[str, str] = {}
         if any(one.kept for one in found):
             if not campaign.described:
                 prepare_references(campaign, data, basis)
@@ -167,23 +179,51 @@ def run_sweep(
             rows[text] = row
             return row
 
-        left = {text: task for text, task in tasks.items() if not is_done(task)}
-        progress.begin(len(tasks), len(tasks) - len(left))
-        for text in tasks:
-            if text not in left:
-                complete(text, "")
-
         def done(task: Task, error: str) -> None:
-            text = f"{task['low']};{task['high']}"
-            if error:
-                errors[text] = error
-            progress.advance(complete(text, error))
+            progress.advance(complete(f"{task['low']};{task['high']}", error))
 
-        runner.run(list(left.values()), done)
-        answer = _answer(campaign, directory, list(rows.values()), basis, tasks, progress)
+        def work(texts: Sequence[str], *, before: int) -> None:
+            """Do what is left of these settings; `before` others are complete."""
+            left = [text for text in texts if not is_done(tasks[text])]
+            progress.begin(before + len(texts), before + len(texts) - len(left))
+            for text in texts:
+                if text not in left:
+                    complete(text, "")
+            runner.run([tasks[text] for text in left], done)
+
+        screened = None
+        if campaign.screening is None or not tasks:
+            work(list(tasks), before=0)
+        else:
+            screened = _screened(campaign, data, found, rows, work, progress)
+            if screened.screen.efficiency is not None:
+                write_efficiency(directory / "observer.json", screened.screen.efficiency)
+        answer = _answer(campaign, directory, list(rows.values()), basis, tasks, screened, progress)
         _write_json(directory / "sweep.json", answer)
         write_table(directory / "sweep.csv", answer["rows"])
     return answer
+
+
+def _screened(
+    campaign: Campaign,
+    data: Path,
+    outlooks: Sequence[Outlook],
+    rows: dict[str, dict[str, Any]],
+    work: Callable[..., None],
+    progress: Progress,
+) -> "Screened":
+    """Train what the observer leaves undecided, round by round, and say in the rows of the others why they were not trained."""
+    from .sweep_screening import Screen, screened_rows
+
+    screen = Screen(campaign, data / "test.h5", outlooks)
+    asked: list[str] = []
+    while chosen := screen.next(rows, asked):
+        if asked:
+            left = len(screen.kept) - len(asked) - len(chosen)
+            progress.tell(f"{len(chosen)} undecided settings are trained next; {left} others wait for the observer")
+        work(chosen, before=len(asked))
+        asked += chosen
+    return screened_rows(screen, rows, asked)
 
 
 def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -196,9 +236,25 @@ def seconds_of(directory: Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, 
     return found
 
 
-def outlook_row(outlook: Outlook, label: str) -> dict[str, Any]:
-    """An outlook as a row, for people and JSON."""
-    return _row(outlook, label, None, "")
+def outlook_rows(campaign: Campaign, outlooks: Sequence[Outlook]) -> list[dict[str, Any]]:
+    """Outlooks as rows, for people and JSON.
+
+    With a calibrated observer under [screening] each has the a90 that it expects, over the objects of the references; with a
+    [requirement] the verdict as far as it is known.
+    """
+    labels = labels_of([one.pair for one in outlooks])
+    rows = [_row(one, label, None, "") | {"kept": one.kept} for one, label in zip(outlooks, labels, strict=True)]
+    if campaign.screening is not None and campaign.screening.observer is not None:
+        from .sweep_screening import Screen
+
+        expected = Screen(campaign, campaign.test_references or campaign.references, outlooks).expected()
+        for row in rows:
+            one = expected.get(str(row["setting"]))
+            row["predicted"] = None if one is None else one.as_dict()
+    if campaign.requirement is not None:
+        for row in rows:
+            row["verdict"] = judge_row(row, campaign.requirement).verdict
+    return rows
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -209,7 +265,12 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         for row in rows:
             flat = dict(row)
             rate, dose = row["false_alarm_rate"] or {}, row["dose_uGy"] or {}
+            predicted = row["predicted"] or {}
             flat |= {
+                "a90_other_size": (row["other_size"] or {}).get("a90"),
+                "predicted_a90": predicted.get("value"),
+                "predicted_low": predicted.get("low"),
+                "predicted_high": predicted.get("high"),
                 "false_alarm_rate": rate.get("value"),
                 "false_alarm_low": rate.get("low"),
                 "false_alarm_high": rate.get("high"),
@@ -315,6 +376,10 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
         "delta_R": outlook.delta_R,
         "cnr_object": outlook.cnr_object,
         "extrapolated": outlook.extrapolated,
+        "predicted": None,
+        "decided": None,
+        "verdict": None,
+        "other_size": None,
         "points": [],
         "line": None,
         "folder": "",
@@ -342,7 +407,14 @@ def _row(outlook: Outlook, label: str, task: Task | None, error: str) -> dict[st
         "objects": curve["objects"],
         "false_alarm_rate": None
         if alarms is None
-        else {"value": alarms["rate"], "low": alarms["low"], "high": alarms["high"], "n": alarms["n"]},
+        else {
+            "value": alarms["rate"],
+            "low": alarms["low"],
+            "high": alarms["high"],
+            "n": alarms["n"],
+            "effective_n": alarms["effective_n"],
+        },
+        "other_size": curve["other_size"],
         "points": curve["points"],
         "line": curve["line"],
         "warnings": [*row["warnings"], *curve["warnings"]],
@@ -359,11 +431,18 @@ def _answer(
     rows: list[dict[str, Any]],
     basis: Mapping[str, Any],
     tasks: Mapping[str, Task],
+    screened: "Screened | None",
     progress: Progress,
 ) -> dict[str, Any]:
-    limits = campaign.limits
-    most = limits.maximum_false_alarm_rate
-    choice = choose(rows, goal=limits.a90, most_false_alarms=most)
+    goal, most = campaign.goal, campaign.most_false_alarms
+    verdicts: list[Verdict] = []
+    changes_by = ""
+    if campaign.requirement is not None:
+        changes, changes_by = _changes(campaign, directory, rows, screened)
+        for row in rows:
+            verdicts.append(judge_row(row, campaign.requirement, changes=changes.get(str(row["setting"]), ())))
+            row["verdict"] = verdicts[-1].verdict
+    choice = choose(rows, goal=goal, most_false_alarms=most)
     front = set(pareto_front([row if takes_part(row, most) else {**row, "a90": None} for row in rows]))
     for number, row in enumerate(rows):
         ratio, alike = None, False
@@ -391,12 +470,22 @@ def _answer(
     def named(number: int | None) -> str | None:
         return None if number is None else str(rows[number]["setting"])
 
+    decision = None
+    if campaign.requirement is not None:
+        decision = decide(
+            rows, campaign.requirement, verdicts, recommended=choice.recommended, unit=unit, changes_by=changes_by
+        )
+        said = decision["sentence"]
+    else:
+        said = sentence(rows, choice, goal=goal, unit=unit, most_false_alarms=most)
     result = {
         "campaign": campaign.path.name,
         **basis,
         "size": campaign.curve.size,
         "unit": unit,
-        "goal": limits.a90,
+        "other_size": other_size(campaign.curve.size),
+        "other_unit": UNITS[other_size(campaign.curve.size)],
+        "goal": goal,
         "maximum_false_alarm_rate": most,
         "networks": campaign.training.networks,
         "settings": len(rows),
@@ -407,10 +496,37 @@ def _answer(
         "meets_goal": choice.meets,
         "pareto": [str(rows[number]["setting"]) for number in sorted(front)],
         "alike": [str(row["setting"]) for row in rows if row["alike"]],
-        "sentence": sentence(rows, choice, goal=limits.a90, unit=unit, most_false_alarms=most),
+        "screening": None if screened is None else screened.answer,
+        "decision": decision,
+        "sentence": said if screened is None else f"{said} {screened.sentence}",
         "rows": rows,
     }
     return dict(plain(result))
+
+
+def _changes(
+    campaign: Campaign, directory: Path, rows: Sequence[Mapping[str, Any]], screened: "Screened | None"
+) -> tuple[dict[str, tuple[Change, ...]], str]:
+    """What changes of each setting would do to its a90, and who says so: an observer brought to the networks, or one that is not."""
+    from .sweep_screening import Screen, outlooks_of_rows
+
+    if campaign.described:
+        return {}, "nobody: an observer needs reference images"
+    if not any(row["feasible"] for row in rows):
+        return {}, "nobody: no setting can be"
+    try:
+        if screened is None:
+            screen = Screen(campaign, directory / "references" / "test.h5", outlooks_of_rows(rows))
+            screen.calibrate({str(row["setting"]): row for row in rows if row["trained"]})
+        else:
+            screen = screened.screen
+        factors = screen.changes()
+    except InputError as error:
+        return {}, f"nobody: {error}"
+    found = {
+        text: tuple(Change(kind=kind, factor=value) for kind, value in one.items()) for text, one in factors.items()
+    }
+    return found, "a calibrated observer" if screen.efficiency is not None else "an observer that is not calibrated"
 
 
 def _apart(best: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -55,7 +55,8 @@ def choose(rows: Sequence[Row], *, goal: float | None, most_false_alarms: float 
     """The setting to take.
 
     Without a goal the one whose a90 has the smallest upper bound (one-sided 95 %). With one, the fastest of those whose upper
-    bound is at most the goal; of equally fast ones that of least dose; where none reaches it, the smallest upper bound again.
+    bound is at most the goal, those first that meet the whole requirement where there is one; of equally fast ones that of least
+    dose; where none reaches it, the smallest upper bound again.
     Rows with more false alarms than allowed do not take part.
     """
     allowed = [number for number, row in enumerate(rows) if takes_part(row, most_false_alarms)]
@@ -68,7 +69,12 @@ def choose(rows: Sequence[Row], *, goal: float | None, most_false_alarms: float 
     if not reached:
         return Choice(best=best, recommended=best, meets=False)
     pace = paces(rows)
-    fastest = min(reached, key=lambda number: (-pace[number], _dose(rows[number]), *_bound(rows[number]), number))
+
+    def preferred(number: int) -> tuple[Any, ...]:
+        row = rows[number]
+        return (row.get("verdict") in ("open", "fails"), -pace[number], _dose(row), *_bound(row), number)
+
+    fastest = min(reached, key=preferred)
     return Choice(best=best, recommended=fastest, meets=True)
 
 

@@ -23,6 +23,7 @@ METHODS = ("auto", "ml", "firth")
 PAIRS = ("in_turn", "at_once")
 KEEP_OF = ("throughput", "all")
 MOST_SETTINGS = 10_000
+_FEWEST_TO_CALIBRATE = 4  # of settings, for the two numbers of an observer: observers.efficiency
 
 Pair = tuple[Setting, Setting]
 
@@ -39,7 +40,7 @@ _GRID_WORDS = {
     "frame_interval_ms": "frame_interval_ms",
     "binning": "binning",
 }
-_TABLES = ("setting", "grid", "line", "limits", "training", "detection", "pod", "contrast")
+_TABLES = ("setting", "grid", "line", "limits", "requirement", "screening", "training", "detection", "pod", "contrast")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +74,38 @@ class Limits:
     extrapolation: bool = True
     maximum_false_alarm_rate: float | None = None
     a90: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Requirement:
+    """What the line must do; None: not asked for.
+
+    Fields: size (contrast or length in mm, as the campaign's curve has it) of an object that must be found with a probability of
+    90 %, shown with 95 % confidence; false_alarm_rate (share of images without objects, shown with 95 % confidence);
+    throughput_per_s (products); dose_uGy (air kerma of a pair, its 95 % upper end).
+    """
+
+    size: float
+    false_alarm_rate: float | None = None
+    throughput_per_s: float | None = None
+    dose_uGy: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Screening:
+    """A model observer looks at all settings; those that it leaves undecided are trained.
+
+    Fields: observer (file of a calibrated one; None: calibrated on the campaign's own first settings); train_first (settings that it
+    is calibrated on); round (settings trained before it is asked again); most (settings trained in all, None: no limit); detector,
+    image (see `observers.Observer`).
+    """
+
+    observer: Path | None = None
+    train_first: int = 6
+    round: int = 4
+    most: int | None = None
+    detector: str = "ideal"
+    image: str = "residual"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +172,8 @@ class Campaign:
     Fields: path; twin, references, test_references (files; None: held back from the references); reference_setting (of
     references that do not say); test_share, validation_share (of the references' products, where the file does not deal them
     out); product_material, foreign_material (of a transfer); seed; settings (pairs, each once, in the file's order); timing;
-    limits; training; trying; curve; slabs (None: no contrast-to-noise); keep_best (None: all are trained) of keep_best_of.
+    limits; requirement (None: the best is sought); screening (None: all are trained); training; trying; curve; slabs (None: no
+    contrast-to-noise); keep_best (None: all are trained) of keep_best_of.
     """
 
     path: Path
@@ -155,12 +189,26 @@ class Campaign:
     settings: tuple[Pair, ...]
     timing: Timing
     limits: Limits
+    requirement: Requirement | None
+    screening: Screening | None
     training: Training
     trying: Trying
     curve: CurveOptions
     slabs: Slabs | None
     keep_best: int | None
     keep_best_of: str
+
+    @property
+    def goal(self) -> float | None:
+        """Size that a90 is to lie below; None: none."""
+        return self.limits.a90 if self.requirement is None else self.requirement.size
+
+    @property
+    def most_false_alarms(self) -> float | None:
+        """Share of images without objects that may show an alarm; None: any."""
+        if self.requirement is not None and self.requirement.false_alarm_rate is not None:
+            return self.requirement.false_alarm_rate
+        return self.limits.maximum_false_alarm_rate
 
     @property
     def described(self) -> bool:
@@ -215,6 +263,10 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
     keep_best = words.whole("keep_best", None, least=1)
     keep_best_of = words.choice("keep_best_of", "throughput", KEEP_OF)
     words.done(_TABLES)
+    content_words = {word.lower() for word in content}
+    requirement, size_of_requirement = None, SIZES[0]
+    if "requirement" in content_words:
+        requirement, size_of_requirement = _requirement(tables["requirement"])
     campaign = Campaign(
         path=file,
         twin=twin,
@@ -229,14 +281,16 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
         settings=settings,
         timing=_timing(tables["line"]),
         limits=_limits(tables["limits"]),
+        requirement=requirement,
+        screening=_screening(tables["screening"], file.parent) if "screening" in content_words else None,
         training=_training(tables["training"]),
         trying=_trying(tables["detection"]),
-        curve=_curve(tables["pod"]),
+        curve=_curve(tables["pod"], usual=size_of_requirement),
         slabs=_slabs(tables["contrast"]),
         keep_best=keep_best,
         keep_best_of=keep_best_of,
     )
-    _check_together(campaign)
+    _check_together(campaign, size_of_requirement)
     return campaign
 
 
@@ -244,7 +298,7 @@ _SHARES = {"test_share": 0.3, "validation_share": 0.15}
 _MATERIALS = {"product_material": "chicken_breast", "foreign_material": "rib_bone"}
 
 
-def _check_together(campaign: Campaign) -> None:
+def _check_together(campaign: Campaign, size_of_requirement: str) -> None:
     """Words that fit alone but not together."""
     name = campaign.path.name
     tests = campaign.test_references
@@ -255,6 +309,8 @@ def _check_together(campaign: Campaign) -> None:
             expected="images of other products",
             remedy="leave it out: a share of the products is then held back",
         )
+    _check_requirement(campaign, size_of_requirement)
+    _check_screening(campaign)
     if campaign.keep_best is not None and campaign.slabs is None:
         raise InputError(
             f"{name}, keep_best",
@@ -302,6 +358,55 @@ def _check_together(campaign: Campaign) -> None:
             received="contrast with products from a description, whose contrast is another one at every setting",
             expected="one size for all settings",
             remedy='write size = "size_mm" under [pod]',
+        )
+
+
+def _check_requirement(campaign: Campaign, size: str) -> None:
+    if campaign.requirement is None:
+        return
+    limits = campaign.limits
+    twice = [
+        word
+        for word, mine, theirs in (
+            ("a90", limits.a90, campaign.requirement.size),
+            ("maximum_false_alarm_rate", limits.maximum_false_alarm_rate, campaign.requirement.false_alarm_rate),
+            ("minimum_throughput_per_s", limits.minimum_throughput_per_s, campaign.requirement.throughput_per_s),
+            ("maximum_dose_uGy", limits.maximum_dose_uGy, campaign.requirement.dose_uGy),
+        )
+        if mine is not None and theirs is not None
+    ]
+    if twice:
+        raise InputError(
+            f"{campaign.path.name}, [limits], {twice[0]}",
+            received="the same beside [requirement]",
+            expected="one of the two",
+            remedy="a requirement is judged for every setting, a limit rules settings out",
+        )
+    if campaign.curve.size != size:
+        raise InputError(
+            f"{campaign.path.name}, [pod], size",
+            received=f"{campaign.curve.size} with a requirement on {size}",
+            expected="one size",
+            remedy="leave size out under [pod]; the other size is reported beside it",
+        )
+
+
+def _check_screening(campaign: Campaign) -> None:
+    if campaign.screening is None:
+        return
+    if campaign.described:
+        raise InputError(
+            f"{campaign.path.name}, [screening]",
+            received=f"the description {campaign.references.name}",
+            expected="reference images, whose objects the observer looks for",
+            remedy="generate some from the description (`raytwin generate`), or leave [screening] out",
+        )
+    most = campaign.screening.most
+    if most is not None and campaign.screening.observer is None and most < campaign.screening.train_first:
+        raise InputError(
+            f"{campaign.path.name}, [screening], most",
+            received=most,
+            expected=f"train_first, {campaign.screening.train_first}, or more",
         )
 
 
@@ -587,6 +692,53 @@ def _limits(words: _Words) -> Limits:
     return limits
 
 
+def _requirement(words: _Words) -> tuple[Requirement, str]:
+    """The requirement, and the name of its size."""
+    sizes = {name: words.number(name, None, above=0.0) for name in SIZES}
+    given = [name for name, value in sizes.items() if value is not None]
+    if len(given) != 1:
+        raise words.error(
+            "contrast or size_mm", "both" if given else "neither", "the size of the object that must be found"
+        )
+    rates = {
+        "throughput_per_s": words.number("throughput_per_s", None, above=0.0),
+        "products_per_minute": words.number("products_per_minute", None, above=0.0),
+    }
+    if None not in rates.values():
+        raise words.error("throughput_per_s and products_per_minute", "both", "one of the two")
+    pace = rates["throughput_per_s"]
+    if rates["products_per_minute"] is not None:
+        pace = rates["products_per_minute"] / 60.0
+    requirement = Requirement(
+        size=sizes[given[0]],
+        false_alarm_rate=words.number("false_alarm_rate", None, above=0.0, most=1.0),
+        throughput_per_s=pace,
+        dose_uGy=words.number("dose_uGy", None, above=0.0),
+    )
+    words.done()
+    return requirement, given[0]
+
+
+def _screening(words: _Words, folder: Path) -> Screening:
+    from ..observers import DETECTORS, IMAGES
+
+    usual = Screening()
+    screening = Screening(
+        observer=words.file("observer", folder, needed=False),
+        train_first=words.whole("train_first", usual.train_first, least=_FEWEST_TO_CALIBRATE),
+        round=words.whole("round", usual.round, least=1),
+        most=words.whole("most", None, least=1),
+        detector=words.choice("detector", usual.detector, tuple(DETECTORS)),
+        image=words.choice("image", usual.image, IMAGES),
+    )
+    if screening.observer is not None:
+        for word in ("train_first", "detector", "image"):
+            if word in words:
+                raise words.error(word, "given beside observer", "those that it was calibrated with; leave it out")
+    words.done()
+    return screening
+
+
 def _training(words: _Words) -> Training:
     from ..segmentation.recipe import RECIPES
 
@@ -636,9 +788,9 @@ def _trying(words: _Words) -> Trying:
     return trying
 
 
-def _curve(words: _Words) -> CurveOptions:
+def _curve(words: _Words, *, usual: str) -> CurveOptions:
     curve = CurveOptions(
-        size=words.choice("size", "contrast", SIZES),
+        size=words.choice("size", usual, SIZES),
         link=words.choice("link", "cloglog", LINKS),
         log_size=words.flag("log_size", False),
         method=words.choice("method", "auto", METHODS),

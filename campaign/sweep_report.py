@@ -1,6 +1,5 @@
 """A sweep's answer as one self-contained HTML page."""
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -9,164 +8,230 @@ from typing import Any
 
 import numpy as np
 
-from ..files import whole_file
-from .figures import figure_with_axes, figure_with_panels, png_of
+from ..acquisition.dataset_io import read_dataset
+from ..errors import RaytwinError
+from ..reports import AFTER, BEFORE, MEASURED, QUIET, Band, Chart, Figure, Line, Points, Rule, SortedTable, write_page
+from ..reports.chart import Shape
+from .decision_report import decision_section
 from .sweep_choice import paces
 from .sweep_file import Campaign
+from .sweep_trial import EXAMPLE
 
 _DASH = "–"
-_TAKEN, _ALIKE, _OTHER, _FRONT = "#1b7f3b", "#335588", "#8a8a8a", "#c23b22"
 _MOST_CURVES = 8
-_CURVES_A_LINE = 4
 _MOST_BARS = 60
+_MOST_EXAMPLES = 24
 _FEWEST_TICKS = 3
+# kind of a setting -> colour and shape, in the order of the legend
+_KINDS: dict[str, tuple[str, Shape]] = {
+    "recommended": (AFTER, "circle"),
+    "not shown to be worse than the best": (MEASURED, "triangle"),
+    "worse": (QUIET, "square"),
+}
+_FRONTS: dict[str, tuple[str, Shape]] = {
+    "recommended": (AFTER, "circle"),
+    "no other beats it in a90, dose and throughput": (BEFORE, "diamond"),
+    "beaten by another": (QUIET, "square"),
+}
 
 
 def write_report(
-    answer: Mapping[str, Any], path: Path, *, campaign: Campaign, seconds: Mapping[str, float], version: str
+    answer: Mapping[str, Any],
+    path: Path,
+    *,
+    campaign: Campaign,
+    seconds: Mapping[str, float],
+    version: str,
+    interactive: bool | None = None,
 ) -> Path:
     """Write the report of a sweep's answer (what `run_sweep` returns); returns its path.
 
     Args:
         answer: rows, recommendation and what it rests on.
-        path: the page to write.
+        path: the page to write, in the sweep's folder, whose example images it shows.
         campaign: whose settings of training and limits are told.
         seconds: what each setting took, by its text.
         version: of raytwin.
+        interactive: figures that answer to the pointer; None: where Bokeh is installed.
     """
-    import jinja2
-
     rows = answer["rows"]
+    size = _size_label(answer)
     shown = [row for row in rows if row["a90"] is not None]
-    figures = {}
+    ordered = [row for row in _in_order(rows) if row["trained"]]
+    anchors = {str(row["setting"]): f"setting-{number}" for number, row in enumerate(ordered, start=1)}
+    figures: dict[str, Figure | bytes] = {}
     if shown:
-        figures["a90"] = plot_intervals(shown, size=_size_label(answer), goal=answer["goal"])
-        figures["front"] = plot_front(shown, size=_size_label(answer))
-    if any(row["line"] or row["points"] for row in rows):
-        figures["pod"] = plot_curves(rows, size=_size_label(answer))
-    template = jinja2.Template(
-        (Path(__file__).parent / "sweep_report.html").read_text(encoding="utf-8"), autoescape=True
-    )
-    page = template.render(
+        figures["a90"] = intervals_chart(shown, size=size, goal=answer["goal"], anchors=anchors)
+        figures |= {f"front_{name}": chart for name, chart in front_charts(shown, size=size, anchors=anchors).items()}
+    curves = [row for row in rows if row["line"] or row["points"]]
+    figures |= {f"pod_{number}": chart for number, chart in enumerate(curve_charts(curves, size=size))}
+    examples = {str(row["setting"]): _example_png(path.parent, row) for row in ordered[:_MOST_EXAMPLES]}
+    figures |= {f"example_{anchors[setting]}": png for setting, png in examples.items() if png is not None}
+    columns = {name: any(row[name] is not None for row in ordered) for name in ("motion_px", "cnr_object")}
+    columns["other_size"] = any(row["other_size"]["a90"] is not None for row in ordered)
+    return write_page(
+        path,
+        Path(__file__).parent / "sweep_report.html",
         version=version,
+        figures=figures,
+        interactive=interactive,
         answer=answer,
         sentence=answer["sentence"],
-        size=_size_label(answer),
-        trained=[_trained_row(row, seconds) for row in _in_order(rows) if row["trained"]],
-        columns={
-            name: any(row[name] is not None for row in rows if row["trained"]) for name in ("motion_px", "cnr_object")
-        },
-        left_out=[_left_out_row(row) for row in rows if not row["trained"]],
+        decision=decision_section(answer),
+        size=size,
+        trained=_trained_table(
+            ordered,
+            seconds,
+            columns=columns,
+            anchors=anchors,
+            other="contrast" if answer["other_size"] == "contrast" else "mm",
+        ),
+        fronts=[name for name in figures if name.startswith("front_")],
+        pods=[name for name in figures if name.startswith("pod_")],
+        examples=[
+            {
+                "figure": f"example_{anchors[str(row['setting'])]}",
+                "anchor": f"images-{anchors[str(row['setting'])]}",
+                "label": row["label"],
+            }
+            for row in ordered[:_MOST_EXAMPLES]
+            if examples[str(row["setting"])] is not None
+        ],
+        left_out=_left_out_table([row for row in rows if not row["trained"]]),
         bars=_MOST_BARS if len(shown) > _MOST_BARS else 0,
-        curves=_MOST_CURVES if sum(bool(row["line"] or row["points"]) for row in rows) > _MOST_CURVES else 0,
+        curves=_MOST_CURVES if len(curves) > _MOST_CURVES else 0,
         notes=_notes(rows),
         recommended=next((row for row in rows if row["recommended"]), None),
         facts=_facts(campaign, answer),
         limits=_limits(campaign),
-        figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},
     )
-    with whole_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    return path
 
 
-def plot_intervals(rows: Sequence[Mapping[str, Any]], *, size: str, goal: float | None) -> bytes:
-    """a90 of each setting with its two-sided 95 % interval and one-sided bound, the smallest bound first. PNG."""
+def intervals_chart(
+    rows: Sequence[Mapping[str, Any]], *, size: str, goal: float | None, anchors: Mapping[str, str]
+) -> Chart:
+    """a90 of each setting with its two-sided 95 % interval and one-sided bound, the smallest bound first."""
     ordered = _in_order(rows)
     taken = [row for row in ordered[_MOST_BARS:] if row["recommended"]]
     ordered = [*ordered[: _MOST_BARS - len(taken)], *taken]
-    figure, axes = figure_with_axes(10, 1.4 + 0.32 * len(ordered))
-    axis = axes[0, 0]
-    height = np.arange(len(ordered))[::-1]
     ends = [row[name] for row in ordered for name in ("a90", "a90_high", "a90_upper") if row[name] is not None]
     # bounds far beyond all estimates would squeeze the others; they stand in the table
     largest = max(*(row["a90"] for row in ordered), goal or 0.0, 0.0)
     end = min(1.06 * max([*ends, goal or 0.0]), 2.0 * largest)
     if any(row["a90_high"] is None for row in ordered):
-        end = max(end, 1.4 * largest)  # room for the words beside an interval without an end
-    for y, row in zip(height, ordered, strict=True):
-        colour = _colour(row)
-        low = 0.0 if row["a90_low"] is None else row["a90_low"]
-        high = end if row["a90_high"] is None else min(row["a90_high"], end)
-        axis.plot([low, high], [y, y], color=colour, linewidth=2.2 if row["recommended"] else 1.4)
-        axis.plot([row["a90"]], [y], "o", color=colour, markerfacecolor=colour if row["recommended"] else "white")
-        if row["a90_upper"] is not None:
-            axis.plot([row["a90_upper"]], [y], "|", color=colour, markersize=11, markeredgewidth=1.6)
-        if row["a90_high"] is None or row["a90_high"] > end:
-            open_ended = "no upper end" if row["a90_low"] is not None else "no interval"
-            told = open_ended if row["a90_high"] is None else f"to {row['a90_high']:.3g}"
-            axis.annotate(
-                told,
-                (1.0, y),
-                (-3, 4),
-                xycoords=("axes fraction", "data"),
-                textcoords="offset points",
-                fontsize=7,
-                color=colour,
-                ha="right",
+        end = max(end, 1.4 * largest)
+    marks: list[Any] = []
+    places = {str(row["setting"]): float(number) for number, row in enumerate(ordered)}
+    for kind, (colour, shape) in _KINDS.items():
+        mine = [row for row in ordered if _kind(row) == kind]
+        if not mine:
+            continue
+        high = [end if row["a90_high"] is None else min(row["a90_high"], end) for row in mine]
+        marks.append(
+            Points(
+                x=[row["a90"] for row in mine],
+                y=[places[str(row["setting"])] for row in mine],
+                x_ends=([0.0 if row["a90_low"] is None else row["a90_low"] for row in mine], high),
+                names=[_told(row) for row in mine],
+                anchors=[anchors[str(row["setting"])] for row in mine],
+                colour=colour,
+                shape=shape,
+                label=kind,
+                size_px=10.0,
             )
-    if goal is not None:
-        axis.axvline(goal, color="black", linewidth=0.9, linestyle=":")
-        axis.annotate(
-            "goal", (goal, 0.0), (3, 3), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8
         )
-    axis.set_yticks(height, [row["label"] for row in ordered], fontsize=9)
-    axis.set(xlim=(0, end), ylim=(-0.7, len(ordered) - 0.3))
-    axis.set_xlabel(f"{size} at POD 90 %: estimate, two-sided 95 % interval, one-sided 95 % bound (tick)")
-    for colour, label in ((_TAKEN, "recommended"), (_ALIKE, "not shown to be worse than the best"), (_OTHER, "worse")):
-        if any(_colour(row) == colour for row in ordered):
-            axis.plot([], [], "o-", color=colour, label=label)
-    # below the axis: a legend inside would cover intervals
-    axis.legend(fontsize=8, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False)
-    return png_of(figure)
+    bounded = [row for row in ordered if row["a90_upper"] is not None and row["a90_upper"] <= end]
+    if bounded:
+        marks.append(
+            Points(
+                x=[row["a90_upper"] for row in bounded],
+                y=[places[str(row["setting"])] for row in bounded],
+                names=[f"{row['label']}: one-sided bound" for row in bounded],
+                colour="#111111",
+                shape="diamond",
+                label="one-sided 95 % bound",
+                size_px=6.0,
+            )
+        )
+    if goal is not None:
+        marks.append(Rule(at=goal, along="x", label="goal", colour="#111111"))
+    return Chart(
+        name="a90_of_settings",
+        alt="a90 of every setting with its two-sided 95 % interval. An interval that reaches the right edge has no end there."
+        " A click on a point opens its row.",
+        marks=marks,
+        x_label=f"{size} at POD 90 %",
+        x_ends=(0.0, end),
+        y_ticks={places[str(row["setting"])]: str(row["label"]) for row in ordered},
+        y_ends=(-0.7, len(ordered) - 0.3),
+        downwards=True,
+        wide=True,
+        height_px=130 + 26 * len(ordered),
+    )
 
 
-def plot_front(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
-    """a90 against pace and against dose, with those that no other setting beats in all three. PNG."""
-    pace = paces(rows)
+def _told(row: Mapping[str, Any]) -> str:
+    """A setting's name and, where its interval has no end, that."""
+    if row["a90_high"] is not None:
+        return str(row["label"])
+    return f"{row['label']}: {'no interval' if row['a90_low'] is None else 'no upper end'}"
+
+
+def front_charts(rows: Sequence[Mapping[str, Any]], *, size: str, anchors: Mapping[str, str]) -> dict[str, Chart]:
+    """a90 against pace and against dose, with those that no other setting beats in all three."""
     belt = not any(row["throughput_per_s"] is not None for row in rows)
-    panels = [
-        (pace, "belt speed, mm/s" if belt else "throughput, products/s"),
-        (
-            [math.nan if row["dose_uGy"] is None else row["dose_uGy"]["value"] for row in rows],
-            "air kerma of a pair, uGy",
-        ),
-    ]
     largest = max(row["a90"] for row in rows)
     ends = [row["a90_high"] for row in rows if row["a90_high"] is not None]
     top = min(1.06 * max([*ends, 1.1 * largest]), 2.0 * largest)
-    figure, axes = figure_with_axes(11, 4.2, 1, 2)
-    for column, (values, title) in enumerate(panels):
-        axis = axes[0, column]
-        for value, row in zip(values, rows, strict=True):
-            if not (math.isfinite(value) and value > 0):
+    doses = [math.nan if row["dose_uGy"] is None else row["dose_uGy"]["value"] for row in rows]
+    panels = {
+        "pace": (paces(rows), "belt speed, mm/s" if belt else "throughput, products/s"),
+        "dose": (doses, "air kerma of a pair, µGy"),
+    }
+    charts = {}
+    for name, (values, title) in panels.items():
+        known = [(value, row) for value, row in zip(values, rows, strict=True) if math.isfinite(value) and value > 0]
+        if not known:
+            continue
+        marks = []
+        for kind, (colour, shape) in _FRONTS.items():
+            mine = [(value, row) for value, row in known if _front(row) == kind]
+            if not mine:
                 continue
+            low = [0.0 if row["a90_low"] is None else row["a90_low"] for _, row in mine]
             # an interval without an end leaves the picture
-            low, high = (end if row[name] is None else row[name] for name, end in (("a90_low", 0.0), ("a90_high", top)))
-            colour = _TAKEN if row["recommended"] else _FRONT if row["pareto"] else _OTHER
-            axis.plot([value, value], [low, high], color=colour, linewidth=1, alpha=0.6)
-            axis.plot([value], [row["a90"]], "o", color=colour, markersize=9 if row["recommended"] else 6)
-        axis.set(xscale="log", xlabel=title, ylabel=f"{size} at POD 90 %" if column == 0 else "")
-        axis.set_ylim(0, top)
-        _few_ticks(axis, [value for value in values if math.isfinite(value) and value > 0])
-    others = [row for row in rows if not row["recommended"]]
-    kinds = [
-        ("recommended", _TAKEN, len(others) < len(rows)),
-        ("no other beats it in a90, dose and throughput", _FRONT, any(row["pareto"] for row in others)),
-        ("beaten by another", _OTHER, any(not row["pareto"] for row in others)),
-    ]
-    for label, colour, there in kinds:
-        if there:
-            axes[0, 0].plot([], [], "o", color=colour, label=label)
-    # of the whole figure: a legend of one panel would make that panel narrower
-    figure.legend(fontsize=8, loc="outside upper left", ncols=3, frameon=False)
-    return png_of(figure)
+            high = [top if row["a90_high"] is None else row["a90_high"] for _, row in mine]
+            marks.append(
+                Points(
+                    x=[value for value, _ in mine],
+                    y=[row["a90"] for _, row in mine],
+                    y_ends=(low, high),
+                    names=[_told(row) for _, row in mine],
+                    anchors=[anchors[str(row["setting"])] for _, row in mine],
+                    colour=colour,
+                    shape=shape,
+                    label=kind,
+                    size_px=10.0,
+                )
+            )
+        ticks, limits = _few_ticks([value for value, _ in known])
+        charts[name] = Chart(
+            name=f"a90_against_{name}",
+            alt=f"a90 against {title.partition(',')[0]}, with two-sided 95 % intervals. A click on a point opens its row.",
+            marks=marks,
+            x_label=title,
+            y_label=f"{size} at POD 90 %",
+            x_scale="log",
+            x_ticks=ticks,
+            x_ends=limits,
+            y_ends=(0.0, top),
+            height_px=380,
+        )
+    return charts
 
 
-def _few_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers."""
-    if not values:
-        return
+def _few_ticks(values: Sequence[float]) -> tuple[dict[float, str], tuple[float, float]]:
+    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers; and its ends."""
     lowest, highest = min(values) / 1.25, max(values) * 1.25
     decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
     inside: list[float] = []
@@ -174,44 +239,84 @@ def _few_ticks(axis: Any, values: Sequence[float]) -> None:
         if len(inside) < _FEWEST_TICKS:
             ticks = [step * 10.0**power for power in decades for step in steps]
             inside = [tick for tick in ticks if lowest <= tick <= highest]
-    axis.set_xticks(inside, [f"{tick:g}" for tick in inside])
-    axis.minorticks_off()
-    axis.set_xlim(lowest, highest)
+    return {tick: f"{tick:g}" for tick in inside}, (lowest, highest)
 
 
-def plot_curves(rows: Sequence[Mapping[str, Any]], *, size: str) -> bytes:
-    """POD curves with 95 % bands of the recommended setting, of those that no other beats, and of others up to eight. PNG."""
-    fitted = [row for row in rows if row["line"] or row["points"]]
+def curve_charts(fitted: Sequence[Mapping[str, Any]], *, size: str) -> list[Chart]:
+    """POD curves with 95 % bands of the recommended setting, of those that no other beats, and of others up to eight."""
     ranked = sorted(
         fitted, key=lambda row: (not row["recommended"], not row["pareto"], row["a90"] is None, row["a90"] or 0.0)
     )
-    chosen = ranked[:_MOST_CURVES]
-    figure, axes = figure_with_panels(len(chosen), _CURVES_A_LINE, width=3.1, height=2.9)
-    for number, (axis, row) in enumerate(zip(axes, chosen, strict=True)):
-        colour = _colour(row)
+    charts = []
+    for number, row in enumerate(ranked[:_MOST_CURVES], start=1):
+        colour, _ = _KINDS[_kind(row)]
+        marks: list[Any] = [Rule(at=0.9)]
         line = row["line"]
         if line:
             # where a band has no end there is null
             at, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
-            axis.plot(at, pod, color=colour)
-            axis.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
-        for point in row["points"]:
-            axis.plot([point["size"]], [point["hits"] / point["n"]], "o", color="black", markersize=3)
-        axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
+            marks += [Band(x=at, low=low, high=high, colour=colour), Line(x=at, y=pod, colour=colour)]
+        if row["points"]:
+            marks.append(
+                Points(
+                    x=[point["size"] for point in row["points"]],
+                    y=[point["hits"] / point["n"] for point in row["points"]],
+                    names=[f"{point['hits']} of {point['n']}" for point in row["points"]],
+                    colour="#111111",
+                    size_px=6.0,
+                )
+            )
         if row["a90"] is not None:
-            axis.plot([row["a90"]], [0.9], "o", color=colour, markersize=5)
-        axis.set(ylim=(-0.03, 1.03))
-        axis.locator_params(axis="x", nbins=4)
-        axis.set_title(str(row["label"]) + (" *" if row["recommended"] else ""), fontsize=9)
-        if number + _CURVES_A_LINE >= len(chosen):
-            axis.set_xlabel(size)
-        if number % _CURVES_A_LINE == 0:
-            axis.set_ylabel("probability of detection")
-    return png_of(figure)
+            marks.append(Points(x=[row["a90"]], y=[0.9], colour=colour, shape="diamond", names=["a90"], size_px=10.0))
+        charts.append(
+            Chart(
+                name=f"pod_{number}",
+                title=str(row["label"]) + (" (recommended)" if row["recommended"] else ""),
+                alt="POD with its 95 % band; dots: share of hits in groups of like size; diamond: a90.",
+                marks=marks,
+                x_label=size,
+                y_label="probability of detection",
+                y_ends=(-0.03, 1.03),
+                height_px=270,
+            )
+        )
+    return charts
 
 
-def _colour(row: Mapping[str, Any]) -> str:
-    return _TAKEN if row["recommended"] else _ALIKE if row["alike"] or row["best"] else _OTHER
+def _example_png(folder: Path, row: Mapping[str, Any]) -> bytes | None:
+    """A test pair of a setting around its foreign object, low and high kV, the object outlined; None where none was kept."""
+    kept = folder / str(row["folder"] or "") / EXAMPLE
+    if not row["folder"] or not kept.is_file():
+        return None
+    try:
+        with read_dataset(kept) as dataset:
+            pair, mask = dataset.images(0), dataset.foreign_object_masks(0)
+    except RaytwinError:
+        return None  # a page without this picture is better than none
+    from scipy.ndimage import binary_dilation
+
+    edge = binary_dilation(mask, iterations=2) & ~binary_dilation(mask)
+    panels = []
+    for image in pair:
+        low, high = np.percentile(image, [0.5, 99.5])
+        grey = np.clip((high - image) / max(float(high - low), 1e-9), 0.0, 1.0)
+        panel = np.repeat((255.0 * grey).astype(np.uint8)[..., np.newaxis], 3, axis=-1)
+        panel[edge] = (230, 159, 0)
+        panels.append(panel)
+    gap = np.full((panels[0].shape[0], 4, 3), 255, np.uint8)
+    import imageio.v3
+
+    return bytes(imageio.v3.imwrite("<bytes>", np.hstack([panels[0], gap, panels[1]]), extension=".png"))
+
+
+def _kind(row: Mapping[str, Any]) -> str:
+    recommended, alike, worse = _KINDS
+    return recommended if row["recommended"] else alike if row["alike"] or row["best"] else worse
+
+
+def _front(row: Mapping[str, Any]) -> str:
+    recommended, front, beaten = _FRONTS
+    return recommended if row["recommended"] else front if row["pareto"] else beaten
 
 
 def _in_order(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -247,11 +352,53 @@ def _ratio(ratio: Mapping[str, Any] | None) -> str:
     return f"{ratio['value']:.2f} ({_interval(ratio['low'], ratio['high'])})"
 
 
-def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[str, Any]:
-    alarms, dose, ratio = row["false_alarm_rate"], row["dose_uGy"], row["ratio_to_best"]
-    marks = []
-    if row["recommended"]:
-        marks.append("recommended")
+def _trained_table(
+    rows: Sequence[Mapping[str, Any]],
+    seconds: Mapping[str, float],
+    *,
+    columns: Mapping[str, bool],
+    anchors: Mapping[str, str],
+    other: str,
+) -> SortedTable:
+    """Every setting that was tried; columns that no row fills are left out."""
+    header = ["setting", "a90 (95 %)", "a90/95"]
+    header += [f"a90 in {other} (95 %)"] if columns["other_size"] else []
+    header += ["over the best's (95 %)", "hits", "false alarms (95 %)", "products/s"]
+    header += ["motion, px"] if columns["motion_px"] else []
+    header += ["air kerma, µGy"]
+    header += ["contrast to noise"] if columns["cnr_object"] else []
+    header += ["extrapolated", "s", "remarks", "beam"]
+    body = []
+    for row in rows:
+        alarms, dose, spent = row["false_alarm_rate"], row["dose_uGy"], seconds.get(row["setting"])
+        cells = [
+            str(row["label"]),
+            _DASH if row["a90"] is None else f"{row['a90']:.3g} ({_interval(row['a90_low'], row['a90_high'])})",
+            _number(row["a90_upper"]),
+            *([_other_size(row["other_size"])] if columns["other_size"] else []),
+            _ratio(row["ratio_to_best"]),
+            f"{row['n_hits']}/{row['n']}",
+            _DASH
+            if alarms is None
+            else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.2g} to {100 * alarms['high']:.2g})",
+            _number(row["throughput_per_s"]),
+        ]
+        cells += [_number(row["motion_px"])] if columns["motion_px"] else []
+        cells += [_number(None if dose is None else dose["value"])]
+        cells += [_number(row["cnr_object"])] if columns["cnr_object"] else []
+        cells += ["yes" if row["extrapolated"] else "no", _DASH if spent is None else f"{spent:.0f}", _remarks(row)]
+        body.append((*cells, f"{row['low']}; {row['high']}"))
+    return SortedTable(
+        header=tuple(header),
+        rows=tuple(body),
+        words=frozenset({0, len(header) - 2, len(header) - 1}),
+        anchors=tuple(anchors[str(row["setting"])] for row in rows),
+        marked=frozenset(number for number, row in enumerate(rows) if row["recommended"]),
+    )
+
+
+def _remarks(row: Mapping[str, Any]) -> str:
+    marks = ["recommended"] if row["recommended"] else []
     if row["best"] and not row["recommended"]:
         marks.append("smallest bound")
     if row["alike"]:
@@ -261,39 +408,32 @@ def _trained_row(row: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[s
     if row["reason"]:
         # the figures in brackets stand among the warnings
         marks.append(str(row["reason"]).partition(" (")[0])
-    spent = seconds.get(row["setting"])
-    return {
-        "label": row["label"],
-        "setting": f"{row['low']}; {row['high']}",
-        "recommended": row["recommended"],
-        "a90": _DASH if row["a90"] is None else f"{row['a90']:.3g} ({_interval(row['a90_low'], row['a90_high'])})",
-        "upper": _number(row["a90_upper"]),
-        "ratio": _ratio(ratio),
-        "hits": f"{row['n_hits']}/{row['n']}",
-        "alarms": _DASH
-        if alarms is None
-        else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.2g} to {100 * alarms['high']:.2g})",
-        "dose": _number(None if dose is None else dose["value"]),
-        "throughput": _number(row["throughput_per_s"]),
-        "motion": _number(row["motion_px"]),
-        "cnr": _number(row["cnr_object"]),
-        "extrapolated": "yes" if row["extrapolated"] else "no",
-        "seconds": _DASH if spent is None else f"{spent:.0f}",
-        "marks": "; ".join(marks),
-    }
+    return "; ".join(marks)
 
 
-def _left_out_row(row: Mapping[str, Any]) -> dict[str, str]:
-    dose = row["dose_uGy"]
-    return {
-        "label": row["label"],
-        "setting": f"{row['low']}; {row['high']}",
-        "kind": "cannot be" if not row["feasible"] else "not tried",
-        "throughput": _number(row["throughput_per_s"]),
-        "dose": _number(None if dose is None else dose["value"]),
-        "cnr": _number(row["cnr_object"]),
-        "reason": row["reason"],
-    }
+def _other_size(other: Mapping[str, Any]) -> str:
+    return _DASH if other["a90"] is None else f"{other['a90']:.3g} ({_interval(other['a90_low'], other['a90_high'])})"
+
+
+def _left_out_table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
+    def kerma(row: Mapping[str, Any]) -> str:
+        return _number(None if row["dose_uGy"] is None else row["dose_uGy"]["value"])
+
+    return SortedTable(
+        header=("setting", "", "products/s", "air kerma, µGy", "contrast to noise", "reason"),
+        rows=tuple(
+            (
+                str(row["label"]),
+                "cannot be" if not row["feasible"] else "not tried",
+                _number(row["throughput_per_s"]),
+                kerma(row),
+                _number(row["cnr_object"]),
+                str(row["reason"]),
+            )
+            for row in rows
+        ),
+        words=frozenset({0, 1, 5}),
+    )
 
 
 def _notes(rows: Sequence[Mapping[str, Any]]) -> list[str]:

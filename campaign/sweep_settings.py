@@ -26,9 +26,10 @@ from ..generator.effects.motion_blur import MOTION_BLUR, STATED_MS
 from ..generator.line_limits import frames_per_s
 from ..generator.predict import Prediction, predict_flatfield
 from ..generator.twin import Twin
-from .sweep_file import Campaign, Limits, Pair, Timing, text_of_pair
+from .sweep_file import Campaign, Limits, Pair, Requirement, Timing, text_of_pair
 
 if TYPE_CHECKING:
+    from ..generator.contrast import SlabContrasts
     from ..generator.describe import Description
 
 _STRICTER = ("maximum_kV", "maximum_current_mA", "maximum_power_w")
@@ -86,6 +87,7 @@ class Scout:
         self.twin = replace(twin, instrument=limited_instrument(twin.instrument, campaign.limits))
         self._datasets: list[Dataset] = []
         self._descriptions: list[Description] = []
+        self._contrasts: SlabContrasts | None = None  # beams that several settings share are computed once
         for word, path in (("references", campaign.references), ("test_references", campaign.test_references)):
             if path is None:
                 continue
@@ -120,7 +122,8 @@ class Scout:
             return Outlook(pair=pair, reason=str(error), kept=False, warnings=_once(warnings), **known)
         except _Refused as error:
             return Outlook(pair=pair, reason=str(error), kept=False, warnings=_once(warnings), **known)
-        return Outlook(pair=pair, warnings=_once(warnings), **known)
+        missed = _missed(self.campaign.requirement, known)
+        return Outlook(pair=pair, kept=not missed, why_left_out=missed, warnings=_once(warnings), **known)
 
     def _try_images(self, pair: Pair) -> tuple[str, ...]:
         """Whether images can be made at all; the noise of one reference of each kind is weighed."""
@@ -149,7 +152,7 @@ class Scout:
         return tuple(found)
 
     def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float]:
-        from ..generator.contrast import compute_contrast_map
+        from ..generator.contrast import SlabContrasts
 
         slabs = self.campaign.slabs
         if slabs is None:
@@ -157,14 +160,15 @@ class Scout:
         if self.twin.spectral is None:
             warnings.append("no contrast-to-noise: the twin has no spectral part")
             return {}
-        found = compute_contrast_map(
-            replace(self.twin, effects=()),
-            [[pair]],
-            product=slabs.product,
-            foreign_object=slabs.foreign_object,
-            object_pixels=slabs.object_pixels,
-            displaces=slabs.displaces,
-        )[0][0]
+        if self._contrasts is None:
+            self._contrasts = SlabContrasts(
+                replace(self.twin, effects=()),
+                product=slabs.product,
+                foreign_object=slabs.foreign_object,
+                object_pixels=slabs.object_pixels,
+                displaces=slabs.displaces,
+            )
+        found = self._contrasts.contrast(*pair, intervals=False)
         warnings += [line for line in found.warnings if line not in warnings]
         return {"delta_R": found.delta_R.value, "cnr_object": found.cnr_object}
 
@@ -326,6 +330,19 @@ def _check(
         raise _Refused(f"throughput {text}, asked for are {least:g} products/s")
 
 
+def _missed(requirement: Requirement | None, known: Mapping[str, Any]) -> str:
+    """Why a setting cannot meet the requirement whatever its networks find; empty where it may."""
+    if requirement is None:
+        return ""
+    pace, asked = known["throughput_per_s"], requirement.throughput_per_s
+    if asked is not None and pace is not None and pace < asked * (1 - 1e-9):
+        return f"not trained: throughput {pace:.4g} products/s, required are {asked:.4g}"
+    dose, most = known["dose_uGy"], requirement.dose_uGy
+    if most is not None and dose is not None and dose["low"] > most * (1 + 1e-9):
+        return f"not trained: dose {dose['low']:.4g} uGy or more, required is {most:g} uGy at most"
+    return ""
+
+
 def _check_distance(instrument: Instrument, pair: Pair, dataset: Dataset, fallback: Pair | None) -> None:
     """Refuse a distance that references which state none (the instrument's, then) were not taken at."""
     from ..generator.generate import reference_settings
@@ -352,7 +369,7 @@ def keep_best(outlooks: Sequence[Outlook], *, keep: int, of: str) -> tuple[Outlo
     """
     groups: dict[str, list[int]] = {}
     for number, one in enumerate(outlooks):
-        if one.feasible and one.cnr_object is not None:
+        if one.kept and one.cnr_object is not None:
             groups.setdefault(_pace(one) if of == "throughput" else "any throughput", []).append(number)
     result = list(outlooks)
     for name, members in groups.items():

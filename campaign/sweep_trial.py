@@ -5,7 +5,7 @@ its own that holds what is finished; a task that was killed goes on where it sto
 
     learn.h5, test.h5    references, dealt out (shared by all)                                   `prepare_references`
     start/               the network that all start from                                         task of kind `start`
-    <setting>/trial.json, hits.csv, pod.json, networks/, thresholds.json, seconds.json           task of kind `setting`
+    <setting>/trial.json, hits.csv, pod.json, example.h5, networks/, thresholds.json, seconds.json   task of kind `setting`
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from ..errors import FileFormatError, InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
 from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
-from .sweep_file import Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
+from .sweep_file import SIZES, Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
 from .sweep_settings import open_references, start_pair, twin_at
 from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
 
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 Task = dict[str, Any]
 Tell = Callable[[str], None]
 
+EXAMPLE = "example.h5"  # a part of one test pair, for the report
+_EXAMPLE_PX = 128
 _SEED_BITS = 48
 _FEWEST_START_IMAGES = 16
 _ONE_AT_A_TIME = threading.Lock()  # torch's random state and number of threads belong to the process
@@ -100,7 +102,7 @@ def setting_key(basis: Mapping[str, Any], training: Training, trying: Trying, pa
 
 def curve_key(key: str, curve: CurveOptions) -> str:
     """Hash of what decides the POD of a setting."""
-    return digest({"hits": key, "curve": asdict(curve)})
+    return digest({"hits": key, "curve": asdict(curve), "sizes": SIZES})
 
 
 # ------------------------------------------------------------------------------------------------ tasks
@@ -337,6 +339,34 @@ def _run_start(task: Task, tell: Tell) -> None:
         temporary.write_bytes(canonical({"key": task["key"], "networks": learnt.name}))
 
 
+def _keep_example(tests: Path, path: Path) -> None:
+    """Keep one test pair for the report: the foreign object of middling contrast with what lies around it."""
+    if path.exists() or not tests.exists():
+        return
+    with read_dataset(tests) as dataset:
+        contrast = np.nan_to_num(dataset.column("contrast"), nan=-np.inf)
+        there = np.flatnonzero(np.isfinite(contrast))
+        if there.size == 0:
+            return
+        number = int(there[np.argsort(contrast[there])[there.size // 2]])
+        mask = dataset.foreign_object_masks(number)
+        if not mask.any():
+            return
+        part = tuple(
+            slice(max(0, min(int(middle) - _EXAMPLE_PX // 2, length - _EXAMPLE_PX)), None)
+            for middle, length in zip(np.argwhere(mask).mean(axis=0), mask.shape, strict=True)
+        )
+        part = tuple(slice(one.start, one.start + _EXAMPLE_PX) for one in part)
+        cut = mask[part]
+        with write_dataset(path, shape=(cut.shape[0], cut.shape[1]), provenance={}) as writer:
+            writer.append(
+                image=dataset.images(number)[(slice(None), *part)],
+                foreign_object_mask=cut,
+                product_mask=dataset.product_masks(number)[part],
+                row=dataset.rows[number],
+            )
+
+
 def _run_setting(task: Task, tell: Tell) -> None:
     folder = Path(task["folder"])
     if not _tried(task):
@@ -345,17 +375,35 @@ def _run_setting(task: Task, tell: Tell) -> None:
             temporary.write_bytes(canonical({"key": task["key"], **found}))
         if found["refused"]:
             return
+    _keep_example(folder / "test.h5", folder / EXAMPLE)
     if not task["keep_images"]:
         _remove(folder / "train.h5", folder / "test.h5")
-    curve = curve_of_table(
-        folder / "hits.csv",
-        task["curve"]["size"],
-        link=task["curve"]["link"],
-        log_size=task["curve"]["log_size"],
-        method=task["curve"]["method"],
+    words = {name: task["curve"][name] for name in ("link", "log_size", "method")}
+    curve = curve_of_table(folder / "hits.csv", task["curve"]["size"], **words)
+    curve["other_size"] = _of_other_size(
+        curve_of_table(folder / "hits.csv", other_size(task["curve"]["size"]), **words)
     )
     with whole_file(folder / "pod.json") as temporary:
         temporary.write_bytes(canonical({"key": task["curve_key"], **curve}))
+
+
+def other_size(size: str) -> str:
+    """The size that objects have beside the campaign's: contrast and length in mm."""
+    return next(name for name in SIZES if name != size)
+
+
+def _of_other_size(curve: Mapping[str, Any]) -> dict[str, Any]:
+    """What is kept of the curve over the other size; nothing is fitted where that is not known."""
+    interval = curve["a90_95_interval"]
+    return {
+        "a50": curve["a50"],
+        "a90": curve["a90"],
+        "a90_low": interval["low"],
+        "a90_high": interval["high"],
+        "a90_upper": curve["a90_95"],
+        "line": curve["line"],
+        "points": curve["points"],
+    }
 
 
 def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def strained_text(diagnosis: Diagnosis) -> str:
 
 def paragraph(diagnosis: Diagnosis) -> str:
     """Verdict, where, which, how far; labels in doubt come first, what the session could not show comes last."""
-    text = _verdict_text(diagnosis)
+    text = verdict_text(diagnosis)
     if diagnosis.mislabelled:
         doubts = [item.text for item in diagnosis.mislabelled]
         shown = "; ".join(doubts[:_NAMED_DOUBTS])
@@ -139,7 +139,8 @@ def paragraph(diagnosis: Diagnosis) -> str:
     return text
 
 
-def _verdict_text(diagnosis: Diagnosis) -> str:
+def verdict_text(diagnosis: Diagnosis) -> str:
+    """Where, which and how far, without what the session could not show."""
     gap = diagnosis.gap
     figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
     if diagnosis.mislabelled:

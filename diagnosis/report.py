@@ -1,6 +1,5 @@
 """The diagnosis as one self-contained HTML page."""
 
-import base64
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,19 +7,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files import whole_file
-from .answer import Diagnosis
+from ..generator.effects import EFFECTS
+from ..reports import Figure, SortedTable, write_page
+from .answer import Cause, Diagnosis
 from .assemble import map_changes
-from .explanation import location_text, paragraph, strained_text, strength_text, task_text, title_of
-from .figures import plot_by_axis, plot_gap_maps, plot_hypotheses, plot_places, plot_task, plot_transmission_curves
-from .inference import UNKNOWN
+from .explanation import (
+    axis_text,
+    compared_text,
+    location_text,
+    strained_text,
+    strength_text,
+    task_text,
+    title_of,
+    verdict_text,
+)
+from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, task_charts, transmission_curves
+from .known_laws import changed_effect
 
-_VERDICTS = {
-    "no_gap": "No gap",
-    "explained": "Explained",
-    "ambiguous": "These data cannot tell",
-    "unknown_effect": "An effect that is not in the catalogue",
-}
+_MAPS = 4  # series whose maps are drawn
+_SINCE = {"calibration": "since the calibration"}
 
 
 def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
@@ -35,72 +40,225 @@ def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
     ]
 
 
-def write_report(diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *, version: str) -> Path:
-    """Write the page; returns its path."""
-    import jinja2
-
+def write_report(
+    diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *, version: str, interactive: bool | None = None
+) -> Path:
+    """Write the page; returns its path. interactive: figures that answer to the pointer; None: where Bokeh is installed."""
     after = residuals_after(diagnosis)
-    figures = {
-        "hypotheses": plot_hypotheses(diagnosis),
-        "axes": plot_by_axis(diagnosis),
-        "places": plot_places(diagnosis),
-        "maps": plot_gap_maps(diagnosis, after),
-        "curves": plot_transmission_curves(diagnosis, after),
-    }
     task = answer.get("task")
-    if task is not None:
-        figures["task"] = plot_task(task)
-    template = jinja2.Template((Path(__file__).parent / "report.html").read_text(encoding="utf-8"), autoescape=True)
-    page = template.render(
+    maps = gap_maps(diagnosis, after, count=_MAPS)
+    first = 2 if diagnosis.added else 1  # of the series with most gap
+    groups: dict[str, list[Figure]] = {
+        "map": [*maps],
+        "curve": [*transmission_curves(diagnosis, after)],
+        "task": [] if task is None else [*task_charts(task)],
+    }
+    figures: dict[str, Figure] = {
+        "held_out": held_out_chart(diagnosis),
+        "places": places_chart(diagnosis),
+        "hypotheses": hypotheses_chart(diagnosis),
+    }
+    names = {group: [f"{group}_{number}" for number in range(len(items))] for group, items in groups.items()}
+    for group, items in groups.items():
+        figures |= dict(zip(names[group], items, strict=True))
+    return write_page(
+        path,
+        Path(__file__).parent / "report.html",
         version=version,
-        verdict="Labels look wrong" if diagnosis.mislabelled else _VERDICTS[diagnosis.verdict],
+        figures=figures,
+        interactive=interactive,
+        headline=headline(diagnosis),
+        paragraph=lead_text(diagnosis),
+        whole_text=verdict_text(diagnosis),
         doubts=[item.text for item in diagnosis.mislabelled],
-        paragraph=paragraph(diagnosis) + ("" if task is None else f" {task_text(task)}"),
+        key_figures=_key_figures(diagnosis),
+        proof=[*names["map"][:first], "held_out"],
+        maps=names["map"][first:],
+        curves=names["curve"],
+        steps=next_steps(diagnosis),
         task=None if task is None else _task_rows(task),
+        task_text="" if task is None else task_text(task),
         task_warnings=[] if task is None else task["warnings"],
         task_setting="" if task is None else task["setting"],
-        causes=[
-            {
-                "title": title_of(cause.effect),
-                "id": cause.effect,
-                "probability": f"{cause.probability:.3f}",
-                "strength": strength_text(cause),
-                "parameters": ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
-                "since": "since the calibration" if cause.since == "calibration" else "always there",
-            }
-            for cause in diagnosis.causes
-        ],
-        hypotheses=[
-            {
-                "name": "no gap"
-                if not item.effects
-                else "an unknown effect"
-                if item.effects == (UNKNOWN,)
-                else " + ".join(title_of(effect) for effect in item.effects),
-                "probability": f"{item.probability:.4f}",
-            }
-            for item in diagnosis.hypotheses
-            if item.probability > 1e-4
-        ][:12],
-        where=[{**place, "location": location_text(place["location"])} for place in answer["where"]],
+        task_figures=names["task"],
+        causes=_causes(diagnosis),
+        where=_where(answer),
         threshold=f"{diagnosis.threshold_z:.1f}",
-        missing=list(diagnosis.not_tested.items()),
+        missing=SortedTable(
+            header=("effect that these series could not show", "why"),
+            rows=tuple((title_of(effect), reason) for effect, reason in diagnosis.not_tested.items()),
+            words=frozenset({0, 1}),
+        ),
+        compared=compared_text(diagnosis),
         notes=diagnosis.notes,
         strained=strained_text(diagnosis),
         skipped=diagnosis.warnings[len(diagnosis.mislabelled) :],
         probes=len(diagnosis.compared.residual),
         nuisances=len(diagnosis.compared.factor_names),
-        series=len(diagnosis.compared.views),
-        next_measurement=diagnosis.next_measurement,
         inputs=answer["inputs"],
-        figures={name: "data:image/png;base64," + base64.b64encode(png).decode() for name, png in figures.items()},
     )
-    with whole_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    return path
 
 
-def _task_rows(task: Mapping[str, Any]) -> list[dict[str, str]]:
+def headline(diagnosis: Diagnosis) -> str:
+    """The answer in one line."""
+    if diagnosis.mislabelled:
+        return "Labels look wrong"
+    if diagnosis.verdict == "no_gap":
+        return "No gap: the session agrees with its twin"
+    changed = changed_effect(diagnosis.unknown_location)
+    if diagnosis.verdict == "unknown_effect":
+        if changed is not None:
+            return _sentence(f"{title_of(changed)} is of another strength than the twin's")
+        return "An effect that is not in the catalogue"
+    if diagnosis.verdict == "ambiguous":
+        names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
+        return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
+    named = _sentence(
+        " and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in _leading(diagnosis))
+    )
+    return f"{named}: a part of the gap" if diagnosis.verdict == "explained_in_part" else named
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def lead_text(diagnosis: Diagnosis) -> str:
+    """Where the gap is observed and what becomes of it, in two or three sentences."""
+    gap = diagnosis.gap
+    if diagnosis.mislabelled:
+        first = diagnosis.mislabelled[0].text
+        told = f"{_sentence(first)}. " if len(diagnosis.mislabelled) == 1 else ""
+        return f"{told}No effect is named until these labels are right or the series are left out."
+    if not diagnosis.added or not diagnosis.where:
+        return verdict_text(diagnosis)
+    place = diagnosis.where[0]
+    seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
+    ends = f"the gap on series that the fit did not use falls from {gap.before:.2f} to {gap.after:.2f} (1: noise alone)"
+    return f"{seen}. With what was found added to the twin, {ends}."
+
+
+def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """What to do with the answer, most useful first: a sentence each, with a command where there is one."""
+
+    def step(text: str, command: str = "") -> dict[str, str]:
+        return {"text": text, "command": command}
+
+    measure = diagnosis.next_measurement
+    measured = (
+        [step(f"Measure: {measure['text']}.", "raytwin diagnose SESSION -o again --also NEW_SESSION")]
+        if measure and measure.get("text")
+        else []
+    )
+    if diagnosis.mislabelled:
+        return [
+            step(
+                "Check the labels named above against the log of the measurement, correct them in the sidecar and import again."
+            ),
+            step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
+        ]
+    if diagnosis.verdict == "no_gap":
+        return [
+            step(
+                "Use the twin as it is.",
+                "raytwin generate TWIN REFERENCES --low SETTING --high SETTING -n 80 -o images.h5",
+            ),
+            *measured,
+        ]
+    if diagnosis.verdict == "unknown_effect" and changed_effect(diagnosis.unknown_location) is None:
+        return [
+            *measured,
+            step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),
+            step("Describe the effect in a file of your own, if you know its equation (documentation: effects)."),
+        ]
+    if diagnosis.verdict == "ambiguous":
+        return [*measured, *_confirmed_by(diagnosis, diagnosis.causes[:3])]
+    use = step(
+        "Use the improved twin that lies beside this page; every command takes it.",
+        "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
+    )
+    return [use, *measured, *_confirmed_by(diagnosis, _leading(diagnosis))]
+
+
+def _confirmed_by(diagnosis: Diagnosis, causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
+    """The measurement that shows each cause by itself."""
+    known = [cause.effect for cause in causes if cause.effect in EFFECTS]
+    return [
+        {"text": f"To confirm {title_of(effect).lower()}: {EFFECTS[effect].isolated_by}.", "command": ""}
+        for effect in known
+    ]
+
+
+def _leading(diagnosis: Diagnosis) -> list[Cause]:
+    return [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
+
+
+def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    gap = diagnosis.gap
+    found = [
+        {"value": f"{cause.probability:.2f}", "text": f"probability of {title_of(cause.effect).lower()}"}
+        for cause in _leading(diagnosis)
+    ]
+    if diagnosis.mislabelled:
+        found = []
+    elif diagnosis.verdict == "no_gap":
+        found = [{"value": f"{diagnosis.probability_no_gap:.2f}", "text": "probability that nothing is missing"}]
+    elif diagnosis.verdict == "unknown_effect":
+        found = [
+            {"value": f"{diagnosis.probability_unknown:.2f}", "text": "probability of an effect outside the catalogue"}
+        ]
+    if diagnosis.added:
+        found.append(
+            {
+                "value": f"{gap.before:.2f} → {gap.after:.2f}",
+                "text": "gap on series that the fit did not use (1: noise alone)",
+            }
+        )
+    else:
+        found.append({"value": f"{gap.before:.2f}", "text": "gap (1: noise alone)"})
+    if diagnosis.added and gap.shrinks_by is not None:
+        value, low, high = (100.0 * min(one, 1.0) for one in gap.shrinks_by)
+        found.append(
+            {"value": f"{value:.0f} %", "text": f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"}
+        )
+    return found
+
+
+def _causes(diagnosis: Diagnosis) -> SortedTable:
+    rows = [
+        (
+            title_of(cause.effect),
+            cause.effect,
+            f"{cause.probability:.3f}",
+            strength_text(cause),
+            ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
+            _SINCE.get(cause.since, "always there"),
+        )
+        for cause in diagnosis.causes
+    ]
+    return SortedTable(
+        header=("effect", "id", "probability", "strength (95 %)", "inner parameters", "when"),
+        rows=tuple(rows),
+        words=frozenset({0, 1, 4, 5}),
+    )
+
+
+def _where(answer: Mapping[str, Any]) -> SortedTable:
+    rows = [
+        (
+            axis_text(place["axis"]),
+            place["series"],
+            place["statistic"],
+            location_text(place["location"]),
+            f"{place['z']:+.1f}",
+        )
+        for place in answer["where"]
+    ]
+    header = ("axis", "series", "statistic", "location", "z")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 2, 3}))
+
+
+def _task_rows(task: Mapping[str, Any]) -> SortedTable:
     """One line for each kind of networks and of images that they were tried on."""
     names = {"before": "twin before", "after": "twin after", "measured": "measured images"}
 
@@ -112,12 +270,13 @@ def _task_rows(task: Mapping[str, Any]) -> list[dict[str, str]]:
         networks, _, images = name.partition("_on_")
         interval, alarms = curve["a90_95_interval"], curve["false_alarms"]
         rows.append(
-            {
-                "networks": names[networks],
-                "images": names[images],
-                "hits": f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
-                "a90": f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
-                "false_alarms": "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
-            }
+            (
+                names[networks],
+                names[images],
+                f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
+                f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
+                "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
+            )
         )
-    return rows
+    header = ("networks learnt from", "tried on", "hits", "a90 (95 %)", "false alarms")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1}))

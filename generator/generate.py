@@ -710,6 +710,7 @@ def generate_dataset(
         "reference_sha256": reference_sha256,
         "setting_low": str(low),
         "setting_high": str(high),
+        "pixel_mm": twin.instrument.pixel_mm,
         "seed": seed,
         "recipe": recipe,
         "product_material": product_material,

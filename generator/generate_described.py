@@ -247,6 +247,7 @@ def generate_from_description(
         "description": description.text,
         "setting_low": str(low),
         "setting_high": str(high),
+        "pixel_mm": twin.instrument.pixel_mm,
         "seed": seed,
         "recipe": "raytwin",
         "bad_pixels": bad_pixels,

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .changes import factors_of_changes as factors_of_changes
     from .detectors import DETECTORS as DETECTORS
     from .efficiency import Efficiency as Efficiency
     from .efficiency import MeasuredSize as MeasuredSize
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from .observe import Observed as Observed
     from .observe import Observer as Observer
     from .observe import observe_settings as observe_settings
+    from .reference_objects import objects_and_texture as objects_and_texture
     from .search import independent_places as independent_places
     from .search import search_threshold as search_threshold
     from .texture import ProductTexture as ProductTexture
@@ -39,10 +41,12 @@ _HOME = {
     "Observer": "observe",
     "ProductTexture": "texture",
     "Shape": "objects",
+    "factors_of_changes": "changes",
     "fit_efficiency": "efficiency",
     "frequency_bins": "frequencies",
     "independent_places": "search",
     "object_spectrum": "frequencies",
+    "objects_and_texture": "reference_objects",
     "objects_of_references": "objects",
     "objects_of_shape": "objects",
     "observe_settings": "observe",

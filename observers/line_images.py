@@ -90,7 +90,7 @@ class LineImages:
         if line.effects:
             self.warnings += ("left out of the observer: effects " + ", ".join(one.id for one in line.effects),)
         self._model: SpectralModel = spectral_model_of(self.twin)
-        self._thickness: dict[str, FloatArray] = {}
+        self._last_weights: dict[tuple[float, tuple[Filter, ...]], tuple[SpectralModel, FloatArray]] = {}
 
     @property
     def pixel_mm(self) -> float:
@@ -106,10 +106,15 @@ class LineImages:
         return mu_per_mm(material_from_name(material), model.energies_keV)
 
     def _weights(self, setting: Setting) -> tuple[SpectralModel, FloatArray]:
-        posterior = self.twin.spectral
-        model = spectral_model_of(self.twin, highest_kV=setting.kV)
-        best = model.default_parameters() if posterior is None else posterior.best
-        return model, model.moment_weights(best, OpenBeam(kV=setting.kV, filters=setting.filters))[:2]
+        key = (setting.kV, setting.filters)
+        if key not in self._last_weights:
+            posterior = self.twin.spectral
+            model = spectral_model_of(self.twin, highest_kV=setting.kV)
+            best = model.default_parameters() if posterior is None else posterior.best
+            weights = model.moment_weights(best, OpenBeam(kV=setting.kV, filters=setting.filters))[:2]
+            # the same beam is asked for behind several stacks, one after the other
+            self._last_weights = {key: (model, weights)}
+        return self._last_weights[key]
 
     def _behind(self, setting: Setting, layers: Sequence[tuple[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
         """M and gain over that of the open beam (place,) behind materials of these thicknesses (place,), mm."""

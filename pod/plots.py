@@ -252,15 +252,27 @@ def _draw_hits(axes: Any, table: Trials, *, log_size: bool) -> None:
     up, down = table.hits > 0, table.misses > 0
     axes.plot(table.size[up], np.full(up.sum(), 1.035), "|", color=_GREY, ms=6, alpha=0.5)
     axes.plot(table.size[down], np.full(down.sum(), -0.035), "|", color=_GREY, ms=6, alpha=0.5)
+    groups = grouped_hits(table, log_size=log_size)
+    share = groups["hits"] / groups["n"]
+    axes.plot(groups["size"], share, "o", color="black", ms=4, label="share of hits, grouped")
+
+
+def grouped_hits(table: Trials, *, log_size: bool) -> dict[str, Array]:
+    """Trials in at most ten groups of like size and number: mean size (on log size its geometric mean), hits and n of each."""
     order = np.argsort(table.size, kind="stable")
     total = (table.hits + table.misses)[order]
     groups = int(min(10, max(len(np.unique(table.size)) // 4, 1)))
     where = np.minimum((np.cumsum(total) - 0.5 * total) / total.sum() * groups, groups - 1).astype(int)
     weight = np.bincount(where, weights=total, minlength=groups)
     x = np.log(table.size) if log_size else table.size
-    middle = np.bincount(where, weights=x[order] * total, minlength=groups) / weight
-    share = np.bincount(where, weights=table.hits[order], minlength=groups) / weight
-    axes.plot(np.exp(middle) if log_size else middle, share, "o", color="black", ms=4, label="share of hits, grouped")
+    filled = weight > 0
+    hits = np.bincount(where, weights=table.hits[order], minlength=groups)[filled]
+    middle = np.bincount(where, weights=x[order] * total, minlength=groups)[filled] / weight[filled]
+    return {
+        "size": np.exp(middle) if log_size else middle,
+        "hits": hits.astype(float),
+        "n": weight[filled].astype(float),
+    }
 
 
 def _untransformed(values: Array, box_cox: float) -> Array:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         Detection,
         Rate,
         detect_in_image,
+        detect_on_row,
         rate_of_crossed_trials,
         recall_in_mask,
         summarise_detections,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from .runs import detect_with_networks, split_for_training, train_networks
     from .runs_io import NetworkResult, Runs, finished_networks, open_runs, read_result, read_weights
     from .scaling import SCALINGS, crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
+    from .segmenters import Segmenter, detect_with_segmenters, segmenter_from_module, segmenter_from_onnx
     from .training import EpochResult, TrainingState, count_epochs, iterate_training, learning_rate_at
     from .weights_io import STARTER_PATH, read_safetensors, starter_recipe, write_safetensors
 
@@ -36,6 +38,7 @@ _LAZY = {
         "Detection",
         "Rate",
         "detect_in_image",
+        "detect_on_row",
         "rate_of_crossed_trials",
         "recall_in_mask",
         "summarise_detections",
@@ -48,6 +51,7 @@ _LAZY = {
     "runs": ("detect_with_networks", "split_for_training", "train_networks"),
     "runs_io": ("NetworkResult", "Runs", "finished_networks", "open_runs", "read_result", "read_weights"),
     "scaling": ("SCALINGS", "crop_to_shape", "pad_to_multiple", "scale_min_max", "scale_residual"),
+    "segmenters": ("Segmenter", "detect_with_segmenters", "segmenter_from_module", "segmenter_from_onnx"),
     "training": ("EpochResult", "TrainingState", "count_epochs", "iterate_training", "learning_rate_at"),
     "weights_io": ("STARTER_PATH", "read_safetensors", "starter_recipe", "write_safetensors"),
 }
@@ -67,6 +71,7 @@ __all__ = [
     "Rate",
     "Recipe",
     "Runs",
+    "Segmenter",
     "TrainingState",
     "build_network",
     "choose_device",
@@ -74,7 +79,9 @@ __all__ = [
     "crop_to_shape",
     "cross_entropy_and_dice",
     "detect_in_image",
+    "detect_on_row",
     "detect_with_networks",
+    "detect_with_segmenters",
     "dice_as_published",
     "examples_from_arrays",
     "examples_from_dataset",
@@ -92,6 +99,8 @@ __all__ = [
     "recipe_for_fine_tuning",
     "scale_min_max",
     "scale_residual",
+    "segmenter_from_module",
+    "segmenter_from_onnx",
     "split_for_training",
     "starter_recipe",
     "summarise_detections",

@@ -5,13 +5,16 @@ import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files import whole_file
+
+if TYPE_CHECKING:
+    from ..acquisition.dataset_io import DatasetRow
 
 MARK_THRESHOLD = 0.5
 DETECTION_RECALL = 0.1
@@ -90,6 +93,42 @@ def detect_in_image(
         return alarm, alarm, None, float(values.max())
     recall = recall_in_mask(marked, mask)
     return recall > DETECTION_RECALL, None, recall, float(values[mask].max())
+
+
+def detect_on_row(
+    row: "DatasetRow",
+    probabilities: NDArray[Any],
+    foreign_object_mask: NDArray[Any],
+    *,
+    network: int,
+    threshold: float = MARK_THRESHOLD,
+) -> Detection:
+    """`detect_in_image` as a line of the hit/miss table, with what a dataset says of the image.
+
+    Args:
+        row: of the dataset.
+        probabilities, foreign_object_mask: (row, column), as there.
+        network: its number.
+        threshold: 0..1.
+    """
+    hit, false_alarm, recall, response = detect_in_image(probabilities, foreign_object_mask, threshold=threshold)
+    return Detection(
+        contrast=_known(row.contrast) if recall is not None else None,
+        size_mm=_known(row.size_mm) if recall is not None else None,
+        hit=hit,
+        network=network,
+        image=row.image,
+        foreign_object=row.foreign_object,
+        setting=row.setting,
+        false_alarm=false_alarm,
+        recall=recall,
+        response=response,
+        product=row.product,
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def rate_of_crossed_trials(

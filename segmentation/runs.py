@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..errors import FileFormatError, InputError
 from ..files import sha256_of_file
 from ._torch import load_torch
-from .detection import MARK_THRESHOLD, Detection, detect_in_image
+from .detection import MARK_THRESHOLD, Detection, detect_on_row
 from .examples import examples_from_dataset
 from .network import build_network, probabilities_from_scaled
 from .recipe import Recipe
@@ -209,8 +209,6 @@ def detect_with_networks(
     """
     if not 0 <= threshold < 1:
         raise InputError("threshold", received=threshold, expected="a probability, 0 or more and below 1")
-    if not len(numbers):
-        raise InputError(dataset.path, received="no images to try the networks on", expected="at least one")
     finished = finished_networks(runs)
     chosen = finished if networks is None else list(networks)
     if not chosen or not set(chosen) <= set(finished):
@@ -220,9 +218,7 @@ def detect_with_networks(
             expected="at least one" if networks is None else f"networks {chosen}",
             remedy="run the same `raytwin train` again: it goes on where it stopped",
         )
-    usable, skipped = _with_pixels(dataset, numbers)
-    if skipped and warn is not None:
-        warn(f"{len(skipped)} images are left out: their foreign object has no pixel in its mask ({skipped[0]} ...)")
+    usable = images_with_pixels(dataset, numbers, warn=warn)
     recipe = runs.recipe
     examples = examples_from_dataset(dataset, usable, recipe=recipe)
     for number in chosen:
@@ -243,22 +239,25 @@ def detect_with_networks(
             )
             for place, (_, masks), found in zip(places, pairs, probabilities, strict=True):
                 row = dataset.rows[usable[place]]
-                hit, false_alarm, recall, response = detect_in_image(found, masks[-1], threshold=threshold)
-                yield Detection(
-                    contrast=_known(row.contrast) if recall is not None else None,
-                    size_mm=_known(row.size_mm) if recall is not None else None,
-                    hit=hit,
-                    network=number,
-                    image=row.image,
-                    foreign_object=row.foreign_object,
-                    setting=row.setting,
-                    false_alarm=false_alarm,
-                    recall=recall,
-                    response=response,
-                    product=row.product,
-                )
+                yield detect_on_row(row, found, masks[-1], network=number, threshold=threshold)
             if progress is not None:
                 progress(len(pairs))
+
+
+def images_with_pixels(
+    dataset: "Dataset", numbers: Sequence[int] | NDArray[np.intp], *, warn: Callable[[str], None] | None
+) -> list[int]:
+    """Numbers of the images that can be tried: an object that is there has a pixel in its mask.
+
+    Raises:
+        InputError: none.
+    """
+    if not len(numbers):
+        raise InputError(dataset.path, received="no images to try the networks on", expected="at least one")
+    usable, skipped = _with_pixels(dataset, numbers)
+    if skipped and warn is not None:
+        warn(f"{len(skipped)} images are left out: their foreign object has no pixel in its mask ({skipped[0]} ...)")
+    return usable
 
 
 def _with_pixels(dataset: "Dataset", numbers: Sequence[int] | NDArray[np.intp]) -> tuple[list[int], list[str]]:
@@ -302,7 +301,3 @@ def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
             remedy="start from a network of the same recipe",
         )
     return weights
-
-
-def _known(value: float) -> float | None:
-    return None if np.isnan(value) else value

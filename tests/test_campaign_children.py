@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from raytwin.campaign._children import ChildError, Children, KilledError, StoppedError
-from raytwin.campaign._once import only_one
 from raytwin.errors import InputError
+from raytwin.files import only_one
 
 # minutes of work
 LABEL = {
@@ -108,7 +108,6 @@ def test_nothing_is_started_after_a_stop():
 
 
 def test_a_folder_is_one_runs_until_it_ends(tmp_path):
-    pytest.importorskip("fcntl")
     with (
         only_one(tmp_path, "a sweep"),
         pytest.raises(InputError, match="where a sweep is running; expected a folder that no"),

@@ -24,6 +24,7 @@ from raytwin.campaign.sweep_runners import DaskCluster, Here, Processes
 from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, motion_strength_px, start_pair, twin_at
 from raytwin.campaign.sweep_trial import seed_of
 from raytwin.errors import InputError, MissingDependencyError, RaytwinError
+from raytwin.files import only_one
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.generate import generate_dataset
 from raytwin.generator.predict import predict_flatfield
@@ -337,11 +338,8 @@ def test_a_folder_of_something_else_and_a_second_run_are_refused(line, whole, tm
     (tmp_path / "letter.txt").touch()
     with pytest.raises(InputError, match="other files"):
         sweep(campaign, tmp_path, Here())
-    fcntl = pytest.importorskip("fcntl")
-    with open(whole[0] / ".lock", "w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="is running"):
-            sweep(campaign, whole[0], Here())
+    with only_one(whole[0], "another"), pytest.raises(InputError, match="is running"):
+        sweep(campaign, whole[0], Here())
 
 
 def test_the_report_shows_every_setting(line, whole):

@@ -13,7 +13,7 @@ from raytwin.campaign import task as task_module
 from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
 from raytwin.cli import main
 from raytwin.diagnosis.explanation import task_text
-from raytwin.diagnosis.figures import plot_task
+from raytwin.diagnosis.figures import task_charts
 from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.known_scenes import KnownScenes
@@ -204,7 +204,9 @@ def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_s
     # an answer is JSON, and it can be said and drawn
     assert json.loads(json.dumps(found)) == found
     assert "measured" in task_text(found)
-    assert plot_task(found).startswith(b"\x89PNG")
+    drawn = task_charts(found)
+    assert [chart.name for chart in drawn] == ["pod_expected", "pod_tried"]
+    assert all("twin before" in chart.numbers_csv() for chart in drawn)
     paths = [tmp_path / "task" / f"{name}_test.h5" for name in ("before", "after")]
     with read_dataset(paths[0]) as one, read_dataset(paths[1]) as two:
         lower = [(one.images(k) - two.images(k))[:, one.product_masks(k)].mean() for k in range(len(one))]

@@ -56,7 +56,7 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     assert "excess_noise" in [effect.id for effect in read_twin(sessions / "noisy" / "twin.h5").effects]
     page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")
     assert "excess_noise" in page
-    assert page.count("data:image/png;base64,") == 5
+    assert page.count("data:image/png;base64,") >= 5 and "gap_before_" in page
     # against the improved twin nothing is left, and nothing is added a second time
     words = ["diagnose", str(sessions / "noisy.h5"), "-o", str(sessions / "again"), "--json"]
     assert main([*words, "--twin", str(sessions / "noisy" / "twin.h5")]) == 0

@@ -16,6 +16,7 @@ from raytwin.campaign.sweep_add import add_setting
 from raytwin.campaign.sweep_file import read_campaign
 from raytwin.errors import FileFormatError, InputError
 from raytwin.explore.known_pod import read_known_pod
+from raytwin.explore.page import numbers_text, object_diameter_mm
 from raytwin.explore.picture import draw_pair
 from raytwin.explore.server import tunnel_command
 from raytwin.explore.state import ExplorerState, first_state, ranges_of
@@ -113,6 +114,28 @@ def test_images_have_the_contrast_and_the_noise_that_were_predicted(explorer: Ex
             independent = values.size / 3
             assert abs(values.mean() - mean - 0.5 * sd**2) < 4 * sd / np.sqrt(independent)
             assert abs(values.std() / sd - 1) < 4 / np.sqrt(2 * independent)
+
+
+def test_the_size_seen_is_that_of_an_observer_of_discs(
+    explorer: Explorer, state: ExplorerState, view: ExplorerView
+) -> None:
+    seen = view.seen_size
+    assert seen is not None and seen.a90_mm is not None and seen.networks is None
+    theirs = rt.observe(
+        "virtual_lab",
+        (LOW, HIGH),
+        product=str(state.product),
+        foreign_object=state.foreign_object.material,
+        shape="plate",
+        height_mm=state.foreign_object.thickness_mm,
+    )
+    assert seen.a90_mm == pytest.approx(theirs.rows[0]["a90"]["value"], rel=0.03)
+    across = object_diameter_mm(state, explorer.instrument.pixel_mm / explorer.instrument.magnification)
+    assert seen.pod == pytest.approx(np.interp(across, theirs.sizes, theirs.pod[0]), abs=0.05)
+    longer = explorer.view(replace(state, exposure_ms=2 * state.exposure_ms)).seen_size
+    assert longer.a90_mm < seen.a90_mm and longer.pod > seen.pod
+    text = numbers_text(view, explorer)
+    assert f"{seen.a90_mm:.3g} mm across; POD of the disc shown {100 * seen.pod:.3g} %" in text
 
 
 def test_a_seed_gives_its_noise_and_another_one_another(explorer: Explorer, state: ExplorerState) -> None:

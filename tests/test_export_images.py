@@ -245,6 +245,33 @@ def test_dicom_of_an_acquisition_comes_back_with_its_settings(session, tmp_path)
             assert getattr(back.instrument, word) == getattr(first.instrument, word)
 
 
+def test_a_zarr_store_holds_every_array_and_attribute_of_the_file(session, dataset, tmp_path):
+    zarr = pytest.importorskip("zarr", reason="Zarr stores need the extra `zarr`")
+    for name, source in (("session", session), ("dataset", dataset)):
+        written = rt.export(source, tmp_path / name, to="zarr")
+        assert list(written.files) == ["data.zarr"]
+        store = zarr.open_group(tmp_path / name / "data.zarr", mode="r")
+        arrays_there = []
+        with h5py.File(source) as file:
+            assert store.attrs["format"] == file.attrs["format"]
+
+            def same(path, item, store=store, found=arrays_there):
+                if not isinstance(item, h5py.Dataset):
+                    return
+                found.append(path)
+                if h5py.check_string_dtype(item.dtype):
+                    parent, _, name = path.rpartition("/")
+                    assert (store[parent] if parent else store).attrs[name] == item.asstr()[()].tolist()
+                    return
+                np.testing.assert_array_equal(store[path][...], item[()])
+                if item.ndim > 1:
+                    assert store[path].metadata.dimension_names[-2:] == ("row", "column")
+                    assert store[path].chunks[-2:] == item.shape[-2:]
+
+            file.visititems(same)
+        assert len(arrays_there) > 3
+
+
 def test_real_numbers_keep_sixteen_bits_in_dicom(tmp_path):
     pytest.importorskip("pydicom", reason="DICOM files need the extra `dicom`")
     from raytwin.acquisition._image_files import read_image
@@ -261,8 +288,8 @@ def test_real_numbers_keep_sixteen_bits_in_dicom(tmp_path):
 @pytest.mark.parametrize(
     ("source", "words", "told"),
     [
-        ("dataset", ["--to", "csv"], "one of coco, yolo, tiff for a dataset"),
-        ("session", ["--to", "coco"], "one of tiff, nxtomo, dicom for an acquisition"),
+        ("dataset", ["--to", "csv"], "one of coco, yolo, tiff, zarr for a dataset"),
+        ("session", ["--to", "coco"], "one of tiff, nxtomo, dicom, zarr for an acquisition"),
         ("dataset", ["--to", "tiff", "--pixel-mm", "0"], "a finite pitch above 0 mm"),
         ("dataset", ["--to", "coco", "--setting", "kv=40,power_w=1,exposure_ms=1"], "only a twin is exported"),
     ],

@@ -21,6 +21,7 @@ BASE = {"errors", "files", "results"}
 BELOW = {
     "acquisition": set(),
     "pod": set(),
+    "reports": set(),
     "materials": {"acquisition"},  # for the words of a setting: Filter
     "segmentation": {"acquisition"},
     "lab": {"acquisition"},  # shares no physics with the twin, or agreement would prove nothing
@@ -28,7 +29,7 @@ BELOW = {
     "generator": {"acquisition", "materials", "spectra"},
     "observers": {"acquisition", "materials", "spectra", "generator", "pod"},
     "calibration": {"acquisition", "materials", "spectra", "generator"},
-    "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod"},
+    "diagnosis": {"acquisition", "materials", "spectra", "generator", "calibration", "segmentation", "pod", "reports"},
 }
 SHIPPED = {
     "raytwin.data.calibration": "data/calibration",

@@ -116,6 +116,7 @@ def of_fields(kind: Any, choices: dict[str, Schema]) -> dict[str, Schema]:
 def campaign() -> Schema:
     """A sweep over settings."""
     from raytwin.campaign import sweep_file
+    from raytwin.observers import DETECTORS, IMAGES
     from raytwin.pod.links import LINKS
     from raytwin.segmentation.recipe import RECIPES
 
@@ -128,6 +129,9 @@ def campaign() -> Schema:
     training = of_fields(sweep_file.Training, {"recipe": choice(RECIPES), "start_shares": shares})
     training.pop("start")
     training |= {"start_low": TEXT, "start_high": TEXT}
+    requirement = of_fields(sweep_file.Requirement, {})
+    requirement.pop("size")
+    requirement |= dict.fromkeys((*sweep_file.SIZES, "products_per_minute"), NUMBER)
     slabs = of_fields(sweep_file.Slabs, {"product": TEXT})
     slabs.pop("foreign_object")
     words = {
@@ -141,6 +145,13 @@ def campaign() -> Schema:
         "grid": table(grid),
         "line": table(of_fields(sweep_file.Timing, {"pair": choice(sweep_file.PAIRS)})),
         "limits": table(of_fields(sweep_file.Limits, {})),
+        "requirement": table(requirement),
+        "screening": table(
+            of_fields(
+                sweep_file.Screening,
+                {"observer": TEXT, "most": WHOLE, "detector": choice(DETECTORS), "image": choice(IMAGES)},
+            )
+        ),
         "training": table(training),
         "detection": table(of_fields(sweep_file.Trying, {})),
         "pod": table(

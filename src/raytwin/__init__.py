@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .api.images import train as train
     from .api.observers import calibrate_observer as calibrate_observer
     from .api.observers import observe as observe
+    from .api.reports import report as report
     from .api.sessions import check as check
     from .api.sessions import diagnose as diagnose
     from .api.sessions import lab_session as lab_session
@@ -65,6 +66,7 @@ _HOME = {
     "predict": "api.twins",
     "read_dataset": "api.images",
     "read_twin": "api.twins",
+    "report": "api.reports",
     "spectrum": "api.beams",
     "sweep": "api.campaigns",
     "train": "api.images",
@@ -99,6 +101,7 @@ __all__ = [
     "predict",
     "read_dataset",
     "read_twin",
+    "report",
     "spectrum",
     "sweep",
     "train",

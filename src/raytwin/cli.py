@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 
 from . import __version__
+from ._log import kept_in, taken_out
 from .errors import InputError, RaytwinError
 
 # name -> (module in raytwin.commands, one line for `raytwin --help`)
@@ -35,6 +36,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "import": ("import_", "other file layouts -> an acquisition or dataset file"),
     "explore": ("explore", "a page of settings in the browser: what changes with kV, filter, exposure, product"),
     "export": ("export", "a twin for other simulators, images for other trainers and viewers"),
+    "report": ("report", "a twin, a dataset or a table of hits as one page"),
+    "completion": ("completion", "completion of commands and options in bash, zsh or tcsh"),
     "info": ("info", "what is installed; or a twin in a table"),
 }
 
@@ -73,6 +76,7 @@ READING = frozenset(
         "detect",
         "explore",
         "export",
+        "report",
     }
 )
 
@@ -84,16 +88,22 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message} (see `{self.prog} --help`)\n")
 
 
-def _parser(selected: str | None) -> argparse.ArgumentParser:
+def whole_parser() -> argparse.ArgumentParser:
+    """The parser with the options of every command."""
+    return _parser(*COMMANDS)
+
+
+def _parser(*selected: str) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="raytwin",
         description="A calibrated digital twin of an X-ray inspection line.",
         epilog="`raytwin COMMAND --help` shows a command's options and an example.",
     )
+    parser.add_argument("--log", metavar="FILE", help="keep what the command says in a file, too (before COMMAND)")
     parser.add_argument("--version", action="version", version=f"raytwin {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, (module_name, line) in COMMANDS.items():
-        if name == selected:
+        if name in selected:
             module = importlib.import_module(f".commands.{module_name}", __package__)
             command = commands.add_parser(
                 name,
@@ -126,10 +136,27 @@ def _as_options(argument: str, options: Mapping[str, str]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 success, 1 internal failure, 2 bad input."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words:
-        sys.stdout.write(_WAY)
-        return 0
+    try:
+        file, words = taken_out(sys.argv[1:] if arguments is None else arguments)
+        if not words:
+            sys.stdout.write(_WAY)
+            return 0
+        if arguments is None and words[0] in READING:
+            from ._guard import code_of_child
+
+            code_there = code_of_child(words)
+            if code_there is not None:
+                return code_there
+        with kept_in(file, words, version=__version__) as write_line:
+            code = _main(words)
+            write_line(f"exit code {code}")
+            return code
+    except InputError as error:
+        sys.stderr.write(f"raytwin: error: {error}\n")
+        return 2
+
+
+def _main(words: list[str]) -> int:
     selected = next((word for word in words if not word.startswith("-")), None)
     if selected is not None and selected not in COMMANDS:
         near = get_close_matches(selected, COMMANDS, n=1, cutoff=0.5)
@@ -137,15 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         known = ", ".join(COMMANDS)
         sys.stderr.write(f"raytwin: error: got {selected!r}; expected a command: {known}{hint}\n")
         return 2
-    if arguments is None and selected in READING:
-        from ._guard import code_of_child
-
-        code_there = code_of_child(words)
-        if code_there is not None:
-            return code_there
     options: dict[str, str] = {}
     try:
-        parsed = _parser(selected if selected in COMMANDS else None).parse_args(words)
+        parsed = _parser(*([selected] if selected is not None else [])).parse_args(words)
         options = parsed.option_of_argument
         code: int = parsed.run(parsed)
         sys.stdout.flush()

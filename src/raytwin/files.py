@@ -97,3 +97,30 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+@contextmanager
+def only_one(folder: str | os.PathLike[str], what: str) -> Iterator[None]:
+    """No second run in the same folder at the same time, on any system; the file `.lock` in it is the lock.
+
+    Args:
+        folder: must exist.
+        what: is running there, for the message: `a sweep`.
+
+    Raises:
+        InputError: another run works in the folder.
+    """
+    from filelock import FileLock, Timeout
+
+    # a second thread of this process is another run, too
+    lock = FileLock(Path(folder) / ".lock", timeout=0, is_singleton=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            "-o", received=f"{folder}, where {what} is running", expected="a folder that no other run works in"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()

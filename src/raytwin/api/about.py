@@ -30,6 +30,7 @@ _EXTRAS = {
     "dicom": ("pydicom",),
     "fabio": ("fabio",),
     "meshes": ("trimesh",),
+    "zarr": ("zarr",),
 }
 _LIBRARIES = (
     "numpy",
@@ -183,7 +184,7 @@ def export(
             open or its file.
         output: folder to write; of a dataset or an acquisition, a new or empty one.
         to: of a twin `csv`, `gvxr` (gVirtualXray's JSON), `xcist` (gecatsim's spectrum and configuration files) or `leap`; of a
-            dataset `coco`, `yolo` or `tiff`; of an acquisition `tiff`, `nxtomo` or `dicom`.
+            dataset `coco`, `yolo`, `tiff` or `zarr`; of an acquisition `tiff`, `nxtomo`, `dicom` or `zarr`.
         settings: of a twin, that the spectra are written for; None: the measured kV and filters, at 1 mAs.
         labels: of YOLO: `polygons` or `boxes`.
         bits: of a grey value for trainers, 8 or 16; None: 8 for YOLO, 16 for COCO.
@@ -218,6 +219,14 @@ def export(
         is_acquisition = isinstance(opened, acquisition_io.AcquisitionFile)
         if (is_dataset or is_acquisition) and settings is not None:
             raise InputError("settings", received=str(settings), expected="none: only a twin is exported for settings")
+        if (is_dataset or is_acquisition) and to == "zarr":
+            from ..acquisition.export_zarr import export_zarr
+
+            telling = stack.enter_context(Telling(progress, unit="image"))
+            files, warnings = export_zarr(
+                opened.path, folder, progress=lambda done, total: telling.begin("images", total, done=done)
+            )
+            return Exported(to=to, folder=folder, files=files, warnings=warnings)
         if is_dataset:
             from ..acquisition.export_dataset import export_dataset
 

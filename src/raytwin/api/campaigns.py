@@ -27,7 +27,10 @@ _LABELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class SweepPlan(Result):
-    """What is known of every setting of a campaign before training: rows with feasibility, dose, throughput, contrast to noise."""
+    """What is known of every setting of a campaign before training: rows with feasibility, dose, throughput, contrast to noise.
+
+    Where the campaign names a calibrated observer, also the a90 that it expects of networks.
+    """
 
     rows: tuple[Mapping[str, Any], ...]
 
@@ -52,19 +55,90 @@ class SweepPlan(Result):
         return _scatter(self.rows, ax=ax, what="cnr_object", against=against)
 
     def _table(self) -> Table:
+        seen = any(row["predicted"] is not None for row in self.rows)
         rows = tuple(
             (
                 str(row["label"]),
                 "yes" if row["feasible"] else "no",
                 number_text(row["throughput_per_s"]),
                 number_text(row["cnr_object"]),
+                *([_expected_text(row["predicted"])] if seen else []),
                 str(row["reason"]),
             )
             for row in self.rows
         )
+        expected = ["expected a90"] if seen else []
         answer = self.to_dict()
         title = f"{answer['settings']} settings, {answer['feasible']} feasible, {answer['to_train']} to train"
-        return Table(title=title, header=("setting", "feasible", "products/s", "CNR", "reason"), rows=rows)
+        return Table(title=title, header=("setting", "feasible", "products/s", "CNR", *expected, "reason"), rows=rows)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Decision(Result):
+    """Which settings do what is asked of the line, with what margin, and what would make the answer surer.
+
+    Fields: requirement (what was asked); sentence (the answer in words); recommended (LOW;HIGH of the setting that is taken, or comes
+    closest); verdict (on it: `meets`, `open`, `fails`); settings (a mapping a setting: verdict; criteria with value, bound and
+    margin; limited_by; changes); changes_by (who says what changes would do to a90); front (settings that no other beats in a90,
+    dose and throughput, a90 of networks or expected); measurements (what to measure on the real line, most useful first).
+    """
+
+    requirement: Mapping[str, Any]
+    sentence: str
+    recommended: str | None
+    verdict: str | None
+    settings: tuple[Mapping[str, Any], ...]
+    changes_by: str
+    front: tuple[Mapping[str, Any], ...]
+    measurements: tuple[Mapping[str, Any], ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What stands under `decision` in what `raytwin sweep --json` prints."""
+        found: dict[str, Any] = plain({name: getattr(self, name) for name in _DECISION_FIELDS})
+        return found | {"meets": [one["setting"] for one in found["settings"] if one["verdict"] == "meets"]}
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row a setting: verdict, limited_by, and value, bound, margin and verdict of each criterion."""
+        rows = []
+        for one in self.settings:
+            row = {"setting": one["setting"], "label": one["label"], "verdict": one["verdict"]}
+            row["limited_by"] = ", ".join(one["limited_by"])
+            for part in one["criteria"]:
+                row |= {f"{part['name']}_{field}": part[field] for field in ("value", "bound", "margin", "verdict")}
+            row |= {f"a90_factor_{change['kind']}": change["factor"] for change in one["changes"]}
+            rows.append(row)
+        return frame(rows)
+
+    def _table(self) -> Table:
+        from ..campaign.decision import Change, change_text
+
+        names = [part["name"] for part in self.settings[0]["criteria"]] if self.settings else []
+        rows = []
+        for one in self.settings:
+            margins = ["" if part["margin"] is None else f"{100 * part['margin']:+.0f} %" for part in one["criteria"]]
+            helps = change_text(Change(**one["changes"][0])) if one["changes"] and one["limited_by"] else ""
+            rows.append((str(one["label"]), str(one["verdict"]), *margins, helps))
+        taken = next((str(one["label"]) for one in self.settings if one["setting"] == self.recommended), None)
+        meets = sum(one["verdict"] == "meets" for one in self.settings)
+        title = f"{meets} of {len(self.settings)} settings meet the requirement"
+        return Table(
+            title=title if taken is None else f"{title}; {taken}: {self.verdict}",
+            header=("setting", "verdict", *(f"margin of {name.replace('_', ' ')}" for name in names), "would help"),
+            rows=tuple(rows),
+            notes=tuple(f"measure: {one['text']}" for one in self.measurements),
+        )
+
+
+_DECISION_FIELDS = (
+    "requirement",
+    "sentence",
+    "recommended",
+    "verdict",
+    "settings",
+    "changes_by",
+    "front",
+    "measurements",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -78,6 +152,16 @@ class Sweep(Result):
     def rows(self) -> tuple[Mapping[str, Any], ...]:
         """A row a setting, in the campaign's order."""
         return tuple(self.answer["rows"])
+
+    @property
+    def decision(self) -> Decision | None:
+        """The answer to the campaign's requirement; None where it states none."""
+        held = self.answer["decision"]
+        if held is None:
+            return None
+        words = {name: held[name] for name in _DECISION_FIELDS}
+        lists = {name: tuple(words[name]) for name in ("settings", "front", "measurements")}
+        return Decision(**{**words, **lists})
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin sweep --json` prints."""
@@ -93,18 +177,26 @@ class Sweep(Result):
         return _scatter(self.rows, ax=ax, what="a90", against=against)
 
     def _table(self) -> Table:
+        seen = any(row["predicted"] is not None for row in self.rows)
         rows = tuple(
             (
                 str(row["label"]),
                 number_text(row["a90"]),
                 f"{number_text(row['a90_low'])} to {number_text(row['a90_high'])}" if row["a90"] is not None else "",
+                *([_expected_text(row["predicted"])] if seen else []),
                 number_text(row["throughput_per_s"]),
                 str(row["reason"]) or ", ".join(word for word in ("recommended", "pareto", "alike") if row[word]),
             )
             for row in self.rows
         )
-        header = ("setting", "a90", "95 % interval", "products/s", "")
+        header = ("setting", "a90", "95 % interval", *(["expected"] if seen else []), "products/s", "")
         return Table(title=str(self.answer["sentence"]), header=header, rows=rows)
+
+
+def _expected_text(predicted: Mapping[str, float] | None) -> str:
+    if predicted is None:
+        return ""
+    return f"{number_text(predicted['value'])} ({number_text(predicted['low'])} to {number_text(predicted['high'])})"
 
 
 def _scatter(rows: tuple[Mapping[str, Any], ...], *, ax: Any, what: str, against: str) -> Any:
@@ -199,13 +291,9 @@ def sweep(
 
 
 def _plan(campaign: "Campaign", telling: Telling) -> SweepPlan:
-    from ..campaign.sweep import outlook_row
-    from ..campaign.sweep_settings import labels_of
+    from ..campaign.sweep import outlook_rows
 
-    outlooks = _looked_at(campaign, telling)
-    labels = labels_of([one.pair for one in outlooks])
-    rows = [outlook_row(one, label) | {"kept": one.kept} for one, label in zip(outlooks, labels, strict=True)]
-    return SweepPlan(rows=tuple(plain(rows)))
+    return SweepPlan(rows=tuple(plain(outlook_rows(campaign, _looked_at(campaign, telling)))))
 
 
 def _looked_at(campaign: "Campaign", telling: Telling) -> "tuple[Outlook, ...]":

@@ -1,6 +1,7 @@
 """Dual-energy images and the networks that look at them: generated, trained on, tried."""
 
 import dataclasses
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ..generator.describe import Description
     from ..generator.generate import GenerationSummary
     from ..generator.twin import Twin
-    from ..segmentation import Detection, EpochResult, NetworkResult, Rate, Recipe
+    from ..segmentation import Detection, EpochResult, NetworkResult, Rate, Recipe, Segmenter
 
     Pairs: TypeAlias = "Dataset | PathLike | GeneratedPairs"
 
@@ -669,13 +670,15 @@ def _use_threads(threads: int | None) -> None:
 
 
 def detect(
-    runs: "TrainedNetworks | PathLike",
+    runs: "TrainedNetworks | PathLike | Segmenter | Sequence[Segmenter | PathLike]",
     dataset: "Pairs",
     *,
     output: PathLike | None = None,
     split: str | None = None,
     setting: str | None = None,
     threshold: float = 0.5,
+    scaling: str | None = None,
+    probabilities: bool = False,
     device: str = "auto",
     threads: int | None = None,
     progress: Progress | bool | None = None,
@@ -686,12 +689,15 @@ def detect(
     its pixels are marked; an image without one is a false alarm when any pixel is.
 
     Args:
-        runs: what `train` returned, or its folder.
+        runs: what `train` returned, or its folder; or networks made elsewhere, one or several: a torch module, an ONNX file
+            (`.onnx`), or a function of log images (image, 2, row, column) that gives probabilities (image, row, column).
         dataset: a dataset file, an open one, or what `generate` returned.
         output: the hit/miss table to write (CSV); None: none.
         split: `train`, `val`, `test` or `all`; None: `test`, and all where the file has none and is not the one trained on.
         setting: only images of this setting, as the file names it.
         threshold: probability above which a pixel is marked, 0 or more and below 1.
+        scaling: of the images that a torch module or an ONNX file was trained on, `min_max` or `residual`; None: log images.
+        probabilities: whether a torch module or an ONNX file gives these; False: logits.
         device, threads: as for `train`.
         progress: True for a bar, or a function of (stage, done, total).
 
@@ -699,50 +705,49 @@ def detect(
         The table; `fit_pod` takes it.
 
     Raises:
-        InputError: no finished network, no such images, a threshold out of range.
-        MissingDependencyError: the extra `segmentation` is not installed.
+        InputError: no finished network, no such images, a threshold out of range, an answer that is no probability.
+        MissingDependencyError: the extra `segmentation` (of ONNX files `onnx`) is not installed.
 
     Example:
         >>> runs = rt.train("references.h5", "networks", networks=1, steps=2, batch=2, crop_px=32, seed=1)
         >>> found = rt.detect(runs, "references.h5", split="all")
         >>> set(found.to_dataframe()["hit"]) <= {0, 1}
         True
+        >>> import numpy as np
+        >>> blind = rt.detect(lambda images: np.zeros_like(images[:, 0]), "references.h5", split="all")
+        >>> int(blind.to_dataframe()["hit"].sum())
+        0
     """
-    from ..files import sha256_of_file
-    from ..segmentation import (
-        choose_device,
-        detect_with_networks,
-        finished_networks,
-        open_runs,
-        summarise_detections,
-        write_detections,
-    )
+    from ..segmentation import summarise_detections, write_detections
 
     if split is not None and split not in SPLITS:
         raise InputError("split", received=repr(split), expected="one of " + ", ".join(SPLITS))
-    folder = open_runs(runs.path if isinstance(runs, TrainedNetworks) else runs)
-    _use_threads(threads)
-    where = choose_device(device)
     warnings: list[str] = []
+    foreign = _segmenters(runs, scaling=scaling, probabilities=probabilities, device=device, threads=threads)
     with _as_dataset(dataset) as images, Telling(progress, unit="image") as telling:
-        trained_on = sha256_of_file(images.path) == folder.configuration["dataset_sha256"]
-        numbers = _numbers(images, split=split, setting=setting, trained_on=trained_on, warnings=warnings)
-        networks = finished_networks(folder)
-        unfinished = len(list(folder.path.glob("network_*/state.pt")))
-        if unfinished:
-            warnings.append(f"{unfinished} networks of {folder.path} are not finished and are left out")
-        telling.begin("detecting", len(numbers) * len(networks))
-        rows = tuple(
-            detect_with_networks(
-                folder,
-                images,
-                numbers,
-                threshold=threshold,
-                device=where,
-                progress=telling.advance,
-                warn=warnings.append,
-            )
-        )
+        words: dict[str, Any] = {"threshold": threshold, "progress": telling.advance, "warn": warnings.append}
+        if foreign is not None:
+            from ..segmentation import detect_with_segmenters
+
+            networks = list(foreign)
+            numbers = _numbers(images, split=split, setting=setting, trained_on=False, warnings=warnings)
+            telling.begin("detecting", len(numbers) * len(networks))
+            rows = tuple(detect_with_segmenters(foreign, images, numbers, **words))
+        else:
+            from ..files import sha256_of_file
+            from ..segmentation import choose_device, detect_with_networks, finished_networks, open_runs
+
+            folder = open_runs(runs.path if isinstance(runs, TrainedNetworks) else runs)  # type: ignore[arg-type]
+            _use_threads(threads)
+            where = choose_device(device)
+            trained_on = sha256_of_file(images.path) == folder.configuration["dataset_sha256"]
+            numbers = _numbers(images, split=split, setting=setting, trained_on=trained_on, warnings=warnings)
+            networks = finished_networks(folder)
+            unfinished = len(list(folder.path.glob("network_*/state.pt")))
+            if unfinished:
+                warnings.append(f"{unfinished} networks of {folder.path} are not finished and are left out")
+            telling.begin("detecting", len(numbers) * len(networks))
+            rows = tuple(detect_with_networks(folder, images, numbers, device=where, **words))
     unknown = sum(row.recall is not None and row.contrast is None and row.size_mm is None for row in rows)
     if unknown:
         warnings.append(
@@ -758,6 +763,45 @@ def detect(
         rates=summarise_detections(rows),
         warnings=tuple(warnings),
     )
+
+
+def _segmenters(
+    given: Any, *, scaling: str | None, probabilities: bool, device: str, threads: int | None
+) -> "dict[int, Segmenter] | None":
+    """Networks made elsewhere, by number; None where a folder of raytwin's own was given."""
+    several = list(given) if isinstance(given, list | tuple) else [given]
+    one_file = isinstance(given, str | os.PathLike) and Path(given).suffix.lower() != ".onnx"
+    if isinstance(given, TrainedNetworks) or one_file:
+        if scaling is not None or probabilities:
+            raise InputError(
+                "scaling and probabilities",
+                received="given with networks that raytwin trained",
+                expected="none: their recipe says both",
+            )
+        return None
+    if not several:
+        raise InputError("runs", received="an empty list", expected="one network or more")
+    found: dict[int, Segmenter] = {}
+    for number, one in enumerate(several):
+        if isinstance(one, str | os.PathLike):
+            from ..segmentation import segmenter_from_onnx
+
+            found[number] = segmenter_from_onnx(one, scaling=scaling, probabilities=probabilities)
+        elif hasattr(one, "state_dict") and hasattr(one, "eval"):
+            from ..segmentation import choose_device, segmenter_from_module
+
+            _use_threads(threads)
+            where = choose_device(device)
+            found[number] = segmenter_from_module(one, scaling=scaling, probabilities=probabilities, device=where)
+        elif callable(one):
+            found[number] = one
+        else:
+            raise InputError(
+                "runs",
+                received=type(one).__name__,
+                expected="a folder of networks, a torch module, an ONNX file or a function of images",
+            )
+    return found
 
 
 def _numbers(

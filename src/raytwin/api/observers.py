@@ -366,25 +366,19 @@ def objects_of_file(
     Raises:
         InputError: references that do not say their setting, or without objects of known contrast.
     """
-    from ..observers import objects_of_references, texture_of_references
+    from ..observers import objects_and_texture
 
     if size not in _UNITS:
         raise InputError("size", received=size, expected="contrast or size_mm")
     with dataset_of(references) as dataset:
-        found = objects_of_references(dataset, pixel_mm=line.pixel_mm)
-        low, semicolon, high = found.setting.partition(";")
-        if not semicolon:
-            raise InputError(
-                dataset.path, received="references without their settings", expected="LOW;HIGH in each row"
-            )
-        pair = (setting_from_text(low), setting_from_text(high))
-        texture = None
-        if with_texture:
-            texture = texture_of_references(dataset, line, pair=pair, material=product_material)
-    objects = line.objects_from_references(
-        found, pair=pair, product_material=product_material, foreign_material=foreign_material, size=size
-    )
-    return objects, texture
+        return objects_and_texture(
+            line,
+            dataset,
+            product_material=product_material,
+            foreign_material=foreign_material,
+            size=size,
+            with_texture=with_texture,
+        )
 
 
 def _pairs(settings: Any) -> list[tuple[Setting, Setting]]:

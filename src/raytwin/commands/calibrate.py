@@ -73,16 +73,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a dual-layer panel, by the series' attribute `layer` (default: front)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the posterior's draws (default 0)")
+    parser.add_argument("--report", metavar="PAGE.html", type=Path, help="write the answer as a page")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin calibrate`."""
     from ..api._progress import Bar
+    from ..api.reports import checked_page, report
     from ..api.twins import calibrate
     from ..files import check_writable
 
     check_writable(arguments.output)
+    if arguments.report is not None:
+        checked_page(arguments.report, argument="--report")
     spectra = {}
     for text in arguments.spectrum:
         file, colon, voltage = text.rpartition(":")
@@ -105,6 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     twin.save(arguments.output)
     result = twin.to_dict()
+    if arguments.report is not None:
+        result["report"] = str(report(twin, arguments.report))
     for warning in result["warnings"]:
         say(f"warning: {warning}")
     answer(result, as_json=arguments.json, text=_text(result, arguments.output))

@@ -14,8 +14,9 @@ from ._answer import answer, say
 if TYPE_CHECKING:
     from ..segmentation import Rate
 
-EXAMPLE = """example:
+EXAMPLE = """examples:
   raytwin detect networks test_images.h5 -o hits.csv
+  raytwin detect network.onnx test_images.h5 -o hits.csv --scaling min_max
 """
 
 _SPLITS = ("train", "val", "test", "all")
@@ -23,7 +24,9 @@ _SPLITS = ("train", "val", "test", "all")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `raytwin detect`."""
-    parser.add_argument("runs", metavar="RUNS", help="folder of networks from `raytwin train`")
+    parser.add_argument(
+        "runs", metavar="RUNS", help="folder of networks from `raytwin train`, or a network made elsewhere (.onnx)"
+    )
     parser.add_argument("dataset", metavar="DATASET", help="dataset file")
     parser.add_argument("-o", "--output", metavar="HITS.csv", required=True, help="the hit/miss table to write")
     parser.add_argument(
@@ -33,6 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--setting", help="only images of this setting, as the file names it")
     parser.add_argument("--threshold", type=float, default=0.5, help="probability above which a pixel is marked (0.5)")
+    parser.add_argument(
+        "--scaling", help="of an ONNX file's images: min_max or residual (default: log images as they are)"
+    )
+    parser.add_argument(
+        "--probabilities", action="store_true", help="an ONNX file gives probabilities (default: logits)"
+    )
     parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
     parser.add_argument("--threads", type=int, help="processor threads (all)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -51,6 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
             split=arguments.split,
             setting=arguments.setting,
             threshold=arguments.threshold,
+            scaling=arguments.scaling,
+            probabilities=arguments.probabilities,
             device=arguments.device,
             threads=arguments.threads,
             progress=bar,

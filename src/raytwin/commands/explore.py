@@ -5,8 +5,10 @@ Within an SSH session the command that brings the page to you is printed. Ctrl+C
 """
 
 import argparse
+import os
 from pathlib import Path
 
+from ..errors import InputError
 from ._answer import answer, say
 from ._twin_file import HELP
 
@@ -14,6 +16,9 @@ EXAMPLE = """examples:
   raytwin explore twin.h5
   raytwin explore virtual_lab --pod hits.csv --campaign campaign.toml --no-browser --port 5010
 """
+
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,25 +47,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="dataset or description that a new campaign names (default: a description of what is seen)",
     )
+    parser.add_argument(
+        "--observer",
+        type=Path,
+        metavar="FILE",
+        help="an observer that `raytwin observe --save` or a screened sweep left: a90 of networks on the objects of --references",
+    )
     parser.add_argument("--json", action="store_true", help="print the address as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin explore`."""
+    # an answer is many small sums, which threads would make longer; the libraries read these words when they are loaded
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
     from ..explore.server import listen, serve
 
+    if arguments.observer is not None and arguments.references is None:
+        raise InputError(
+            "--observer", received="no --references", expected="the dataset whose objects the networks look for"
+        )
     listening = listen(arguments.port)
     import numba
 
     from ..api._given import as_twin
     from ..explore.known_pod import read_known_pod
     from ..explore.page import CampaignTarget, page_of
+    from ..explore.seen_size import read_networks_observer
     from ..explore.state import first_state
     from ..explore.view import Explorer
     from ..spectra import MODELS, is_packaged
 
     twin = as_twin(arguments.twin)
-    explorer = Explorer(twin, name=arguments.twin, pods=[read_known_pod(path) for path in arguments.pod])
+    networks = None
+    if arguments.observer is not None:
+        networks = read_networks_observer(str(arguments.observer), str(arguments.references), twin)
+    pods = [read_known_pod(path) for path in arguments.pod]
+    explorer = Explorer(twin, name=arguments.twin, pods=pods, networks=networks)
     tube = twin.spectral
     if tube is not None and not all(is_packaged(tube.anode, tube.anode_angle_deg, model) for model in MODELS):
         say(

@@ -33,7 +33,7 @@ EXAMPLE = """examples:
   raytwin export session.h5 --to dicom -o radiographs
 """
 
-_FORMS = ("csv", "gvxr", "xcist", "leap", "coco", "yolo", "tiff", "nxtomo", "dicom")
+_FORMS = ("csv", "gvxr", "xcist", "leap", "coco", "yolo", "tiff", "nxtomo", "dicom", "zarr")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -70,10 +70,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     files = parser.add_argument_group("files")
     files.add_argument("--export", metavar="CURVE.csv", help="write the curve with its 95 %% band")
     files.add_argument("--plots", metavar="DIR", help="write the figures")
+    files.add_argument("--report", metavar="PAGE.html", type=Path, help="write the answer as a page")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from ..api.reports import checked_page, report
+
+    if arguments.report is not None:
+        checked_page(arguments.report, argument="--report")
     curve = fit_pod(
         arguments.table,
         size=arguments.size,
@@ -108,6 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
         result["export"] = arguments.export
     if arguments.plots:
         result["plots"] = [_saved(figure, Path(arguments.plots) / name) for name, figure in _figures(curve).items()]
+    if arguments.report is not None:
+        result["report"] = str(report(curve, arguments.report))
     for line in result["warnings"]:
         say(f"warning: {line}")
     answer(result, as_json=arguments.json, text=text_from_answer(result, curve.table.size_name))

@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan",
         action="store_true",
-        help="train nothing: print feasibility, dose, throughput and contrast-to-noise of every setting",
+        help="train nothing: print feasibility, dose, throughput and contrast-to-noise of every setting, and the a90 that an observer"
+        " named under [screening] expects",
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -66,14 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
 
             def told(stage: str, done: int, total: int | None) -> None:
                 bar(stage, done, total)
-                if stage == "settings" and bar.hidden and not counts:
-                    counts.extend((done, total or 0))
-                    if done:
+                if stage == "settings" and bar.hidden:
+                    if not counts and done:
                         say(f"{done} of {total} settings are done already")
+                    counts[:] = (done, total or 0)  # a screened sweep learns round by round how many there are
 
             def finished(row: Mapping[str, Any]) -> None:
                 if bar.hidden and counts:
-                    counts[0] += 1
                     say(f"[{counts[0]}/{counts[1]}] {row['label']}: {_told(row)}")
 
             found = sweep(
@@ -98,7 +98,9 @@ def run(arguments: argparse.Namespace) -> int:
         count = f"{len(rows)} setting{'s' * (len(rows) != 1)}"
         lines = [*_plan_lines(rows), f"{count}, {result['feasible']} feasible, {result['to_train']} to train"]
     else:
-        lines = [*_result_lines(result["rows"]), result["sentence"], f"report: {result['paths']['report']}"]
+        lines = [*_result_lines(result["rows"], result["other_size"]), result["sentence"]]
+        lines += _measurement_lines(result["decision"])
+        lines.append(f"report: {result['paths']['report']}")
     answer(result, as_json=arguments.json, text="\n".join(lines))
     return 0
 
@@ -140,17 +142,29 @@ def _costs(row: Mapping[str, Any]) -> list[str]:
 
 
 def _plan_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    return _table(
-        ("setting", "products/s", "motion px", "dose uGy", "CNR"),
-        [[str(row["label"]), *_costs(row)] for row in rows],
-        [str(row["reason"]) for row in rows],
-    )
+    header = ["setting", "products/s", "motion px", "dose uGy", "CNR"]
+    seen = any(row["predicted"] is not None for row in rows)
+    if seen:
+        header += ["a90", "low", "high"]
+    body = []
+    for row in rows:
+        expected = row["predicted"] or {}
+        ends = [_shown(expected.get(name)) for name in ("value", "low", "high")] if seen else []
+        body.append([str(row["label"]), *_costs(row), *ends])
+    return _table(header, body, [_note(row, []) for row in rows])
 
 
-def _result_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _note(row: Mapping[str, Any], marks: Sequence[str]) -> str:
+    """Why a setting has no a90, its verdict on the requirement, and other marks."""
+    verdict = {None: "", "meets": "meets the requirement"}.get(row["verdict"], str(row["verdict"]))
+    return ", ".join(part for part in (str(row["reason"]), verdict, *marks) if part)
+
+
+def _result_lines(rows: Sequence[Mapping[str, Any]], other_size: str) -> list[str]:
     body, notes = [], []
     for row in rows:
         alarms = row["false_alarm_rate"]
+        expected, other = row["predicted"] or {}, row["other_size"] or {}
         body.append(
             [
                 str(row["label"]),
@@ -158,11 +172,30 @@ def _result_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
                 _shown(row["a90_low"]),
                 _shown(row["a90_high"]),
                 _shown(row["a90_upper"]),
+                _shown(other.get("a90")),
+                _shown(expected.get("value")),
                 "-" if alarms is None else f"{100 * alarms['value']:.3g} %",
                 *_costs(row),
             ]
         )
         marks = [word for word in ("recommended", "pareto", "alike") if row[word]]
-        notes.append(str(row["reason"]) or ", ".join(marks))
-    header = ("setting", "a90", "low", "high", "a90/95", "false al.", "products/s", "motion px", "dose uGy", "CNR")
-    return _table(header, body, notes)
+        notes.append(_note(row, marks))
+    other_name = "a90 mm" if other_size == "size_mm" else "a90 contrast"
+    header = ["setting", "a90", "low", "high", "a90/95", other_name, "expected"]
+    header += ["false al.", "products/s", "motion px", "dose uGy", "CNR"]
+    # columns that no setting fills are left out
+    kept = [
+        0,
+        *(
+            column
+            for column in range(1, len(header))
+            if column not in (5, 6) or any(line[column] != "-" for line in body)
+        ),
+    ]
+    return _table([header[column] for column in kept], [[line[column] for column in kept] for line in body], notes)
+
+
+def _measurement_lines(decision: Mapping[str, Any] | None) -> list[str]:
+    if decision is None:
+        return []
+    return ["To be surer, measure on the real line:", *(f"  {one['text']}" for one in decision["measurements"])]

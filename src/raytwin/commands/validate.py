@@ -36,17 +36,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the fits that leave a level out (default 0)")
     parser.add_argument("--plot", metavar="FILE", type=Path, help="draw the errors (png, pdf or svg)")
+    parser.add_argument("--report", metavar="PAGE.html", type=Path, help="write the answer as a page")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin validate`."""
     from ..api._progress import Bar
+    from ..api.reports import checked_page, report
     from ..api.twins import validate
     from ..calibration.validate import plot_validation
 
     if arguments.plot is not None and arguments.plot.suffix.lower() not in _FORMATS:
         raise InputError("--plot", received=arguments.plot.name, expected="a name that ends in " + ", ".join(_FORMATS))
+    if arguments.report is not None:
+        checked_page(arguments.report, argument="--report")
     with Bar(only_on_terminal=True, unit="level") as bar:
         found = validate(
             arguments.twin,
@@ -65,6 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
         with whole_file(arguments.plot) as temporary:
             plot_validation(found).savefig(temporary, format=arguments.plot.suffix[1:].lower(), dpi=150)
         result["plot"] = str(arguments.plot)
+    if arguments.report is not None:
+        result["report"] = str(report(found, arguments.report))
     answer(result, as_json=arguments.json, text=_text(result))
     return 0
 

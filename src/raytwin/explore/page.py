@@ -15,6 +15,7 @@ from ..errors import InputError, RaytwinError
 from ..generator.twin import Estimate
 from ..materials import library_from_files, material_from_name
 from ..results import same_value
+from .seen_size import SeenSize
 from .state import ExplorerState, first_state
 from .view import BeamView, Explorer, ExplorerView, MapView
 
@@ -458,6 +459,8 @@ def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
     if pixel_mm is not None and explorer.instrument.magnification is not None:
         across = object_diameter_mm(view.state, pixel_mm / explorer.instrument.magnification)
         both.append(("object as a disc, in its plane", f"{across:.3g} mm across ({view.state.object_pixels} pixels)"))
+    if view.seen_size is not None:
+        both += _seen_size_rows(view.seen_size)
     for pod in view.pods:
         both.append((f"a90 of {pod.known.name}, {pod.known.size_name}", _a90_text(pod.known)))
         if pod.times_a90 is not None:
@@ -538,6 +541,24 @@ def _a90_text(known: Any) -> str:
         return "none: the data support no a90"
     ends = [("?" if end is None else _number(end, 3)) for end in (known.a90_low, known.a90_high)]
     return f'{_number(known.a90, 3)} <span class="i">({ends[0]} to {ends[1]})</span>'
+
+
+def _seen_size_rows(seen: SeenSize) -> list[tuple[str, str]]:
+    """What model observers find, as titles and texts."""
+    diameter = f"none up to {seen.largest_mm:.3g} mm" if seen.a90_mm is None else f"{seen.a90_mm:.3g} mm across"
+    if seen.pod is not None:
+        diameter += f"; POD of the disc shown {100 * seen.pod:.3g} %"
+    rows = [(f"a90 of an ideal observer, {100 * seen.false_alarm_rate:g} % false alarms", diameter)]
+    if seen.size_name:
+        unit = "" if seen.size_name == "contrast" else " mm"
+        one = seen.networks
+        text = (
+            "none"
+            if one is None
+            else f'{_number(one.value, 3)}{unit} <span class="i">({_number(one.low, 3)} to {_number(one.high, 3)})</span>'
+        )
+        rows.append((f"a90 of networks, {seen.size_name.removesuffix('_mm')}, expected", text))
+    return rows
 
 
 def _percents(pod: tuple[float, float, float]) -> str:

@@ -24,6 +24,7 @@ from ..generator.twin_spectrum import spectral_model_of
 from ..materials import transmission
 from .known_pod import KnownPod
 from .picture import ImagePair, draw_pair
+from .seen_size import Eye, NetworksObserver, SeenSize
 from .state import BEAMS, ExplorerState, Ranges, ranges_of
 
 FloatArray = NDArray[np.float64]
@@ -67,6 +68,7 @@ class ExplorerView:
 
     Fields: state; low, high; contrast (None where there is none); dose_uGy (air kerma of both images together); pair_per_s (pairs
     a second, one image after the other, as far as exposure and readout go); images (None where none can be drawn); pods;
+    seen_size (by model observers; None where they cannot say);
     limits (declared limits that are broken, and what makes an answer impossible, in words); cautions (what limits the
     numbers); command, python (texts that give the same numbers).
     """
@@ -79,6 +81,7 @@ class ExplorerView:
     pairs_per_s: float
     images: ImagePair | None
     pods: tuple[PodView, ...]
+    seen_size: SeenSize | None
     limits: tuple[str, ...]
     cautions: tuple[str, ...]
     command: str
@@ -107,12 +110,15 @@ class Explorer:
         twin: a calibrated line with a spectral part.
         name: how the twin is named on the command line.
         pods: known POD curves.
+        networks: an observer that was brought to networks.
 
     Raises:
         InputError: a twin without spectral part.
     """
 
-    def __init__(self, twin: Twin, *, name: str, pods: Sequence[KnownPod] = ()) -> None:
+    def __init__(
+        self, twin: Twin, *, name: str, pods: Sequence[KnownPod] = (), networks: NetworksObserver | None = None
+    ) -> None:
         refuse_without_spectrum(twin)
         self.twin = twin
         self.name = name
@@ -129,6 +135,7 @@ class Explorer:
         )
         self._line = replace(twin, instrument=unlimited)
         self._present = present_line(self._line)
+        self._eye = Eye(self._line, networks=networks)
         self._predictions: dict[tuple[bool, Setting], Prediction] = {}
         self._slabs: dict[tuple[Any, ...], SlabContrasts] = {}
         self._asked = 0
@@ -160,6 +167,7 @@ class Explorer:
             pairs_per_s=1.0 / sum(1.0 / frames_per_s(self.instrument, state.setting(beam)) for beam in BEAMS),
             images=images,
             pods=tuple(_pod_view(known, contrast) for known in self.pods),
+            seen_size=None if contrast is None else _or_told(lambda: self._eye.see(state), limits),
             limits=tuple(dict.fromkeys(limits)),
             cautions=tuple(text for text in dict.fromkeys(cautions) if text not in limits),
             command=command_text(self.name, state),

@@ -170,7 +170,8 @@ def plot_training(training: dict[str, Any]) -> bytes:
 
 def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exposures: Sequence[float]) -> bytes:
     """POD against contrast: a thin curve a network, a thick one for all; hits and misses as ticks; a90 intervals. PNG."""
-    figure, axes = figure_with_panels(len(exposures), 2, width=5.2, height=3.8)
+    columns = 2 if len(exposures) in (2, 4) else 3
+    figure, axes = figure_with_panels(len(exposures), columns, width=10.4 / columns, height=3.8)
     for number, (axis, exposure) in enumerate(zip(axes, exposures, strict=True)):
         for kind, colour, label, offset in (("real", REAL, "measured", 0.0), ("test", GENERATED, "generated", 0.025)):
             name = f"{kind}_{exposure:g}ms"
@@ -199,7 +200,7 @@ def plot_pod(hits: dict[str, list[dict[str, str]]], answers: dict[str, Any], exp
                     axis.plot([low, high], [0.9 - offset] * 2, color=colour, linewidth=1.4)
         axis.axhline(0.9, color="grey", linewidth=0.7, linestyle=":")
         axis.set(title=f"{exposure:g} ms", xlabel="contrast $\\Delta R$", ylim=(-0.1, 1.12))
-        if number % 2 == 0:
+        if number % columns == 0:
             axis.set_ylabel("probability of detection")
     told: dict[str, Any] = {}
     for axis in axes:

@@ -2,15 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 _FEWEST_TICKS = 3
 
 
-def few_ticks(axis: Any, values: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers."""
-    if not values:
-        return
+def few_ticks(values: Sequence[float]) -> tuple[dict[float, str], tuple[float, float]]:
+    """Ticks (value, text) of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, and the axis' ends.
+
+    values: what is drawn on it, one at least.
+    """
     lowest, highest = min(values) / 1.25, max(values) * 1.25
     decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
     inside: list[float] = []
@@ -18,6 +18,4 @@ def few_ticks(axis: Any, values: Sequence[float]) -> None:
         if len(inside) < _FEWEST_TICKS:
             ticks = [step * 10.0**power for power in decades for step in steps]
             inside = [tick for tick in ticks if lowest <= tick <= highest]
-    axis.set_xticks(inside, [f"{tick:g}" for tick in inside])
-    axis.minorticks_off()
-    axis.set_xlim(lowest, highest)
+    return {tick: f"{tick:g}" for tick in inside}, (lowest, highest)

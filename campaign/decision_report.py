@@ -208,7 +208,10 @@ def plot_front_with_expected(answer: Mapping[str, Any]) -> bytes:
             axis.axvline(factor * limit, color="black", linewidth=0.8, linestyle=":")
         axis.set(xscale="log", xlabel=title, ylabel="a90" + (f", {answer['unit']}" if answer["unit"] else ""))
         if points:
-            few_ticks(axis, [*(point[0] for point in points), *([] if limit is None else [factor * limit])])
+            ticks, ends = few_ticks([*(point[0] for point in points), *([] if limit is None else [factor * limit])])
+            axis.set_xticks(list(ticks), list(ticks.values()))
+            axis.minorticks_off()
+            axis.set_xlim(*ends)
             axis.set_ylim(0, 1.1 * max(*(point[1] for point in points), required["size"]))
     for label, colour, face, marker in (
         ("recommended", GENERATED, GENERATED, "s"),

@@ -12,6 +12,7 @@ from ..acquisition.dataset_io import read_dataset
 from ..errors import RaytwinError
 from ..reports import AFTER, BEFORE, MEASURED, QUIET, Band, Chart, Figure, Line, Points, Rule, SortedTable, write_page
 from ..reports.chart import Shape
+from ._ticks import few_ticks
 from .decision_report import decision_section
 from .sweep_choice import paces
 from .sweep_file import Campaign
@@ -21,7 +22,6 @@ _DASH = "–"
 _MOST_CURVES = 8
 _MOST_BARS = 60
 _MOST_EXAMPLES = 24
-_FEWEST_TICKS = 3
 # kind of a setting -> colour and shape, in the order of the legend
 _KINDS: dict[str, tuple[str, Shape]] = {
     "recommended": (AFTER, "circle"),
@@ -214,7 +214,7 @@ def front_charts(rows: Sequence[Mapping[str, Any]], *, size: str, anchors: Mappi
                     size_px=10.0,
                 )
             )
-        ticks, limits = _few_ticks([value for value, _ in known])
+        ticks, limits = few_ticks([value for value, _ in known])
         charts[name] = Chart(
             name=f"a90_against_{name}",
             alt=f"a90 against {title.partition(',')[0]}, with two-sided 95 % intervals. A click on a point opens its row.",
@@ -228,18 +228,6 @@ def front_charts(rows: Sequence[Mapping[str, Any]], *, size: str, anchors: Mappi
             height_px=380,
         )
     return charts
-
-
-def _few_ticks(values: Sequence[float]) -> tuple[dict[float, str], tuple[float, float]]:
-    """Ticks of a logarithmic axis at 1, 2 and 5, or at more numbers where it spans little, in plain numbers; and its ends."""
-    lowest, highest = min(values) / 1.25, max(values) * 1.25
-    decades = range(math.floor(math.log10(lowest)), math.ceil(math.log10(highest)) + 1)
-    inside: list[float] = []
-    for steps in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8), (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9)):
-        if len(inside) < _FEWEST_TICKS:
-            ticks = [step * 10.0**power for power in decades for step in steps]
-            inside = [tick for tick in ticks if lowest <= tick <= highest]
-    return {tick: f"{tick:g}" for tick in inside}, (lowest, highest)
 
 
 def curve_charts(fitted: Sequence[Mapping[str, Any]], *, size: str) -> list[Chart]:

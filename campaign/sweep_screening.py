@@ -220,9 +220,12 @@ class Screen:
                     received=f"an observer calibrated for {self.efficiency.size_name}",
                     expected=f"one for {campaign.curve.size}, the size of this campaign",
                 )
-        rate = campaign.trying.marked_share if campaign.trying.threshold is None else 0.1
         self._observer: Observer = (
-            Observer(detector=screening.detector, image=screening.image, false_alarm_rate=rate)
+            Observer(
+                detector=screening.detector,
+                image=screening.image,
+                false_alarm_rate=campaign.trying.marked_share,
+            )
             if self.efficiency is None
             else self.efficiency.observer
         )

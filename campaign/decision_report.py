@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from ._ticks import few_ticks
-from .decision import FAILS, IMPOSSIBLE, LIKELY, MEETS, OPEN, WORDS, Change, change_text, requirement_text
+from .decision import FAILS, IMPOSSIBLE, LIKELY, MEETS, OPEN, WORDS, Change, change_text
 from .figures import GENERATED, PUBLISHED, REAL, figure_with_axes, png_of
-from .sweep_file import Requirement
 
 _DASH = "–"
 _ORDER = (MEETS, LIKELY, OPEN, FAILS, IMPOSSIBLE)
@@ -45,8 +44,6 @@ def _inline(png: bytes) -> str:
 
 
 def _decision(decision: Mapping[str, Any], unit: str) -> dict[str, Any]:
-    names = ("size", "false_alarm_rate", "throughput_per_s", "dose_uGy")
-    requirement = Requirement(**{name: decision["requirement"][name] for name in names})
     settings = decision["settings"]
     taken = next((one for one in settings if one["setting"] == decision["recommended"]), None)
     ordered = sorted(
@@ -55,7 +52,6 @@ def _decision(decision: Mapping[str, Any], unit: str) -> dict[str, Any]:
     )
     counts = [(kind, sum(one["verdict"] == kind for one in settings)) for kind in _ORDER]
     return {
-        "asked": requirement_text(requirement, unit=unit),
         "tally": [(kind, count) for kind, count in counts if count],
         "taken": None
         if taken is None

@@ -15,8 +15,9 @@ import numpy as np
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..diagnosis.assemble import build_problem
 from ..diagnosis.changes import Variant, catalogue_variants
-from ..diagnosis.curves import Curve
+from ..diagnosis.discrepancy import USUAL_LEVEL
 from ..diagnosis.held_out import folds_of, left_over, shrinkage_of
+from ..diagnosis.observed import Point
 from ..diagnosis.problem import Problem
 from ..generator.effects import AppliedEffect
 from ..generator.twin import Twin
@@ -47,11 +48,15 @@ def second_day_shrinkage(
         variants=[*catalogue_variants(without=without), *own],
         calibrated_elsewhere=True,
     )
-    own_curves = [(curve, float(curve.strengths[0])) for curve in problem.curves if curve.variant == _NAME]
+    own_curves = [
+        Point(curve=curve, strength=float(curve.strengths[0]), level=USUAL_LEVEL)
+        for curve in problem.curves
+        if curve.variant == _NAME
+    ]
     return shrinkage(problem, own_curves)
 
 
-def shrinkage(problem: Problem, effects: Sequence[tuple[Curve, float]]) -> dict[str, float] | None:
+def shrinkage(problem: Problem, effects: Sequence[Point]) -> dict[str, float] | None:
     """Share of the gap above its floor that effects at given strengths take away, with its 95 % interval over series.
 
     None where the gap is not above what noise alone would show.

@@ -18,12 +18,16 @@ from .readings import Suspect
 if TYPE_CHECKING:
     import pandas
 
-VERDICTS = ("no_gap", "explained", "ambiguous", "unknown_effect")
+VERDICTS = ("no_gap", "explained", "explained_in_part", "ambiguous", "unknown_effect")
+_LEFT_LISTED = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cause:
-    """An effect, how probable it is, its strength and inner parameters, and how far the gap shrinks with it."""
+    """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
+
+    level: by how much of itself its law seems to be off.
+    """
 
     effect: str
     probability: float
@@ -33,6 +37,13 @@ class Cause:
     sign: float
     since: str
     shrinks_by: tuple[float, float, float] | None
+    level: float = 0.0
+    left: tuple["Place", ...] = ()
+
+    @property
+    def onset(self) -> str:
+        """`always` or `since_calibration`."""
+        return "always" if self.since == "always" else "since_calibration"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,7 +253,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
 
     return {
         "format": "raytwin-diagnosis",
-        "version": 1,
+        "version": 2,
         "verdict": diagnosis.verdict,
         "gap": {
             "before": diagnosis.gap.before,
@@ -257,7 +268,16 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
                 "strength": {**(interval(cause.strength) or {}), "unit": cause.unit},
                 "parameters": parameters(cause),
                 "since": cause.since,
+                "onset": cause.onset,
                 "shrinks_by": interval(cause.shrinks_by),
+                "fit": {
+                    "share_removed": interval(cause.shrinks_by),
+                    "law_off_by": cause.level,
+                    "left": [
+                        {"axis": place.axis, "series": place.series, "location": place.location, "z": place.z}
+                        for place in cause.left[:_LEFT_LISTED]
+                    ],
+                },
             }
             for cause in diagnosis.causes
         ],

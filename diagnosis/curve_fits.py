@@ -7,139 +7,179 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from .curves import Curve
-from .inexact_laws import LAW_ERRORS, LEAST_FACTOR, credible, law_factors, own_variance, with_law
-from .nuisances import Nuisances
+from .discrepancy import LEVELS, Levels
+from .observed import Observed, Point
 
 _CHANCE_NODES = 161
+_ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
+_VARIANTS = 3  # of an effect that are fitted with all levels
+_WEAK = 0.3  # of the best strength
 IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
 _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurveFit:
-    """One curve against the residual: log evidence over none, likelihood over strength nodes, the separation from none.
+    """One curve against a residual.
 
-    separation is the length of the response at the best strength once the nuisances have taken their part, in standard
-    deviations.
+    Fields: curve; by_level (level,): log evidence over none with the law off by each level; log_evidence: the same, averaged over the
+    levels' frequencies; level: the likeliest; strengths and log_likelihood (node,) over none at that level.
     """
 
     curve: Curve
+    by_level: NDArray[np.float64]
     log_evidence: float
+    level: float
     strengths: NDArray[np.float64]
     log_likelihood: NDArray[np.float64]
-    separation: float
 
     @property
     def best(self) -> float:
         """Strength of the highest likelihood."""
         return float(self.strengths[int(np.argmax(self.log_likelihood))])
 
+    @property
+    def point(self) -> Point:
+        """Where the likelihood is highest."""
+        return Point(curve=self.curve, strength=self.best, level=self.level)
 
-def fit_curve(
-    residual: NDArray[np.float64],
-    curve: Curve,
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
-    *,
-    places: NDArray[np.intp] | None = None,
-    law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
-) -> CurveFit:
+    def at_level(self, level: float) -> Point:
+        """Where the likelihood is highest, the law off by another level."""
+        return Point(curve=self.curve, strength=self.best, level=level)
+
+    def averaged(self, frequencies: Sequence[float]) -> float:
+        """Log evidence over none with levels of these frequencies."""
+        return _over_levels(self.by_level, frequencies)
+
+
+def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) -> float:
+    return float(logsumexp(by_level, b=np.asarray(frequencies[: len(by_level)])))
+
+
+def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exact: bool = False) -> CurveFit:
     """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `_log_integral`.
 
-    The law's inaccuracy is a random factor a group and a part of each probe's own, both in proportion to what the
-    nuisances leave of the response at the best strength (found in rounds) and to what is seen in each of `places` (groups
-    where absent).
+    At each level the covariance is that of the law at its best strength, found in rounds.
+
+    Args:
+        observed: what is weighed.
+        curve: in its units.
+        levels: of discrepancy.
+        exact: the law is taken as exact, and nothing about it as random: a first look, at a fraction of the cost.
     """
-    places = groups if places is None else places
     if curve.by_chance_alone:
-        return _fit_chance(residual, curve, nuisances)
-    nodes = curve.responses
-    solved = nuisances.solve_all(nodes)
-    seen = nuisances.solve(residual)
-
-    def terms(
-        model: Nuisances, rows: NDArray[np.float64], vector: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return model.inner(rows, vector[None, :])[:, 0], model.inner(rows, rows)
-
-    def likelihood(
-        strengths: NDArray[np.float64], model: tuple[NDArray[np.float64], NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        weights = curve.weights(strengths)
-        quadratic = np.einsum("si,ij,sj->s", weights, model[1], weights)
-        return weights @ model[0] - 0.5 * quadratic, quadratic
-
-    sharp = terms(nuisances, nodes, residual)
+        strengths, value = _fit_chance(observed, curve)
+        evidence = _log_integral(strengths, value, curve.low, curve.high)
+        return CurveFit(
+            curve=curve,
+            by_level=np.full(len(levels.levels), evidence),
+            log_evidence=evidence,
+            level=0.0,
+            strengths=strengths,
+            log_likelihood=value,
+        )
     coarse = curve.log_strengths()
-    strengths = coarse
-    value, quadratic = likelihood(strengths, sharp)
-    at = int(np.argmax(value))
-    for reach in _REACHES:  # a peak sharper than the nodes lie apart is closed in on
-        width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
-        strengths = _refined(coarse, float(strengths[at]), width)
-        value, quadratic = likelihood(strengths, sharp)
-        at = int(np.argmax(value))
-    choices = [(strengths, value, math.sqrt(max(float(quadratic[at]), 0.0)))]
-    start = float(strengths[at])
-    for law_error, share in law_errors:
-        best = start
-        for _ in range(3):
-            effective = credible(curve.weights(np.array([best]))[0] @ solved, seen, places)
-            extra = law_factors(curve, best, effective, groups, law_error)
-            own = own_variance(curve, best, effective, law_error)
-            if not extra and float(own.max()) < LEAST_FACTOR:
-                break
-            # evidence over none: the residual's own terms change with the covariance
-            moved, moved_nodes, wide, shift = with_law(residual, nodes, nuisances, extra, own)
-            wide_terms = terms(wide, moved_nodes, moved)
-            value, quadratic = likelihood(coarse, wide_terms)
-            width = 1.0 / math.sqrt(max(float(quadratic[int(np.argmax(value))]), 1e-6))
-            strengths = _refined(coarse, float(coarse[int(np.argmax(value))]), max(width, 0.3 * law_error))
-            value, quadratic = likelihood(strengths, wide_terms)
-            value = value + shift + math.log(share)
-            # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
-            weak = strengths < 0.3 * best
-            value = np.where(weak, likelihood(strengths, sharp)[0], value)
-            at = int(np.argmax(value))
-            choices.append((strengths, value, math.sqrt(max(float(quadratic[at]), 0.0))))
-            moved_on = abs(math.log(float(strengths[at]) / best))
-            best = float(strengths[at])
-            if moved_on < 0.05:
-                break
-    strengths, value, separation = max(choices, key=lambda item: float(item[1].max()))
+    sharp = _Terms(observed, curve)
+    strengths, value = sharp.closed_in(coarse)
+    first = _log_integral(strengths, value, curve.low, curve.high)
+    found = [(first, strengths, value)]
+    if not exact:
+        start = float(strengths[int(np.argmax(value))])
+        found = [_at_level(observed, curve, start, level, sharp) or found[0] for level in levels.levels]
+    by_level = np.array([item[0] for item in found])
+    frequencies = (1.0,) if exact else levels.of_kind
+    with np.errstate(divide="ignore"):
+        likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
     return CurveFit(
         curve=curve,
-        log_evidence=_log_integral(strengths, value, curve.low, curve.high),
-        strengths=strengths,
-        log_likelihood=value,
-        separation=separation,
+        by_level=by_level,
+        log_evidence=_over_levels(by_level, frequencies),
+        level=0.0 if exact else levels.levels[likeliest],
+        strengths=found[likeliest][1],
+        log_likelihood=found[likeliest][2],
     )
 
 
-def _fit_chance(residual: NDArray[np.float64], curve: Curve, nuisances: Nuisances) -> CurveFit:
-    """Evidence over none of a curve that moves probes by chance alone: r ~ N(0, C + s^2 S S^T), S its spread.
+def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
+    """Every curve fitted: with all levels of discrepancy those variants of each effect that are likeliest with an exact law."""
+    found = [fit_curve(observed, curve, exact=True) for curve in curves]
+    ranked: dict[str, list[int]] = {}
+    for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
+        ranked.setdefault(curves[number].effect, []).append(number)
+    for numbers in ranked.values():
+        for number in numbers[:_VARIANTS]:
+            found[number] = fit_curve(observed, curves[number])
+    return found
+
+
+class _Terms:
+    """Log likelihood over none of a curve at any strength, with what may vary beside it fixed."""
+
+    def __init__(self, observed: Observed, curve: Curve) -> None:
+        self._curve = curve
+        inner = observed.nuisances.inner
+        self._linear = inner(curve.responses, observed.residual[None, :])[:, 0]
+        self._gram = inner(curve.responses, curve.responses)
+
+    def at(self, strengths: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Log likelihood over none, and squared length of the response, at strengths."""
+        weights = self._curve.weights(strengths)
+        quadratic = np.einsum("si,ij,sj->s", weights, self._gram, weights)
+        return weights @ self._linear - 0.5 * quadratic, quadratic
+
+    def closed_in(self, coarse: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Strengths and their log likelihood: a peak sharper than the nodes lie apart is closed in on."""
+        strengths = coarse
+        value, quadratic = self.at(strengths)
+        for reach in _REACHES:
+            at = int(np.argmax(value))
+            width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
+            strengths = _refined(coarse, float(strengths[at]), width)
+            value, quadratic = self.at(strengths)
+        return strengths, value
+
+
+def _at_level(
+    observed: Observed, curve: Curve, start: float, level: float, sharp: _Terms
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None:
+    """Log evidence, strengths and log likelihood over none with the law off by a level; None: that moves nothing."""
+    best, none = start, observed.log_likelihood
+    coarse = curve.log_strengths()
+    found = None
+    for _ in range(_ROUNDS):
+        wide = observed.widened(curve, best, level)
+        if wide is None:
+            break
+        strengths, value = _Terms(wide, curve.over(wide.units / observed.units)).closed_in(coarse)
+        value = value + wide.log_likelihood - none
+        # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
+        weak = strengths < _WEAK * best
+        value = np.where(weak, sharp.at(strengths)[0], value)
+        found = _log_integral(strengths, value, curve.low, curve.high), strengths, value
+        before, best = best, float(strengths[int(np.argmax(value))])
+        if abs(math.log(best / before)) < _SETTLED:
+            break
+    return found
+
+
+def _fit_chance(observed: Observed, curve: Curve) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Strengths and log likelihood over none of a curve that moves probes by chance alone: r ~ N(0, C + s^2 S S^T), S its spread.
 
     With S^T C^-1 S = V D V^T and c = V^T S^T C^-1 r the log likelihood ratio is
     1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
     """
     if curve.spread is None:
         raise ValueError(f"curve {curve.effect} {curve.variant} moves nothing")
-    spread = curve.spread.T
-    values, vectors = np.linalg.eigh(nuisances.inner(spread, spread))
-    along = vectors.T @ nuisances.inner(spread, residual[None, :])[:, 0]
+    spread, inner = curve.spread.T, observed.nuisances.inner
+    values, vectors = np.linalg.eigh(inner(spread, spread))
+    along = vectors.T @ inner(spread, observed.residual[None, :])[:, 0]
     strengths = curve.log_strengths(_CHANCE_NODES)
     grown = np.multiply.outer(strengths**2, np.maximum(values, 0.0))
     quadratic = np.sum(along**2 * strengths[:, None] ** 2 / (1.0 + grown), axis=1)
-    likelihood = 0.5 * (quadratic - np.sum(np.log1p(grown), axis=1))
-    return CurveFit(
-        curve=curve,
-        log_evidence=_log_integral(strengths, likelihood, curve.low, curve.high),
-        strengths=strengths,
-        log_likelihood=likelihood,
-        separation=math.sqrt(2.0 * max(float(likelihood.max()), 0.0)),
-    )
+    return strengths, 0.5 * (quadratic - np.sum(np.log1p(grown), axis=1))
 
 
 def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ def new_outliers(
     looks: Mapping[str, FirstLook],
     maps: CalibratedMaps,
 ) -> StandingOut:
-    """Pixels in use that stand out in any dark or flat, or in all objects where no later dark or flat shows them.
+    """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
 
     Args:
         kept: series that can be compared.
@@ -67,8 +67,7 @@ def new_outliers(
             limit = max(_largest_ratio(look.frames), 2.5)
             if bool(np.any(ratio[good] > limit)):
                 outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good
-    if not any(item.series.kind in ("dark", "flat") and not item.calibrates for item in kept):
-        outlying |= _out_in_every_object(kept, expected, looks, maps)
+    outlying |= _out_in_every_object(kept, expected, looks, maps)
     # a detector full of outliers is a pattern, not a set of defects
     bad, all_of_them = (
         found if found.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
@@ -83,7 +82,7 @@ def _out_in_every_object(
     looks: Mapping[str, FirstLook],
     maps: CalibratedMaps,
 ) -> NDArray[np.bool_]:
-    """Pixels that stand out of their neighbours whatever lies before them: defects where no later flat or dark shows them."""
+    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow."""
     from scipy.ndimage import median_filter
 
     good = maps.good
@@ -94,15 +93,15 @@ def _out_in_every_object(
             alike.setdefault((item.series.kV, item.series.exposure_ms), []).append(item)
     found = np.zeros(good.shape, dtype=bool)
     for members in alike.values():
-        if len({item.series.scene for item in members}) < _LEAST_SCENES:
-            continue
-        times = np.zeros(good.shape)
-        for item in members:
+        times, scenes = np.zeros(good.shape), set()
+        for number, item in enumerate(reversed(members), start=1):
             measured = maps.corrected(item, looks[item.name].mean_DN)
             residual = measured - full_size(expected[item.name].signal_DN, good.shape)
             residual = residual - median_filter(residual, size=5, mode="nearest")
             times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
-        found |= times >= _NEARLY_ALWAYS * len(members)
+            scenes.add(item.series.scene)
+            if len(scenes) >= _LEAST_SCENES:
+                found |= times >= _NEARLY_ALWAYS * number
     return found
 
 

@@ -9,36 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import Curve
-from .inexact_laws import law_terms
+from .discrepancy import USUAL_LEVEL, law_terms
 from .inference import UNKNOWN, Hypothesis
 from .local_nuisances import LocalNuisances
+from .observed import Point
 from .problem import Problem, SeriesView
 from .strengths import strengths_on
 
-_SHOWN = 5.0  # standard deviations from which a probe shows it
-# the same of a probe once nuisances are fitted on all series: what half of them foretell badly is no gap yet
-_UNTOLD = 3.0
-_CONTRADICTS = 4.0  # times what a place showed before, or could have shown unseen, that an explanation makes of it
 _DRAWS = 300
-_UNSEEN = 3.0  # standard deviations of a probe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gap:
-    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor.
-
-    left: what is left of a typical probe that showed the gap and that no nuisance tells (median of |after| over |before|); None:
-    too few showed it.
-    contradicted: what the explanation adds in places that showed no gap, sum of squares over that of the gap.
-    """
+    """Root mean square of standardised residuals on held-out probes, 1 = noise: before and after, and the floor."""
 
     before: float
     after: float
     floor: float
     shrinks_by: tuple[float, float, float] | None
-    left: float | None = None
-    contradicted: float = 0.0
 
 
 def folds_of(problem: Problem) -> NDArray[np.intp]:
@@ -88,7 +76,7 @@ def _beam(view: SeriesView) -> tuple[Any, ...]:
 
 
 def left_over(
-    problem: Problem, fit: NDArray[np.bool_], added: Sequence[tuple[Curve, float]] = ()
+    problem: Problem, fit: NDArray[np.bool_], added: Sequence[Point] = ()
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction, and these (probe,).
 
@@ -97,15 +85,18 @@ def left_over(
     counted.
     """
     residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
-    for curve, strength in added:
+    for point in added:
+        curve, strength = point.curve, point.strength
         residual = residual - curve.response(strength)
         if curve.spread is not None:
             factors = np.concatenate([factors, strength * curve.spread], axis=1)
         if curve.jitter is not None:
             own = own + strength**2 * curve.jitter
     inexact, laws = own[fit], [factors[fit]]
-    for curve, strength in added:
-        of_law, of_probe = law_terms(replace(curve, spread=None, jitter=None), strength, problem.groups)
+    places = problem.places
+    for point in added:
+        bare = replace(point.curve, spread=None, jitter=None)
+        of_law, of_probe = law_terms(bare, point.strength, problem.groups, places, max(point.level, USUAL_LEVEL))
         laws.append(of_law[fit])
         inexact = inexact + of_probe[fit]
     root = np.sqrt(inexact)
@@ -118,18 +109,15 @@ def left_over(
 
 
 def held_out(
-    problem: Problem, leading: Hypothesis, nuisances: LocalNuisances, rng: np.random.Generator
+    problem: Problem, leading: Hypothesis, rng: np.random.Generator
 ) -> tuple[Gap, tuple[tuple[str, float, float, float], ...], dict[str, tuple[float, float, float]]]:
-    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect.
-
-    nuisances: of the problem.
-    """
+    """Gap before, after and floor on series that the fit did not see, both ways round; shares by effect."""
     folds = folds_of(problem)[problem.series_of]
     size = len(problem.residual)
     before, after = np.full(size, np.nan), np.full(size, np.nan)
-    alone = {effect: np.full(size, np.nan) for effect in leading.effects if effect != UNKNOWN}
-    noise = np.ones(size)
     effects = [effect for effect in leading.effects if effect != UNKNOWN]
+    alone = {effect: np.full(size, np.nan) for effect in effects}
+    noise = np.ones(size)
     for fold in (0, 1):
         fit = folds != fold
         held = ~fit
@@ -139,7 +127,10 @@ def held_out(
         # what a repeat of the same measurement would show: counting noise, of all that nuisances fitted there allow
         noise[held] = problem.noise[held] / sd
         strengths = strengths_on(problem, leading, effects, fit)
-        added = [(leading.variants[effect], strengths[effect]) for effect in effects]
+        added = [
+            Point(curve=leading.variants[effect], strength=strengths[effect], level=leading.levels[effect])
+            for effect in effects
+        ]
         after[held] = left_over(problem, fit, added)[0] if effects else before[held]
         for one, effect in zip(added, effects, strict=True):
             alone[effect][held] = left_over(problem, fit, [one])[0]
@@ -159,16 +150,11 @@ def held_out(
         found = shrinkage_of(before, values[known], floor, series, rng)
         if found is not None:
             shares[effect] = found
-    untold = nuisances.given_others(problem.residual)[known]
-    shown = (np.abs(before) > _SHOWN) & (np.abs(untold) > _UNTOLD)
-    left = float(np.median(np.abs(after[shown]) / np.abs(before[shown]))) if shown.sum() >= 10 else None
     gap = Gap(
         before=_rms(before),
         after=_rms(after),
         floor=floor,
         shrinks_by=shrinkage_of(before, after, floor, series, rng) if effects else None,
-        left=left,
-        contradicted=contradicted_share(before, after, problem.parts[known]),
     )
     return gap, tuple(rows), shares
 
@@ -205,11 +191,3 @@ def shrinkage_of(
         return None
     low, high = np.quantile(draws, [0.025, 0.975])
     return point, min(float(low), point), max(float(high), point)
-
-
-def contradicted_share(before: NDArray[np.float64], after: NDArray[np.float64], places: NDArray[np.intp]) -> float:
-    """Squares of `after` (probe,) in places (probe,) that showed far less before, over all squares of `before` (probe,)."""
-    was, now = np.bincount(places, weights=before**2), np.bincount(places, weights=after**2)
-    unseen = _UNSEEN**2 * np.bincount(places)
-    added = now > _CONTRADICTS * np.maximum(was, unseen)
-    return float(now[added].sum() / max(float(was.sum()), 1e-12))

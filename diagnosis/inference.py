@@ -2,16 +2,14 @@
 
 Probes are residuals r (probe,) against the twin, in units of their own standard deviations. Nuisance parameters are
 integrated out exactly (they are linear with Gaussian priors): r ~ N(m, C), C = I + F F^T, F (probe, factor) the
-responses to the nuisances times their prior standard deviations. With C = L L^T only projections are needed.
+responses to the nuisances times their prior standard deviations.
 
-    none      m = 0
-    effect    m = m_e(s), s the strength, log-uniform over its plausible range, the law's own inaccuracy a random factor
-              (LAW_ERRORS) for each group of probes; what the effect does by chance is extra covariance
-    pair      m = m_e(s) + m_f(t)
-    unknown   m = 0 and an extra variance tau^2 in any number of families of probes, tau log-uniform, at a price for each
-
-Evidence of each is integrated numerically over strengths; a hypothesis' probability is prior x evidence, raised to a
-power below 1 where tests on simulated sessions showed overconfidence.
+    none      m = 0; now and then one family of probes is off by a little (`unknown.Chance`)
+    effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
+              any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
+    pair      m = m_e(s) + m_f(t), each law off by a level of its own
+    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, as far off as
+              effects of other kinds are from the law that resembles them most
 """
 
 import math
@@ -21,25 +19,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .curve_fits import CurveFit, fit_curve, interval_of, log_mean_exp
+from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .curves import Curve
-from .inexact_laws import LAW_ERRORS
-from .nuisances import Nuisances
-from .pairs import Doubts, Observed, Single, weigh_pairs
-from .unknown import unknown_evidence
+from .discrepancy import FARTHEST_LEVEL, LEVELS
+from .observed import Observed, Point
+from .pairs import Single, left_by_the_stronger, log_density, log_width, weigh_pairs
+from .unknown import Beyond, beyond
 
 UNKNOWN = "unknown_effect"
-UNKNOWN_DOUBT = 0.05  # share of what an effect of the catalogue explains that an unknown one must explain beyond it
-UNKNOWN_CHANCE = 3.0  # log evidence that sessions without any effect show by chance (up to 3.5 in 46 sealed ones)
+_WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
+_PAIRS_FROM = 6  # effects, the likeliest, that are the first of a pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypothesis:
     """One explanation and how probable it is.
 
-    Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability;
-    log_evidence; strengths per effect: best value and 95 % interval (value, low, high); variants per effect; location:
-    probe group of an unknown effect; chi_square of the standardised probes left over, nuisances refitted.
+    Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability; log_evidence;
+    strengths per effect: best value and 95 % interval (value, low, high); variants per effect; levels: of discrepancy, per effect;
+    location: probe group of an unknown effect; rest: the one in which laws leave most, empty where they leave nothing.
     """
 
     effects: tuple[str, ...]
@@ -47,7 +45,19 @@ class Hypothesis:
     log_evidence: float
     strengths: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     variants: Mapping[str, Curve] = field(default_factory=dict)
+    levels: Mapping[str, float] = field(default_factory=dict)
     location: str = ""
+    rest: str = ""
+
+    def alone(self, effect: str) -> "Hypothesis":
+        """One of its effects, as it stands here."""
+        return replace(
+            self,
+            effects=(effect,),
+            strengths={effect: self.strengths[effect]},
+            variants={effect: self.variants[effect]},
+            levels={effect: self.levels[effect]},
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,98 +71,118 @@ class Priors:
 
 
 def weigh_hypotheses(
-    residual: NDArray[np.float64],
+    observed: Observed,
+    fits: Sequence[CurveFit],
     *,
-    curves: Sequence[Curve],
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
-    group_names: Sequence[str],
-    unknown_groups: NDArray[np.intp] | None = None,
-    unknown_names: Sequence[str] | None = None,
+    parts: NDArray[np.intp],
+    part_names: Sequence[str],
     priors: Priors | None = None,
-    power: float = 1.0,
-    pairs_from: int = 6,
-    law_errors: Sequence[tuple[float, float]] = LAW_ERRORS,
-    doubts: Doubts | None = None,
-    places: NDArray[np.intp] | None = None,
-    fits: Sequence[CurveFit] | None = None,
-    unknown: tuple[float, str] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
     Args:
-        residual: standardised probes less the twin's (probe,).
-        curves: what each effect would do; several curves of one effect are variants with equal prior.
-        nuisances: factor model of what may vary without being an effect.
-        groups, group_names: group of each probe (probe,), within which a law's inaccuracy is one factor.
-        unknown_groups, unknown_names: partition for the unknown effect; the same as `groups` where absent.
+        observed: standardised probes less the twin's, and what may vary.
+        fits: of each effect's curves to it; several curves of one effect are variants with equal prior.
+        parts, part_names: families of probes (probe,) in which an unknown effect may show.
         priors: of the kinds of hypothesis.
-        power: calibration of confidence: evidences are raised to it.
-        pairs_from: pairs are formed of the best so many effects with every other.
-        law_errors: relative errors of an effect's law in each group, and how probable each is.
-        doubts: how effects are known to mislead; None: no more than any.
-        places: place of each probe (probe,), within which a law is off by a share of no more than what is seen there; the
-            groups where absent.
-        fits: of the curves, with the same residual, nuisances, groups, places and law errors, where they are known.
-        unknown: as `unknown_evidence` finds it with the same residual, nuisances and partition, where it is known.
     """
-    priors, doubts = priors or Priors(), doubts or Doubts()
-    places = groups if places is None else places
-    if fits is None:
-        fits = [fit_curve(residual, curve, nuisances, groups, places=places, law_errors=law_errors) for curve in curves]
+    priors = priors or Priors()
     singles = _singles(fits)
     count = max(len(singles), 1)
-    of_none, of_single = math.log(priors.none), math.log(priors.single / count)
+    ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
+    none = beyond(observed, parts, part_names)
+    rests = _Rests(observed, parts, part_names)
+    weighed = [(Hypothesis(effects=(), probability=0.0, log_evidence=none.allowed), math.log(priors.none))]
+    of_single = math.log(priors.single / count)
+    alike = []
+    for effect in ranked:
+        single = singles[effect]
+        found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
+        found = replace(found, strengths={effect: interval_of(single.fits)})
+        if effect in ranked[:_WITH_REST]:
+            found = rests.of_kind(found, [single.best])
+            alike.append(rests.of_another(single))
+        weighed.append((found, of_single))
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
-    weighed = [(Hypothesis(effects=(), probability=0.0, log_evidence=0.0), of_none)]
-    for effect, single in singles.items():
-        weighed.append(
-            (
-                Hypothesis(
-                    effects=(effect,),
-                    probability=0.0,
-                    log_evidence=single.log_evidence - doubts.chance.get(effect, 0.0),
-                    strengths={effect: interval_of(single.fits)},
-                    variants={effect: single.best.curve},
-                ),
-                of_single,
-            )
+    for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
+        found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
+        if number < _WITH_REST:
+            found = rests.of_kind(found, list(pair.fits.values()))
+        weighed.append((found, of_pair))
+        # or the weaker of them is what the stronger one's law leaves
+        strong, leaves = left_by_the_stronger(observed, pair)
+        weighed.append((found.alone(strong), of_single + leaves))
+    likest = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
+    evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
+    unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
+    weighed.append((unknown, math.log(priors.unknown)))
+    return _by_effects(weighed)
+
+
+def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
+    """Hypotheses with log priors as probabilities, those with the same effects as one, most probable first."""
+    scores = np.array([item.log_evidence + prior for item, prior in weighed])
+    shares = np.exp(scores - scores.max())
+    shares /= shares.sum()
+    best: dict[tuple[str, ...], Hypothesis] = {}
+    total: dict[tuple[str, ...], float] = {}
+    for number in np.argsort(-scores):
+        item = weighed[number][0]
+        total[item.effects] = total.get(item.effects, 0.0) + float(shares[number])
+        best.setdefault(item.effects, item)
+    every = [replace(item, probability=total[effects]) for effects, item in best.items()]
+    return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
+
+
+class _Rests:
+    """What laws leave beside effects, in families of probes."""
+
+    def __init__(self, observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> None:
+        self._observed = observed
+        self._parts = parts
+        self._names = names
+
+    def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
+        """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
+        points = [fit.at_level(min(fit.level, FARTHEST_LEVEL)) for fit in fits]
+        evidence, found = self._beside(points)
+        plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
+        with_rest = evidence + math.log(LEVELS.rest_of_kind)
+        return replace(
+            hypothesis,
+            log_evidence=float(np.logaddexp(plain, with_rest)),
+            rest=found.place if with_rest > plain else "",
         )
-    observed = Observed(residual=residual, nuisances=nuisances, groups=groups, places=places, law_errors=law_errors)
-    for pair in weigh_pairs(observed, singles, curves, doubts=doubts, leading=pairs_from):
-        weighed.append(
-            (
-                Hypothesis(
-                    effects=pair.effects,
-                    probability=0.0,
-                    log_evidence=pair.log_evidence,
-                    strengths=pair.strengths,
-                    variants=pair.variants,
-                ),
-                of_pair,
-            )
+
+    def of_another(self, single: Single) -> float:
+        """Log evidence over none of an effect that is only like one of the catalogue's."""
+        plain = log_mean_exp(
+            np.array([fit.averaged(LEVELS.of_another) for fit in single.fits if len(fit.by_level) > 1])
         )
-    parts = groups if unknown_groups is None else unknown_groups
-    names = group_names if unknown_names is None else unknown_names
-    beyond, place = unknown_evidence(residual, nuisances, parts, names) if unknown is None else unknown
-    # no law is exact: a strong effect leaves a part of what it does to be explained by anything
-    explained = max(item.log_evidence for item, _ in weighed)
-    beyond -= UNKNOWN_CHANCE + UNKNOWN_DOUBT * max(0.0, min(beyond, explained))
-    likest = max(singles, key=lambda effect: singles[effect].log_evidence, default="")
-    if likest and singles[likest].log_evidence > beyond:
-        # what chance shows of the effect that looks most like it is no evidence of anything else either
-        beyond -= doubts.chance.get(likest, 0.0)
-    weighed.append(
-        (
-            Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=beyond, location=place),
-            math.log(priors.unknown),
-        )
+        evidence, _ = self._beside([single.best.at_level(LEVELS.levels[-1])], another=True)
+        share = LEVELS.rest_of_another
+        return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
+
+    def _beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
+        """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
+        beside = self._observed
+        for point in points:
+            beside = beside.beside(point)
+        found = beyond(beside, self._parts, self._names)
+        evidence = beside.log_likelihood - self._observed.log_likelihood + found.log_evidence
+        evidence += sum(log_density(point, another=another) for point in points) + log_width(beside, points)
+        return evidence, found
+
+
+def _of_fits(effects: tuple[str, ...], fits: Mapping[str, CurveFit], log_evidence: float) -> Hypothesis:
+    return Hypothesis(
+        effects=effects,
+        probability=0.0,
+        log_evidence=log_evidence,
+        strengths={effect: interval_of([fit]) for effect, fit in fits.items()},
+        variants={effect: fit.curve for effect, fit in fits.items()},
+        levels={effect: fit.level for effect, fit in fits.items()},
     )
-    scores = np.array([power * item.log_evidence + prior for item, prior in weighed])
-    probability = np.exp(scores - scores.max())
-    probability /= probability.sum()
-    found = (replace(item, probability=float(p)) for (item, _), p in zip(weighed, probability, strict=True))
-    return tuple(sorted(found, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
 def _singles(fits: Sequence[CurveFit]) -> dict[str, Single]:

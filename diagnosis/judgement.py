@@ -1,6 +1,5 @@
-"""Which effect explains a session's gap, of all that its probes say: hypotheses weighed, refined, and put to held-out data."""
+"""What a session's probes say: which hypothesis explains the gap, how well its laws fit, and what to measure next."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,9 +10,8 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.twin import Twin
 from .answer import Cause, Diagnosis, Place
-from .curve_fits import CurveFit, fit_curve
+from .curve_fits import fit_effects
 from .curves import Curve
-from .doubts import doubts_of
 from .held_out import held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from .known_effects import with_found
@@ -21,17 +19,16 @@ from .known_laws import CHANGED_FROM, CHANGED_SD, KnownStrength, known_strengths
 from .local_nuisances import LocalNuisances
 from .next_series import best_measurement, proposal_text
 from .nuisances import Nuisances
+from .observed import Observed
 from .plan import WORTH_IT, best_repeat, repeat_text
 from .problem import Problem
 from .refine import refine
 from .strengths import applied_at_best, strength_of
-from .unknown import unknown_evidence
-from .veto import is_refused, vetoed, with_doubt
 from .whitening import Whitening
 
 EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
-POWER = 0.8  # sessions without effect showed evidences of 1-4 for the weakest effects, where 0-2 would be chance
 _WORST_PLACES = 30
+_MUCH = 0.5  # of the gap that an effect removes to be listed, though an unknown one is likelier
 _WORTH_LISTING = 0.02  # probability of an effect that is neither named nor tied
 SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 STRAINED_FROM = 5.0  # prior standard deviations
@@ -61,14 +58,9 @@ def judge(
         hypotheses = _of_another_strength(hypotheses, known_strengths(problem, nuisances, of=changed, sd=CHANGED_SD))
     verdict = _verdict_of(hypotheses)
     tell("held-out data")
-    gap, by_axis, shares = held_out(problem, verdict.leading, nuisances, rng)
-    if verdict.leading.effects not in ((), (UNKNOWN,)) and is_refused(problem, gap, verdict.leading):
-        # the best of the wrong ones
-        refused = vetoed(hypotheses)
-        verdict = _Verdict(word="unknown_effect", hypotheses=refused, leading=refused[0])
-        gap, by_axis, shares = held_out(problem, verdict.leading, nuisances, rng)
-    verdict = verdict.doubted()
+    gap, by_axis, shares = held_out(problem, verdict.leading, rng)
     leading, named = verdict.leading, verdict.named
+    likeliest = _likeliest_known(problem, verdict, rng)
     marginal = _by_effect(verdict.hypotheses)
     added = tuple(applied_at_best(problem, leading, effect) for effect in named)
     ambiguous = verdict.word == "ambiguous"
@@ -77,7 +69,7 @@ def judge(
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
-        causes=_causes(problem, verdict, shares),
+        causes=_causes(problem, verdict, shares | likeliest, _places(beside, nuisances)),
         probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),
         probability_unknown=marginal.get(UNKNOWN, 0.0),
         unknown_location=next((item.location for item in verdict.hypotheses if item.effects == (UNKNOWN,)), ""),
@@ -111,52 +103,30 @@ def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> 
     """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
-    residual = whitening.apply(problem.residual[None, :])[0]
-    shared = Nuisances(whitening.factors)
-    places = problem.places
-    unknown = unknown_evidence(residual, shared, problem.parts, problem.part_names)
-    doubts = doubts_of(problem)
-
-    def fitted(curves: Sequence[Curve]) -> tuple[CurveFit, ...]:
-        return tuple(fit_curve(residual, curve, shared, problem.groups, places=places) for curve in curves)
-
-    def weigh(curves: Sequence[Curve], fits: Sequence[CurveFit]) -> tuple[Hypothesis, ...]:
-        return weigh_hypotheses(
-            residual,
-            curves=curves,
-            nuisances=shared,
-            groups=problem.groups,
-            group_names=problem.group_names,
-            unknown_groups=problem.parts,
-            unknown_names=problem.part_names,
-            priors=priors,
-            power=POWER,
-            doubts=doubts,
-            places=places,
-            fits=fits,
-            unknown=unknown,
-        )
-
+    observed = Observed(
+        residual=whitening.apply(problem.residual[None, :])[0],
+        nuisances=Nuisances(whitening.factors),
+        groups=problem.groups,
+        places=problem.places,
+    )
     whitened = whitening.curves(problem.curves)
-    fits = fitted(whitened)
-    hypotheses = weigh(whitened, fits)
+    fits = fit_effects(observed, whitened)
+    hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
     tell("refinement")
     closer = refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in problem.variants},
         curves=whitened,
-        residual=residual,
-        nuisances=shared,
-        groups=problem.groups,
-        places=places,
+        observed=observed,
         respond=problem.respond,
         whitener=whitening,
         blocks=problem.asked_in_blocks,
     )
     if closer:
         problem = problem.with_variants(closer)
-        refined = whitening.curves(problem.curves[len(whitened) :])
-        hypotheses = weigh((*whitened, *refined), (*fits, *fitted(refined)))
+        whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
+        fits = fit_effects(observed, whitened)
+        hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
     problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     return _Weighed(
@@ -165,7 +135,7 @@ def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> 
             replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
             for item in hypotheses
         ),
-        out_of_reach=_out_of_reach(problem, whitened, shared),
+        out_of_reach=_out_of_reach(problem, whitened, observed),
     )
 
 
@@ -200,12 +170,6 @@ class _Verdict:
         """Effects of the leading hypothesis; none where it is the unknown one."""
         return () if self.leading.effects == (UNKNOWN,) else tuple(self.leading.effects)
 
-    def doubted(self) -> "_Verdict":
-        """With what is kept for what the fit can no longer doubt: it may still be wrong in kind."""
-        hypotheses = with_doubt(self.hypotheses)
-        leading = next(item for item in hypotheses if item.effects == self.leading.effects)
-        return replace(self, hypotheses=hypotheses, leading=leading)
-
 
 def _verdict_of(hypotheses: tuple[Hypothesis, ...]) -> _Verdict:
     """What hypotheses, most probable first, amount to before held-out data are asked."""
@@ -218,7 +182,7 @@ def _verdict_of(hypotheses: tuple[Hypothesis, ...]) -> _Verdict:
     elif leading.effects == (UNKNOWN,):
         word = "unknown_effect"
     elif core == set(leading.effects):
-        word = "explained"
+        word = "explained_in_part" if leading.rest else "explained"
     else:
         total = 0.0
         for item in hypotheses:
@@ -249,10 +213,26 @@ def _indistinct(tied: Sequence[Hypothesis]) -> tuple[tuple[str, str], ...]:
     )
 
 
+def _likeliest_known(
+    problem: Problem, verdict: _Verdict, rng: np.random.Generator
+) -> dict[str, tuple[float, float, float]]:
+    """How far the likeliest effect of the catalogue shrinks the gap where an unknown one is likelier; empty elsewhere."""
+    known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.effects != (UNKNOWN,)), None)
+    if verdict.word != "unknown_effect" or known is None:
+        return {}
+    return {effect: found for effect, found in held_out(problem, known, rng)[2].items() if found[0] > _MUCH}
+
+
 def _causes(
-    problem: Problem, verdict: _Verdict, shares: Mapping[str, tuple[float, float, float] | None]
+    problem: Problem,
+    verdict: _Verdict,
+    shares: Mapping[str, tuple[float, float, float] | None],
+    left: tuple[Place, ...],
 ) -> tuple[Cause, ...]:
-    """Effects that are named, tied or not out of the question, most probable first; shares: how far each shrinks the gap."""
+    """Effects that are named, tied or not out of the question, most probable first.
+
+    shares: how far each shrinks the gap; left: where what is named leaves most.
+    """
     marginal = _by_effect(verdict.hypotheses)
     marginal.pop(UNKNOWN, None)
     named = verdict.named
@@ -260,7 +240,7 @@ def _causes(
     order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
     causes = []
     for effect in order:
-        if effect not in listed and marginal[effect] < _WORTH_LISTING:
+        if effect not in listed and marginal[effect] < _WORTH_LISTING and effect not in shares:
             continue
         best = next(item for item in verdict.hypotheses if effect in item.effects)
         curve = best.variants[effect]
@@ -275,6 +255,8 @@ def _causes(
                 sign=variant.sign,
                 since=variant.since,
                 shrinks_by=shares.get(effect),
+                level=best.levels.get(effect, 0.0),
+                left=left if effect in named else (),
             )
         )
     return tuple(sorted(causes, key=lambda item: -item.probability))
@@ -340,14 +322,11 @@ def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) 
     return tuple(sorted(far, key=lambda item: -abs(item[1])))
 
 
-def _out_of_reach(problem: Problem, curves: Sequence[Curve], nuisances: Nuisances) -> dict[str, str]:
+def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed) -> dict[str, str]:
     """Effects that the session could not show at their largest plausible strength, each with the reason."""
     farthest: dict[str, tuple[float, float]] = {}
     for curve in curves:
-        response = curve.response(curve.high)[None, :]
-        if curve.by_chance_alone and curve.spread is not None:
-            response = curve.high * curve.spread.T
-        length = math.sqrt(max(float(np.trace(nuisances.inner(response, response))), 0.0))
+        length = observed.length(curve, curve.high)
         if length >= farthest.get(curve.effect, (-1.0, 0.0))[0]:
             farthest[curve.effect] = (length, curve.high)
     found = dict(problem.missing_effects)

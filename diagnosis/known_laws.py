@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from ..generator.twin import Twin
 from .changes import Variant
+from .discrepancy import PROBE_SHARE, USUAL_LEVEL, group_factors
 from .forward_model import Change
-from .inexact_laws import LAW_ERRORS, LAW_PROBE_SHARE, group_factors
 from .local_nuisances import LocalNuisances
 from .problem import Problem
 
-_LAW_ERROR = LAW_ERRORS[0][0]
 _STRENGTH_SD = 0.12  # relative: as far as intervals of strengths are widened
 CHANGED_SD = 1.0  # the same where a strength may be any, 0 among them
 _APART = 1.96 * _STRENGTH_SD
@@ -51,11 +50,11 @@ def beside_known(problem: Problem, responses: NDArray[np.float64], effects: Sequ
     left = LocalNuisances(problem.factors, problem.blocks).solve_all(responses)
     own = np.ones(responses.shape[1])
     for effect, response, effective in zip(effects, responses, left, strict=True):
-        of_groups = group_factors(effective, problem.groups, _LAW_ERROR).toarray().T
+        of_groups = group_factors(effective, problem.groups, USUAL_LEVEL).toarray().T
         factors += [_STRENGTH_SD * response[:, None], of_groups]
         names.append(_STRENGTH_OF.format(effect))
         names += [f"law of {effect}, which the twin has, {number}" for number in range(of_groups.shape[1])]
-        own = own + (LAW_PROBE_SHARE * _LAW_ERROR * effective) ** 2
+        own = own + (PROBE_SHARE * USUAL_LEVEL * effective) ** 2
     widened = np.concatenate(factors, axis=1)
     root, ask = np.sqrt(own), problem.respond
 

@@ -33,6 +33,12 @@ class Nuisances:
         every = of_laws if self.of_laws is None else vstack([self.of_laws, of_laws], format="csc")
         return Nuisances(wider * inverse[:, None], _scaled(every, inverse))
 
+    def full(self) -> NDArray[np.float64]:
+        """All factors (probe, factor)."""
+        if self.of_laws is None:
+            return self.factors
+        return np.concatenate([self.factors, self.of_laws.toarray().T], axis=1)
+
     def of_probes(self, probes: NDArray[np.bool_]) -> "Nuisances":
         """Of some of its probes (probe,)."""
         return Nuisances(

@@ -16,8 +16,9 @@ from ..generator.effects.effect import Placement
 from .changes import Variant
 from .curve_fits import CurveFit
 from .curves import Curve
+from .discrepancy import USUAL_LEVEL
 from .inference import Hypothesis
-from .nuisances import Nuisances
+from .observed import Observed, Point
 from .refine_tasks import Task, tasks_of
 from .search import curve_of, searched
 from .seen import Blocks, Responder, Seen, Whitener
@@ -32,12 +33,9 @@ def refine(
     *,
     variants: Mapping[tuple[str, str], Variant],
     curves: Sequence[Curve],
-    residual: NDArray[np.float64],
-    nuisances: Nuisances,
-    groups: NDArray[np.intp],
+    observed: Observed,
     respond: Responder,
     whitener: Whitener,
-    places: NDArray[np.intp] | None = None,
     blocks: Blocks | None = None,
 ) -> list[tuple[Variant, NDArray[np.float64]]]:
     """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
@@ -46,20 +44,12 @@ def refine(
         hypotheses: of the first weighing, with whitened curves.
         variants: of the grid, by effect and name.
         curves: of the grid, whitened.
-        residual, nuisances, groups, places: whitened, as weighed.
+        observed: what is weighed, whitened.
         respond: asks the forward model.
         whitener: of responses.
         blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
     """
-    whole = Seen(
-        residual=residual,
-        nuisances=nuisances,
-        groups=groups,
-        places=places,
-        respond=respond,
-        whitener=whitener,
-        blocks=blocks,
-    )
+    whole = Seen(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
     refinement = _Refinement(whole, variants, curves)
     for task in tasks_of(hypotheses):
         refinement.run(task)
@@ -81,10 +71,10 @@ class _Refinement:
         seen = self._whole
         if task.beside is not None:
             if task.moves_more and not self._clear(
-                task.beside[0].effect, self._whole.beside(*self._where(task.effect, task.own))
+                task.beside[0].effect, self._whole.beside(self._where(task.effect, task.own))
             ):
                 return
-            seen = seen.beside(*self._where(task.beside[0].effect, task.beside))
+            seen = seen.beside(self._where(task.beside[0].effect, task.beside))
         # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
         known = self._closer.get(task.effect) if task.moves_more else None
         if known is not None:
@@ -114,10 +104,11 @@ class _Refinement:
         if best is not None:
             self._closer[task.effect] = best
 
-    def _where(self, effect: str, grid: tuple[Curve, float]) -> tuple[Curve, float]:
-        """Curve and strength of an effect as it was found last; those of the grid before."""
+    def _where(self, effect: str, grid: tuple[Curve, float]) -> Point:
+        """An effect as it was found last, its law off as usual; that of the grid before."""
         known = self._closer.get(effect)
-        return grid if known is None else (known.curve, known.strength)
+        curve, strength = grid if known is None else (known.curve, known.strength)
+        return Point(curve=curve, strength=strength, level=USUAL_LEVEL)
 
     def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""
@@ -138,7 +129,7 @@ class _Closer:
 def _separation(fit: CurveFit, seen: "Seen") -> float:
     """Of a fit from none, its law taken as exact."""
     response = fit.curve.response(fit.best)
-    return math.sqrt(max(float(response @ seen.nuisances.solve(response)), 0.0))
+    return math.sqrt(max(float(response @ seen.observed.nuisances.solve(response)), 0.0))
 
 
 def _displaced_and_distorted(

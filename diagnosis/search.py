@@ -214,13 +214,13 @@ def _newton(here: CurveFit, variant: Variant, slopes: _Slopes, seen: Seen) -> di
     """Steps of the inner parameters, each in half of its range, towards where the probes want them.
 
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
-    by LAW_ERROR, each parameter within about its range.
+    as usual, each parameter within about its range.
     """
     strength = _plausible(here, variant)
     at = np.asarray(here.curve.response(strength))
-    found = seen.widened(here.curve, strength)
-    left, wide = (seen.residual - at) / found.root, found.nuisances
-    rows = np.concatenate([at[None, :], slopes.at(strength)]) / found.root
+    found, root = seen.widened(here.curve, strength)
+    left, wide = found.residual - at / root, found.nuisances
+    rows = np.concatenate([at[None, :], slopes.at(strength)]) / root
     normal = wide.inner(rows, rows)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from .changes import Variant
 from .curve_fits import CurveFit, fit_curve
 from .curves import Curve
-from .inexact_laws import Widened, widened_for
-from .nuisances import Nuisances
+from .discrepancy import USUAL, USUAL_LEVEL
+from .observed import Observed, Point
 
-LAW_ERROR = 0.1
-_TELLS = 0.8  # share of what tells an effect, its law off by LAW_ERROR, that the series of a search hold
+_TELLS = 0.8  # share of what tells an effect, its law off as usual, that the series of a search hold
 _WORTH = 0.7  # share of all series' cost from which a search asks all of them
 
 
@@ -63,53 +62,37 @@ class Blocks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Seen:
-    """What one effect is fitted to, in units of what other effects' laws leave uncertain.
+    """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
 
-    Fields: residual (probe,), nuisances, groups and places as weighed; respond: the forward model; whitener of its responses; root
-    (probe,): standard deviations of the probes, in whitened ones (None: 1); blocks of series (None: all are asked); wanted: which of
+    Fields: observed; respond: the forward model; whitener of its responses; blocks of series (None: all are asked); wanted: which of
     all probes these are (None: all).
     """
 
-    residual: NDArray[np.float64]
-    nuisances: Nuisances
-    groups: NDArray[np.intp]
-    places: NDArray[np.intp] | None
+    observed: Observed
     respond: Responder
     whitener: Whitener
-    root: NDArray[np.float64] | None = None
     blocks: Blocks | None = None
     wanted: NDArray[np.bool_] | None = None
 
-    def beside(self, curve: Curve, strength: float) -> "Seen":
-        """The same once another effect stands at a strength, its law off by LAW_ERROR."""
-        found = self.widened(curve, strength)
-        root = found.root if self.root is None else self.root * found.root
-        rest = (self.residual - curve.response(strength)) / found.root
-        return replace(self, residual=rest, nuisances=found.nuisances, root=root)
+    def beside(self, point: Point) -> "Seen":
+        """The same once another effect stands there."""
+        return replace(self, observed=self.observed.beside(point))
 
     def where_told(self, fit: CurveFit) -> "Seen":
         """The same of the series that tell most of a fitted curve in these units; itself where nearly all are needed."""
         if self.blocks is None:
             return self
-        found = self.widened(fit.curve, fit.best)
-        response = fit.curve.response(fit.best) / found.root
-        kept = self.blocks.telling(response * found.nuisances.solve(response))
+        wide, root = self.widened(fit.curve, fit.best)
+        response = fit.curve.response(fit.best) / root
+        kept = self.blocks.telling(response * wide.nuisances.solve(response))
         if kept is None:
             return self
-        return replace(
-            self,
-            residual=self.residual[kept],
-            nuisances=self.nuisances.of_probes(kept),
-            groups=self.groups[kept],
-            places=None if self.places is None else self.places[kept],
-            root=None if self.root is None else self.root[kept],
-            blocks=None,
-            wanted=kept,
-        )
+        return replace(self, observed=self.observed.of_probes(kept), blocks=None, wanted=kept)
 
-    def widened(self, curve: Curve, strength: float) -> Widened:
-        """What may vary beside a curve at a strength, its law off by LAW_ERROR."""
-        return widened_for(self.residual, curve, strength, self.nuisances, self.groups, LAW_ERROR, places=self.places)
+    def widened(self, curve: Curve, strength: float) -> tuple[Observed, NDArray[np.float64]]:
+        """What is seen where a curve's law (in these units) is off as usual at a strength, and its units in these (probe,)."""
+        wide = self.observed.widened(curve, strength, USUAL_LEVEL) or self.observed
+        return wide, wide.units / self.observed.units
 
     def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
         """Responses (strength, probe) of variants by their place, whitened and in these units."""
@@ -120,12 +103,7 @@ class Seen:
         whitened = self.whitener.apply(responses)
         if self.wanted is not None:
             whitened = whitened[:, self.wanted]
-        return whitened if self.root is None else whitened / self.root
-
-    def scaled(self, curve: Curve) -> Curve:
-        """A whitened curve of all probes in these units."""
-        own = self.cut(curve)
-        return own if self.root is None else own.over(self.root)
+        return np.asarray(whitened / self.observed.units)
 
     def cut(self, curve: Curve) -> Curve:
         """A curve of all probes, of these."""
@@ -133,8 +111,8 @@ class Seen:
 
     def fit(self, curve: Curve) -> CurveFit:
         """A whitened curve of all probes, fitted."""
-        return self.fit_scaled(self.scaled(curve))
+        return self.fit_scaled(self.observed.scaled(self.cut(curve)))
 
     def fit_scaled(self, curve: Curve) -> CurveFit:
-        """A curve in these units, fitted."""
-        return fit_curve(self.residual, curve, self.nuisances, self.groups, places=self.places)
+        """A curve in these units, fitted with its law off as usual."""
+        return fit_curve(self.observed, curve, levels=USUAL)

@@ -56,7 +56,7 @@ def with_sought_anew(result: Diagnosis, anew: Diagnosis, effects: Sequence[Appli
         probability_no_gap=marginal.get((), 0.0),
         probability_unknown=marginal.get((UNKNOWN,), 0.0),
         unknown_location="",
-        gap=replace(result.gap, after=result.gap.before, shrinks_by=None, left=1.0, contradicted=0.0),
+        gap=replace(result.gap, after=result.gap.before, shrinks_by=None),
         held_out=tuple((axis, before, before, floor) for axis, before, _, floor in result.held_out),
         ambiguous_with=(),
         next_measurement=None,

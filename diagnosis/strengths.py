@@ -11,9 +11,11 @@ from ..generator.effects import EFFECTS, AppliedEffect
 from ..generator.series import with_conditions
 from .assemble import map_changes
 from .curve_fits import fit_curve
+from .discrepancy import USUAL
 from .even_maps import Map, mean_over
 from .inference import Hypothesis
 from .nuisances import Nuisances
+from .observed import Observed
 from .output_course import rms_about_mean
 from .problem import Problem, SeriesView
 
@@ -154,7 +156,12 @@ def strengths_on(
     if not effects:
         return strengths
     # in the probes as they are: whitened ones gave a heel of 5 % a strength on half of a session that left three times the gap
-    inner, groups, places = Nuisances(problem.factors[fit]), problem.groups[fit], problem.places[fit]
+    part = Observed(
+        residual=problem.residual[fit],
+        nuisances=Nuisances(problem.factors[fit]),
+        groups=problem.groups[fit],
+        places=problem.places[fit],
+    )
     for _ in range(3 if len(effects) > 1 else 1):
         for effect in effects:
             curve = leading.variants[effect]
@@ -164,13 +171,7 @@ def strengths_on(
                 (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
                 np.zeros(len(problem.residual)),
             )
-            part = replace(
-                curve,
-                responses=curve.responses[:, fit],
-                spread=None,
-                jitter=None if curve.jitter is None else curve.jitter[fit],
-                exact=None if curve.exact is None else curve.exact[fit],
-            )
-            result = fit_curve((problem.residual - others)[fit], part, inner, groups, places=places)
-            strengths[effect] = result.best
+            rest = replace(part, residual=(problem.residual - others)[fit])
+            own = replace(curve.of_probes(fit), spread=None)
+            strengths[effect] = fit_curve(rest, own, levels=USUAL).best
     return strengths

@@ -1,41 +1,81 @@
-"""Evidence of an effect that no catalogue holds: more variance in some families of probes than anything known gives them."""
+"""What no catalogue holds: more variance in some families of probes than anything known gives them.
+
+In how many families an unknown effect shows is not known: every number of them is as likely as another. A single family that is
+off by a little is what sessions without any effect show now and then (`Chance`).
+"""
 
 import math
+import tomllib
 from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .nuisances import Nuisances
+from .observed import Observed
 
-UNKNOWN_SHARE = 0.1  # of the groups of probes in which an effect outside the catalogue shows
-_UNKNOWN_TAU = np.geomspace(0.5, 5000.0, 14)
+_TAU = np.geomspace(0.5, 5000.0, 14)
 _SWEEPS = 4
 
 
-def unknown_evidence(
-    residual: NDArray[np.float64], nuisances: Nuisances, groups: NDArray[np.intp], names: Sequence[str]
-) -> tuple[float, str]:
-    """Log evidence over none of an effect that no catalogue holds, and the group of probes where it is seen most.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chance:
+    """One family of probes that is off where there is no effect: how often, and by how much at most (standard deviations)."""
 
-    Every group may have an extra variance tau^2, log-uniform over a grid, with probability UNKNOWN_SHARE; the evidence is
-    that of the best combination (each group's tau in turn, several sweeps), its prior in it, of one group at least.
+    frequency: float
+    largest: float
+
+
+def _learnt() -> Chance:
+    """As `validation/learn_discrepancy.py` left it."""
+    table = tomllib.loads(files("raytwin.diagnosis").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
+    return Chance(**table["chance"])
+
+
+CHANCE = _learnt()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beyond:
+    """What a residual shows beyond what may vary.
+
+    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_chance: log evidence
+    over none of one family that is off by a little.
     """
-    parts = [np.nonzero(groups == number)[0] for number in range(len(names))]
-    factors = nuisances.factors
-    grams = np.stack([factors[part].T @ factors[part] for part in parts])
-    sums = np.stack([factors[part].T @ residual[part] for part in parts])
-    squares = np.array([float(np.sum(residual[part] ** 2)) for part in parts])
-    sizes = np.array([len(part) for part in parts])
-    grid = np.concatenate([[0.0], _UNKNOWN_TAU])
-    cost = math.log(UNKNOWN_SHARE / len(_UNKNOWN_TAU))
+
+    log_evidence: float
+    place: str
+    by_chance: float
+
+    @property
+    def allowed(self) -> float:
+        """Log evidence of no effect, one family off now and then, over that of none ever off."""
+        return float(np.logaddexp(math.log1p(-CHANCE.frequency), math.log(CHANCE.frequency) + self.by_chance))
+
+
+def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> Beyond:
+    """What a residual shows beyond what may vary, in families `parts` (probe,) of probes.
+
+    Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
+    family's tau in turn, several sweeps), its prior in it, of one family at least.
+    """
+    residual, nuisances = observed.residual, observed.nuisances
+    factors = nuisances.full()
+    members = [np.nonzero(parts == number)[0] for number in range(len(names))]
+    grams = np.stack([factors[part].T @ factors[part] for part in members])
+    sums = np.stack([factors[part].T @ residual[part] for part in members])
+    squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
+    sizes = np.array([len(part) for part in members])
+    count = int(np.count_nonzero(sizes))
+    grid = np.concatenate([[0.0], _TAU])
     one = np.eye(factors.shape[1])
-    tau2 = np.zeros(len(parts))
-    alone: list[tuple[float, int]] = []
-    base = best = 0.0
+    tau2 = np.zeros(len(members))
+    alone = np.full((len(members), len(grid)), -np.inf)
+    base, best = 0.0, -math.inf
     for sweep in range(_SWEEPS):
         changed = False
-        for g, part in enumerate(parts):
+        for g, part in enumerate(members):
             if not len(part):
                 continue
             weights = 1.0 / (1.0 + tau2)
@@ -44,21 +84,35 @@ def unknown_evidence(
             found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
             weights[g] = 1.0
             found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
-            if sweep == 0 and not np.any(np.delete(tau2, g)):
+            others = int(np.count_nonzero(np.delete(tau2, g)))
+            if sweep == 0 and not others:
                 base = float(found[0])
-                alone.append((float(max(found[1:])) + cost, g))
-            found[1:] += cost
+                alone[g] = found
+            found = found + _price(others, count)
+            found[1:] += _price(others + 1, count) - _price(others, count)
             at = int(np.argmax(found))
             changed |= bool(grid[at] ** 2 != tau2[g])
             tau2[g] = grid[at] ** 2
-            best = float(found[at]) + cost * float(np.count_nonzero(np.delete(tau2, g)))
+            best = float(found[at])
         if not changed:
             break
+    own = alone[:, 1:] - base
     if not np.any(tau2):
-        best, place = max(alone)
+        best = float(own.max()) + _price(1, count) + base
+        place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
     else:
         place = int(np.argmax(tau2 * sizes))
-    return best - base, str(names[place])
+    small = CHANCE.largest >= _TAU
+    by_chance = float(np.logaddexp.reduce(own[:, small], axis=None)) - math.log(count * int(np.count_nonzero(small)))
+    return Beyond(log_evidence=best - base, place=str(names[place]), by_chance=by_chance)
+
+
+def _price(shown: int, count: int) -> float:
+    """Log prior of certain `shown` of `count` families at certain sizes; 0 of none, which is no such effect."""
+    if not shown:
+        return 0.0
+    ways = math.lgamma(count + 1) - math.lgamma(shown + 1) - math.lgamma(count - shown + 1)
+    return -math.log(count) - ways - shown * math.log(len(_TAU))
 
 
 def _at_each(

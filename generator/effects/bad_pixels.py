@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows
+from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows
 
 
 def _spoil_pixels(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -60,8 +60,7 @@ BAD_PIXELS = Effect(
     after_calibration=True,
     change=_spoil_pixels,
     isolated_by="darks and flats",
-    shows=Shows(series=EVERY_SERIES, axis="position", flats=False, single_pixels=True),
+    shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
     absorbed="maps",
     reading=Reading(probes=("outliers in any series",)),
-    false_evidence=FalseEvidence(unmistakable=True),
 )

@@ -57,7 +57,7 @@ COMPOSITION_ERROR = Effect(
         " no wedge, edge or disc"
     },
     isolated_by="a certified wedge of the product's material",
-    shows=Shows(series=("object",), axis="energy", flats=False, places=True),
+    shows=Shows(series=("object",), axis="energy", flats=False),
     absorbed="nothing",
     grid=Grid(shares=(0.6, 1.0)),
     images=InImages(not_in_references="references show the product as it is"),

@@ -83,16 +83,13 @@ class Shows:
     """Where an effect, or what is wrong with its law, can show.
 
     Fields: series: kinds of series that it can move; axis: of the answer, under which pictures like its own are listed; flats
-    (False: it leaves the detector-median level and noise of a flat alone); places (it can seem to move a scene's picture);
-    single_pixels (it can make pixels stand out of their neighbours); like_thinner (it brightens behind an object as a thickness map
-    that is too thick does).
+    (False: it leaves the detector-median level and noise of a flat alone); like_thinner (it brightens behind an object as a
+    thickness map that is too thick does).
     """
 
     series: tuple[str, ...]
     axis: str
     flats: bool = True
-    places: bool = False
-    single_pixels: bool = False
     like_thinner: bool = False
 
     def __post_init__(self) -> None:
@@ -135,33 +132,14 @@ class Grid:
 class Variation:
     """How laws of an effect's kind may differ from line to line, and what about it is random.
 
-    Fields: random (one of RANDOM); loosely_tied: times the strength that the rest shows, which the random part may have; exact
-    (it acts as physics has it, whoever simulates it).
+    Fields: random (one of RANDOM).
     """
 
     random: str = "nothing"
-    loosely_tied: float = 1.0
-    exact: bool = False
 
     def __post_init__(self) -> None:
         if self.random not in RANDOM:
             raise InputError("random part of an effect", received=self.random, expected="one of " + ", ".join(RANDOM))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FalseEvidence:
-    """Evidence that sessions show of an effect which they do not have, or that its law leaves to others; natural logarithms.
-
-    Fields: alone: log evidence in sessions without it; alone_sharp: where pixels see no farther than themselves; leaves: share of
-    its log evidence that its law leaves to other effects (0: the usual); edges_alone (no such rest looks like it); unmistakable
-    (pixels or codes of its own show it).
-    """
-
-    alone: float = 0.0
-    alone_sharp: float = 0.0
-    leaves: float = 0.0
-    edges_alone: bool = False
-    unmistakable: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,7 +201,7 @@ class Effect:
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
             diagnosis tries both.
         absorbed: one of ABSORBED: what calibration takes in of one that was always there.
-        shows, reading, grid, variation, false_evidence, images: see there.
+        shows, reading, grid, variation, images: see there.
         lost_in_squares: why it cannot be seen in squares of pixels; empty: it can.
         always_a_little: what most lines have of it, if any; placement: of one that displaces scenes.
         worked_in: (twin, strength) -> the twin whose own numbers are those of a line with it, and warnings; None: it stays an effect.
@@ -247,7 +225,6 @@ class Effect:
     reading: Reading = Reading()
     grid: Grid = Grid()
     variation: Variation = Variation()
-    false_evidence: FalseEvidence = FalseEvidence()
     images: InImages = InImages()
     lost_in_squares: str = ""
     always_a_little: AlwaysALittle | None = None

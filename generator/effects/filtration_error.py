@@ -6,7 +6,7 @@ from ..line_state import LineContext, LineState
 from ..twin import Twin
 from ..twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
-from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
 
 
 def _shift_filtration(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -45,6 +45,5 @@ FILTRATION_ERROR = Effect(
     absorbed="numbers",
     reading=Reading(law_sd=0.05),  # 34 sealed voltages and filters were off by 2 % rms
     grid=Grid(shares=(0.6, 1.0)),
-    variation=Variation(exact=True),
     worked_in=_in_numbers,
 )

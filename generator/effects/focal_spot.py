@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, FalseEvidence, Grid, InImages, Parameter, Shows
+from .effect import Effect, Grid, InImages, Parameter, Shows
 
 _SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
@@ -87,13 +87,12 @@ FOCAL_SPOT = Effect(
     change=_blur_by_focal_spot,
     needs=("scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="an edge at two magnifications",
-    shows=Shows(series=("object",), axis="sharpness", flats=False, places=True),
+    shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
     grid=Grid(
         shares=(0.25, 0.5, 0.75, 1.0), variants=tuple({"aspect": aspect, "flatness": 0.3} for aspect in (0.707, 1.414))
     ),
     # of 64 sealed sessions without effect six showed 4 to 8, edges being drawn no better; two panels without effect, in squares of
     # pixels, 77 of a spot of 0.47 mm, one with a spot of 0.6 mm 107
-    false_evidence=FalseEvidence(alone=5.0, alone_sharp=80.0, edges_alone=True),
     images=InImages(spot=True),
 )

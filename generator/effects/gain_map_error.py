@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import FixedPattern, LineContext, LineState
-from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows, Variation
+from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, Variation
 
 
 def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -50,10 +50,9 @@ GAIN_MAP_ERROR = Effect(
     after_calibration=True,
     change=_change_gain,
     isolated_by="flats repeated, and behind a filter",
-    shows=Shows(series=EVERY_SERIES, axis="position", flats=False, single_pixels=True),
+    shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
     absorbed="maps",
     reading=Reading(probes=("fixed_pattern",), sd=0.12),  # they hold only what differs from pixel to pixel
     variation=Variation(random="pixels"),
     # a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
-    false_evidence=FalseEvidence(unmistakable=True),
 )

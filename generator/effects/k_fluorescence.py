@@ -22,7 +22,7 @@ from ...materials import (
 )
 from ..line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
-from .effect import LIT_SERIES, Effect, FalseEvidence, Grid, Parameter, Reading, Shows
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
 
 _USUAL_ORDER = 0.5
 
@@ -107,12 +107,9 @@ K_FLUORESCENCE = Effect(
     change=_spread_k_photons,
     needs=("spectral", "pixel_mm"),
     isolated_by="the same at a tube voltage below the scintillator's K edge (30 kV) and above it (60 kV)",
-    shows=Shows(series=LIT_SERIES, axis="sharpness", places=True),
+    shows=Shows(series=LIT_SERIES, axis="sharpness"),
     either_onset=True,
     absorbed="noise",
     reading=Reading(law_sd=0.25),  # a K photon's reach stands for how many there are: eleven shares were off by 25 %
     grid=Grid(shares=(0.8,), variants=({"range_mm": 0.15}, {"range_mm": 0.33})),
-    false_evidence=FalseEvidence(
-        alone_sharp=8.0
-    ),  # as of a tail: two panels without effect, in squares of pixels, showed 6
 )

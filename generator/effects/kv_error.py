@@ -9,7 +9,7 @@ from ..line_state import LineContext, LineState
 from ..twin import Twin
 from ..twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
-from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
 
 # the spectral model's table of tube voltage errors ends at 6 %; larger ones are counted from a voltage 5 % off
 _TABLE_END = 0.055
@@ -77,6 +77,5 @@ KV_ERROR = Effect(
     absorbed="numbers",
     reading=Reading(law_sd=0.05),  # 34 sealed voltages and filters were off by 2 % rms
     grid=Grid(shares=(0.6, 1.0)),
-    variation=Variation(exact=True),
     worked_in=_in_numbers,
 )

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line_state import LineContext, LineState
-from .effect import Displacement, Effect, FalseEvidence, Grid, InImages, Parameter, Placement, Reading, Shows
+from .effect import Displacement, Effect, Grid, InImages, Parameter, Placement, Reading, Shows
 
 
 def parts_px(strength_px: float, *, magnification_deg: float, rotation_deg: float) -> tuple[float, float, float]:
@@ -46,9 +46,6 @@ def _displace(state: LineState, parameters: Mapping[str, float], context: LineCo
         shift_px=(down + shift * math.cos(direction), right + shift * math.sin(direction)),
         distortion_px=(larger + radial, turned + turn),
     )
-
-
-_SHARP_EVIDENCE = 8.0  # two panels without effect, in squares of pixels, showed 6 of a tail
 
 
 def _parts(parameters: Mapping[str, float]) -> Displacement:
@@ -123,7 +120,7 @@ MISREGISTRATION = Effect(
     change=_displace,
     needs=("scene",),
     isolated_by="a grid of balls, or an edge in two directions",
-    shows=Shows(series=("object",), axis="sharpness", flats=False, places=True),
+    shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
     reading=Reading(probes=("displacement along rows", "displacement along columns")),  # where scenes lie is its shift
     grid=Grid(
@@ -137,7 +134,6 @@ MISREGISTRATION = Effect(
             ),
         ),
     ),
-    false_evidence=FalseEvidence(alone_sharp=_SHARP_EVIDENCE, edges_alone=True),
     images=InImages(left_out="picture and masks stay together"),
     placement=Placement(parts=_parts, without_shift=_without_shift, combined=_combined),
 )

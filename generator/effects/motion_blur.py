@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line_state import FloatArray, LineContext, LineState
-from .effect import Effect, FalseEvidence, Grid, Parameter, Shows
+from .effect import Effect, Grid, Parameter, Shows
 
 STATED_MS = 50.0  # the strength is the path in this time
 
@@ -52,10 +52,9 @@ MOTION_BLUR = Effect(
     change=_blur_by_motion,
     needs=("scene",),
     isolated_by="an edge at several exposure times of equal charge",
-    shows=Shows(series=("object",), axis="sharpness", flats=False, places=True),
+    shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
     timed=True,
     grid=Grid(shares=(0.0, 0.25, 0.5, 0.75, 1.0)),
     # as of a tail: two panels without effect, in squares of pixels, showed 6
-    false_evidence=FalseEvidence(alone_sharp=8.0, edges_alone=True),
 )

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ..line_state import FloatArray, LineContext, LineState
 from ._light_spread import order_parameter, spread_transfer
-from .effect import LIT_SERIES, AlwaysALittle, Effect, FalseEvidence, Grid, Parameter, Shows
+from .effect import LIT_SERIES, AlwaysALittle, Effect, Grid, Parameter, Shows
 
 _USUAL_ORDER = 1.0  # of the tail: a Lorentzian
 
@@ -56,10 +56,9 @@ MTF_TAIL = Effect(
     after_calibration=True,
     change=_add_tail,
     isolated_by="an edge close to the detector, with flats",
-    shows=Shows(series=LIT_SERIES, axis="sharpness", places=True),
+    shows=Shows(series=LIT_SERIES, axis="sharpness"),
     absorbed="noise",
     grid=Grid(shares=(0.8,), variants=({"reach_px": 0.84}, {"reach_px": 2.4})),
-    false_evidence=FalseEvidence(alone_sharp=8.0),  # two panels without effect, in squares of pixels, showed 6
     # screens have up to 20 % of their light there
     always_a_little=AlwaysALittle(name="tail of the spread", strength=10.0),
 )

@@ -35,7 +35,7 @@ from ...materials import (
 from .._fine_picture import find_borders
 from ..line_state import FloatArray, LineContext, LineState, needed
 from ..spectral_signal import mean_signal_energy_keV
-from .effect import Effect, FalseEvidence, Grid, Parameter, Shows
+from .effect import Effect, Grid, Parameter, Shows
 
 _HALF_PRODUCT_MM = 10.0
 _WATER_MM = 20.0
@@ -301,7 +301,7 @@ OBJECT_SCATTER = Effect(
     change=_add_scatter,
     needs=("spectral", "scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="a slab at two gaps to the detector, or a beam stop",
-    shows=Shows(series=("object",), axis="level", flats=False, places=True, like_thinner=True),
+    shows=Shows(series=("object",), axis="level", flats=False, like_thinner=True),
     absorbed="nothing",
     grid=Grid(
         shares=(0.8,),
@@ -315,5 +315,4 @@ OBJECT_SCATTER = Effect(
     ),
     # photons followed one by one reach shadows that no kernel fills: as a rule up to 3e-3 of its log evidence goes to another
     # effect, 0.016 where 40 % of scatter filled a wide field
-    false_evidence=FalseEvidence(leaves=0.02),
 )

@@ -67,5 +67,5 @@ OUTPUT_DRIFT = Effect(
         variants=tuple({"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)),
         refined=False,
     ),
-    variation=Variation(random="output", loosely_tied=3.0),  # slow and fast parts are not one law
+    variation=Variation(random="output"),
 )

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..line_state import LineContext, LineState
 from ..rounding import variance_before_rounding
-from .effect import EVERY_SERIES, Effect, FalseEvidence, Parameter, Reading, Shows, Variation
+from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, Variation
 
 
 def _lose_bits(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -40,6 +40,5 @@ QUANTISATION = Effect(
     absorbed="noise",
     reading=Reading(probes=("codes",), sd=0.06),
     variation=Variation(random="offset"),
-    false_evidence=FalseEvidence(unmistakable=True),
     lost_in_squares="codes are lost where frames are averaged",
 )

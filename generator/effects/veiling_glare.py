@@ -62,7 +62,7 @@ VEILING_GLARE = Effect(
     change=_add_glare,
     needs=("pixel_mm",),
     isolated_by="opaque discs of several sizes",
-    shows=Shows(series=LIT_SERIES, axis="sharpness", places=True, like_thinner=True),
+    shows=Shows(series=LIT_SERIES, axis="sharpness", like_thinner=True),
     either_onset=True,
     absorbed="noise",
     grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5})),

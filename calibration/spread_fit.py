@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
-from ..generator.psf import Spread
+from ..generator.psf import CLEAR_LAYER, Spread
 from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, smeared, spread_of_bins, usable
 
 FloatArray = NDArray[np.float64]
@@ -72,8 +72,10 @@ _FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
     "Gaussian with two widths": ("aperture", _LORENTZIAN, _WIDTHS),
     "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px2", *_TAIL)),
     "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px2", *_TAIL)),
+    "Gaussian with the tail of a clear layer": ("aperture", CLEAR_LAYER, ("sigma_px2", *_TAIL)),
     "two widths with a Lorentzian tail": ("aperture", _LORENTZIAN, (*_WIDTHS, *_TAIL)),
     "two widths with an exponential tail": ("aperture", _EXPONENTIAL, (*_WIDTHS, *_TAIL)),
+    "two widths with the tail of a clear layer": ("aperture", CLEAR_LAYER, (*_WIDTHS, *_TAIL)),
 }
 _SIMPLEST = "Gaussian, light collected in pixels"
 _MOST_GENERAL = "two widths with an exponential tail"

@@ -97,7 +97,7 @@ def build_problem(
     changes += [Change.of_twin(step) for step in steps_taken]
     changes += [
         replace(model.change(variant, variant.strengths[0]), label=variant.name)
-        for variant in always_a_little(model.base.noise.spread.value, side=side)
+        for variant in always_a_little(side=side)
     ]
     changes += without_each(model.base)
     unjudged = _of_quanta() if only_own_noise(session) else {}

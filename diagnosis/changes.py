@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLARED_SCINTILLATOR
 from ..generator.effects import EFFECTS, AppliedEffect, Effect
 from ..generator.effects.effect import Parameter
-from ..generator.psf import Spread
 from ..generator.twin import Estimate, SpectralPosterior, Twin
 from .coarse import in_squares
 from .curves import Curve
@@ -44,10 +43,6 @@ EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again th
 ROUGH_FIELDS = 24
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
 TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
-_LEAST_TAIL_SD = 0.05  # relative, as of the spread's width
-_TAIL_ORDER_STEP = 0.5  # between the two forms that calibration tries
-# screens spread light by several lengths (Swank 1973, doi:10.1063/1.1662257): so much of a tail may reach so much farther
-_FAR_SHARE, _FARTHER = 1.0 / 3.0, 3.0
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
 READ_NOISE_SD = 0.01  # rows and columns of a tenth each add 2 % to the variance, and calibration may leave them out
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
@@ -308,7 +303,6 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             step_sd=step / sd,
         )
     )
-    result += _tail_changes(twin)
     read = twin.noise.read_noise_DN
     sd = max(READ_NOISE_SD * read.value, (read.high - read.low) / (2 * 1.959964), 1e-3)
     noisier = Estimate(value=read.value + sd, low=read.low, high=max(read.high, read.value + sd))
@@ -337,52 +331,16 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
     return result
 
 
-def _tail_changes(twin: Twin) -> list[TwinChange]:
-    """Steps of what calibration left open of the spread's tail: its share, its reach, and its form, which flats hardly tell."""
-    spread = twin.noise.spread
-    value, intervals = spread.value, spread.intervals
-    if value.tail_share == 0.0:
-        return []
-    sds = {
-        name: max((known.high - known.low) / (2 * 1.959964), _LEAST_TAIL_SD * getattr(value, name))
-        for name in ("tail_share", "tail_px")
-        if (known := intervals.get(name)) is not None
-    }
-    steps = {name: {name: getattr(value, name) + sd} for name, sd in sds.items()} | {
-        "tail_order": {"tail_order": value.tail_order + _TAIL_ORDER_STEP}
-    }
-    return [
-        TwinChange(
-            name=f"{name} of the optical spread",
-            twin=replace(twin, noise=replace(twin.noise, spread=replace(spread, value=replace(value, **step)))),
-            parameters=None,
-            step_sd=1.0,
-        )
-        for name, step in steps.items()
-    ]
-
-
-def always_a_little(spread: Spread, *, side: int = 1) -> list[Variant]:
-    """What most lines have of some effects, at one prior standard deviation: tails of the spread, short and long ones.
-
-    A calibrated tail has one reach; of its light a part, as large as what is usual to be open, may reach farther.
-    """
+def always_a_little(*, side: int = 1) -> list[Variant]:
+    """What most lines have of some effects, at one prior standard deviation: tails of the spread, short and long ones."""
     result = []
     for effect in EFFECTS.values():
         little = effect.always_a_little
         if little is None:
             continue
-        every = variants_of(effect, side=side)
-        for variant in every:
+        for variant in variants_of(effect, side=side):
             name = f"{little.name}, {variant.name}"
             result.append(replace(variant, name=name, since="always", strengths=(little.strength,)))
-        if spread.tail_share > 0.0:
-            far = {"reach_px": _FARTHER * spread.tail_px}
-            light = 100.0 * _FAR_SHARE * spread.tail_share
-            parameters = {**every[0].parameters, **far}
-            result.append(
-                replace(every[0], name=f"far {little.name}", parameters=parameters, since="always", strengths=(light,))
-            )
     return result
 
 

@@ -60,7 +60,7 @@ def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) ->
 
 
 def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exact: bool = False) -> CurveFit:
-    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `_log_integral`.
+    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
 
     At each level the covariance is that of the law at its best strength, found in rounds.
 
@@ -72,7 +72,7 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
     """
     if curve.by_chance_alone:
         strengths, value = _fit_chance(observed, curve)
-        evidence = _log_integral(strengths, value, curve.low, curve.high)
+        evidence = log_integral(strengths, value, curve.low, curve.high)
         return CurveFit(
             curve=curve,
             by_level=np.full(len(levels.levels), evidence),
@@ -84,7 +84,7 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
     coarse = curve.log_strengths()
     sharp = _Terms(observed, curve)
     strengths, value = sharp.closed_in(coarse)
-    first = _log_integral(strengths, value, curve.low, curve.high)
+    first = log_integral(strengths, value, curve.low, curve.high)
     found = [(first, strengths, value)]
     if not exact:
         start = float(strengths[int(np.argmax(value))])
@@ -158,7 +158,7 @@ def _at_level(
         # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
         weak = strengths < _WEAK * best
         value = np.where(weak, sharp.at(strengths)[0], value)
-        found = _log_integral(strengths, value, curve.low, curve.high), strengths, value
+        found = log_integral(strengths, value, curve.low, curve.high), strengths, value
         before, best = best, float(strengths[int(np.argmax(value))])
         if abs(math.log(best / before)) < _SETTLED:
             break
@@ -189,9 +189,7 @@ def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArr
     return np.unique(np.concatenate([strengths, near[(near >= strengths[0]) & (near <= strengths[-1])]]))
 
 
-def _log_integral(
-    strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64], low: float, high: float
-) -> float:
+def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64], low: float, high: float) -> float:
     """log of the mean likelihood under a prior that is even in the logarithm of the strength.
 
     Most of it from low to high, IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.

@@ -147,12 +147,17 @@ def law_terms(
     return factors, own_variance(curve, strength, response, places, level)
 
 
-def log_leak(ratio: float, level: float) -> float:
-    """Log density, in the logarithm of it, of what a law leaves in the shape of another effect, over what it does itself.
+def leak_density(ratio: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
 
-    Half of a Gaussian's about 0 of standard deviation LEAK_SHARE times the level.
+    Half of a Gaussian about 0 of standard deviation LEAK_SHARE times the level; nothing where that is 0.
     """
     scale = LEAK_SHARE * level
-    if scale <= 0.0:
-        return -math.inf
-    return 0.5 * math.log(2.0 / math.pi) + math.log(ratio / scale) - 0.5 * (ratio / scale) ** 2
+    if scale == 0.0:
+        return np.zeros_like(ratio)
+    return np.asarray(math.sqrt(2.0 / math.pi) * ratio / scale * np.exp(-0.5 * (ratio / scale) ** 2))
+
+
+def leak_below(ratio: float, level: float) -> float:
+    """Probability that it is less."""
+    return 1.0 if level == 0.0 else math.erf(ratio / (LEAK_SHARE * level) / math.sqrt(2.0))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .curves import Curve
-from .discrepancy import FARTHEST_LEVEL, LEVELS
+from .discrepancy import LEVELS
 from .observed import Observed, Point
 from .pairs import Single, left_by_the_stronger, log_density, log_width, weigh_pairs
 from .unknown import Beyond, beyond
@@ -111,7 +111,7 @@ def weigh_hypotheses(
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves
         strong, leaves = left_by_the_stronger(observed, pair)
-        weighed.append((found.alone(strong), of_single + leaves))
+        weighed.append((found.alone(strong), of_single - math.log(count) + leaves))
     likest = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
     evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
@@ -144,7 +144,7 @@ class _Rests:
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
         """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
-        points = [fit.at_level(min(fit.level, FARTHEST_LEVEL)) for fit in fits]
+        points = [fit.point for fit in fits]
         evidence, found = self._beside(points)
         plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
         with_rest = evidence + math.log(LEVELS.rest_of_kind)

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve
+from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral
 from .curves import Curve
-from .discrepancy import FARTHEST_LEVEL, LEVELS, log_leak
+from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density
 from .observed import Observed, Point, slope
 
 _IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
@@ -76,43 +76,25 @@ def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: i
 def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Curve]], other: str) -> Pair:
     """Two effects by turns: `other` beside a first one at its point, then the first beside the other, and so on."""
     none = observed.log_likelihood
-    best: Pair | None = None
-    fits: dict[str, CurveFit] = {}
-    for _ in range(_TURNS):
+    best, fits = -math.inf, {}
+    for turn in range(_TURNS):
         beside = observed.beside(point)
         fit = _beside(beside, curves[other])
-        evidence = beside.log_likelihood - none + fit.log_evidence
         second = Point(curve=_own(curves[other], fit), strength=fit.best, level=fit.level)
         wide = beside.widened(fit.curve, fit.best, fit.level) or beside
+        evidence = beside.log_likelihood - none + fit.log_evidence
         evidence += log_density(point) + log_width(wide, [point], [second])
-        fits = {
-            point.curve.effect: fits.get(point.curve.effect, _as_fit(point)),
-            other: replace(fit, curve=second.curve),
-        }
-        if best is not None and evidence < best.log_evidence + _SETTLED:
+        fits[other] = replace(fit, curve=second.curve)
+        before, best = best, max(best, evidence)
+        if turn and evidence < before + _SETTLED:
             break
-        best = Pair(log_evidence=evidence, fits=fits)
         point, other = second, point.curve.effect
-    if best is None:
-        raise ValueError("no turn was taken")
-    return best
+    return Pair(log_evidence=best, fits=fits)
 
 
 def _own(curves: Sequence[Curve], fit: CurveFit) -> Curve:
     """The curve of a fit, in the units before any effect is taken off."""
     return next(curve for curve in curves if curve.variant == fit.curve.variant)
-
-
-def _as_fit(point: Point) -> CurveFit:
-    """Of an effect that has not been fitted beside another."""
-    return CurveFit(
-        curve=point.curve,
-        by_level=np.zeros(1),
-        log_evidence=0.0,
-        level=point.level,
-        strengths=point.strength * np.array([0.999, 1.0, 1.001]),
-        log_likelihood=np.zeros(3),
-    )
 
 
 def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
@@ -129,25 +111,23 @@ def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
 
 
 def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
-    """Which of two moves the probes more, and the log density of what its law leaves in the other's shape over that of the other.
+    """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
 
-    With that in place of the other's density the pair's evidence is that of the stronger one alone, off by so much.
+    The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
     """
-    points = {effect: fit.point for effect, fit in pair.fits.items()}
-    lengths = {effect: observed.length(point.curve, point.strength) for effect, point in points.items()}
+    lengths = {effect: observed.length(fit.curve, fit.best) for effect, fit in pair.fits.items()}
     strong, weak = sorted(lengths, key=lambda effect: -lengths[effect])
-    ratio = lengths[weak] / max(lengths[strong], 1e-12)
-    fit = pair.fits[strong]
-    levels, frequencies = LEVELS.levels[: len(fit.by_level)], LEVELS.of_kind[: len(fit.by_level)]
-    if len(fit.by_level) < 2:
-        leaves = log_leak(ratio, fit.level)
-    else:
-        shares = np.log(frequencies) + fit.by_level
-        shares -= np.logaddexp.reduce(shares)
-        leaves = float(
-            np.logaddexp.reduce([share + log_leak(ratio, level) for share, level in zip(shares, levels, strict=True)])
-        )
-    return strong, leaves - log_density(replace(points[weak], level=0.0)) + math.log(LEVELS.of_kind[0])
+    first, second = pair.fits[strong], pair.fits[weak]
+    ratios = lengths[weak] / max(lengths[strong], 1e-12) * second.strengths / second.best
+    shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
+    shares = np.exp(shares - np.logaddexp.reduce(shares))
+    density = sum(share * leak_density(ratios, level) for share, level in zip(shares, LEVELS.levels, strict=False))
+    low = sum(share * leak_below(float(ratios[0]), level) for share, level in zip(shares, LEVELS.levels, strict=False))
+    top = float(second.log_likelihood.max())
+    likelihood = np.exp(second.log_likelihood - top)
+    left = float(np.trapezoid(likelihood * density, np.log(second.strengths))) + float(likelihood[0]) * low
+    there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
+    return strong, top + math.log(max(left, 1e-300)) - there
 
 
 def log_density(point: Point, *, another: bool = False) -> float:

@@ -5,8 +5,9 @@ Transfer function along rows and columns (f in cycles per pixel):
     H(f) = (1 - w) exp(-2 pi^2 sigma^2 q) + w / (1 + (2 pi L)^2 q)^p,    q = a f_row^2 + f_column^2 / a
 
 sigma: width of the Gaussian core; w: share of the light in a tail of reach L; p: its order, 1 for the Lorentzian transfer of
-screens, 3/2 for light that falls off as exp(-r / L); a: width along rows over width along columns. With w = 0 and a = 1 it is
-the Gaussian of most simulators, which factors into two axes.
+screens, 3/2 for light that falls off as exp(-r / L). Order 0 stands for exp(-2 pi L sqrt(q)), light that falls off as
+(r^2 + L^2)^(-3/2): that of a point a distance L behind a clear layer. a: width along rows over width along columns. With w = 0
+and a = 1 it is the Gaussian of most simulators, which factors into two axes.
 
 Two descriptions of how quanta meet pixels exist in the field, and below one pixel they differ:
 
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 
 PSF_MODELS = ("aperture", "sampled")
+CLEAR_LAYER = 0.0  # order of the tail that a clear layer makes
 FloatArray = NDArray[np.float64]
 _GRID = 64  # cells of the noise power spectrum per axis
 _REACH = 14  # of a kernel over both axes, px
@@ -86,7 +88,7 @@ class Spread:
         if self.tail_share == 0.0:
             return np.asarray(core)
         square = self.aspect * f_row**2 + f_column**2 / self.aspect
-        tail = (1.0 + (2.0 * np.pi * self.tail_px) ** 2 * square) ** -self.tail_order
+        tail = _tail_transfer(self, square)
         return np.asarray((1.0 - self.tail_share) * core + self.tail_share * tail)
 
     def noise_power(self, cells: int = _GRID) -> FloatArray:
@@ -141,6 +143,14 @@ class Spread:
         return float(np.sum(kernel**2 * rho) / np.sum(kernel**3))
 
 
+def _tail_transfer(spread: Spread, square: FloatArray) -> FloatArray:
+    """Of a tail, at squared frequencies q (see the module)."""
+    reach = 2.0 * np.pi * spread.tail_px
+    if spread.tail_order == CLEAR_LAYER:
+        return np.asarray(np.exp(-reach * np.sqrt(square)))
+    return np.asarray((1.0 + reach**2 * square) ** -spread.tail_order)
+
+
 @lru_cache(maxsize=64)
 def _noise_power(spread: Spread, cells: int) -> FloatArray:
     widths = (spread.sigma_px * math.sqrt(spread.aspect), spread.sigma_px / math.sqrt(spread.aspect))
@@ -152,7 +162,7 @@ def _noise_power(spread: Spread, cells: int) -> FloatArray:
         every = (np.arange(cells // 2 + 1)[:, None] / cells + order).ravel()
         gaussians = [base_transfer_1d(spread.model, width, every) for width in widths]
         square = spread.aspect * every[:, None] ** 2 + every[None, :] ** 2 / spread.aspect
-        light = tail * (1.0 + (2.0 * np.pi * spread.tail_px) ** 2 * square) ** -spread.tail_order
+        light = tail * _tail_transfer(spread, square)
         light *= 2.0 * core * np.outer(*gaussians) + light
         if spread.model == "aperture":
             light *= np.outer(np.sinc(every), np.sinc(every)) ** 2

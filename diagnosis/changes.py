@@ -303,6 +303,7 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             step_sd=step / sd,
         )
     )
+    result += _tail_changes(twin)
     read = twin.noise.read_noise_DN
     sd = max(READ_NOISE_SD * read.value, (read.high - read.low) / (2 * 1.959964), 1e-3)
     noisier = Estimate(value=read.value + sd, low=read.low, high=max(read.high, read.value + sd))
@@ -329,6 +330,33 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
         )
     )
     return result
+
+
+def _tail_changes(twin: Twin) -> list[TwinChange]:
+    """Steps of what calibration left open of the tail of the spread: its share and its reach."""
+    spread = twin.noise.spread
+    value = spread.value
+    if value.tail_share == 0.0:
+        return []
+    steps = {}
+    for name in ("tail_share", "tail_px"):
+        known = spread.intervals.get(name)
+        found = 0.0 if known is None else (known.high - known.low) / (2 * 1.959964)
+        steps[name] = max(found, SPREAD_SD * getattr(value, name))
+    return [
+        TwinChange(
+            name=f"{name} of the optical spread",
+            twin=replace(
+                twin,
+                noise=replace(
+                    twin.noise, spread=replace(spread, value=replace(value, **{name: getattr(value, name) + step}))
+                ),
+            ),
+            parameters=None,
+            step_sd=1.0,
+        )
+        for name, step in steps.items()
+    ]
 
 
 def always_a_little(*, side: int = 1) -> list[Variant]:

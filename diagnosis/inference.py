@@ -23,7 +23,7 @@ from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .curves import Curve
 from .discrepancy import LEVELS
 from .observed import Observed, Point
-from .pairs import Single, left_by_the_stronger, log_density, log_width, weigh_pairs
+from .pairs import Single, left_by_the_stronger, log_prior, weigh_pairs
 from .unknown import Beyond, beyond
 
 UNKNOWN = "unknown_effect"
@@ -170,7 +170,7 @@ class _Rests:
             beside = beside.beside(point)
         found = beyond(beside, self._parts, self._names)
         evidence = beside.log_likelihood - self._observed.log_likelihood + found.log_evidence
-        evidence += sum(log_density(point, another=another) for point in points) + log_width(beside, points)
+        evidence += sum(log_prior(point, another=another) for point in points)
         return evidence, found
 
 

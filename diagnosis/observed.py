@@ -6,10 +6,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
 from .curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
+
+FREE_SD = (
+    1.0  # of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +78,14 @@ class Observed:
         )
 
     def beside(self, point: Point) -> "Observed":
-        """What is left once an effect stands there."""
-        curve = self.scaled(point.curve)
-        wide = self.widened(curve, point.strength, point.level) or self
-        return replace(wide, residual=wide.residual - wide.scaled(point.curve).response(point.strength))
+        """What is left once an effect stands there, its strength free about that: FREE_SD in its logarithm, as a Gaussian."""
+        wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
+        own = wide.scaled(point.curve)
+        free = FREE_SD * slope(own, point.strength)[:, None]
+        nuisances = wide.nuisances
+        if np.any(free):
+            nuisances = nuisances.over(np.ones(len(free)), free, csc_array((0, len(free))))
+        return replace(wide, residual=wide.residual - own.response(point.strength), nuisances=nuisances)
 
     def of_probes(self, probes: NDArray[np.bool_]) -> "Observed":
         """Of some of its probes (probe,)."""

@@ -13,7 +13,7 @@ import numpy as np
 from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral
 from .curves import Curve
 from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density
-from .observed import Observed, Point, slope
+from .observed import FREE_SD, Observed, Point
 
 _IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
 _TURNS, _SETTLED = 6, 0.1  # in which two settle, and gain of log evidence that ends them
@@ -81,9 +81,7 @@ def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Cur
         beside = observed.beside(point)
         fit = _beside(beside, curves[other])
         second = Point(curve=_own(curves[other], fit), strength=fit.best, level=fit.level)
-        wide = beside.widened(fit.curve, fit.best, fit.level) or beside
-        evidence = beside.log_likelihood - none + fit.log_evidence
-        evidence += log_density(point) + log_width(wide, [point], [second])
+        evidence = beside.log_likelihood - none + log_prior(point) + fit.log_evidence
         fits[other] = replace(fit, curve=second.curve)
         before, best = best, max(best, evidence)
         if turn and evidence < before + _SETTLED:
@@ -130,8 +128,11 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     return strong, top + math.log(max(left, 1e-300)) - there
 
 
-def log_density(point: Point, *, another: bool = False) -> float:
-    """Log of a level's frequency (of laws of the kind, or of `another`) times the density of a strength's logarithm, even in it."""
+def log_prior(point: Point, *, another: bool = False) -> float:
+    """Log of what a point takes of the prior: how often laws (of the kind, or of `another`) are off by its level, and its strengths'.
+
+    Strengths are even in their logarithm; those about the point are as free as `Observed.beside` leaves them.
+    """
     curve, log = point.curve, math.log
     frequencies = LEVELS.of_another if another else LEVELS.of_kind
     level = frequencies[int(np.argmin(np.abs(np.array(LEVELS.levels) - point.level)))]
@@ -140,25 +141,4 @@ def log_density(point: Point, *, another: bool = False) -> float:
     else:
         low, high = curve.reach
         density = IMPLAUSIBLE / (log(high / low) - log(curve.high / curve.low))
-    return log(level) + log(density)
-
-
-def log_width(beside: Observed, points: Sequence[Point], free: Sequence[Point] = ()) -> float:
-    """Log of the integral over the logarithms of strengths about `points`, as a Gaussian's, in what is left beside them.
-
-    free: points whose strengths take what they can first. No strength counts for more than all that are tried.
-    """
-    both = [*points, *free]
-    rows = np.stack([slope(point.curve, point.strength) for point in both]) / beside.units
-    gram = beside.nuisances.inner(rows, rows)
-    count, total = len(points), 0.0
-    for number, point in enumerate(points):
-        # what the strengths before this one, and the free ones, leave of it
-        others = [*range(number), *range(count, len(both))]
-        own = float(gram[number, number])
-        if others:
-            across = gram[number, others]
-            own -= float(across @ np.linalg.solve(gram[np.ix_(others, others)] + 1e-9 * np.eye(len(others)), across))
-        low, high = point.curve.reach
-        total += min(0.5 * math.log(2.0 * math.pi / max(own, 1e-12)), math.log(math.log(high / low)))
-    return total
+    return log(level) + log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)

@@ -6,7 +6,6 @@ of k times as large as what it does. Levels are no choice for a session: evidenc
 averaged over them, with the frequencies that laws of many shapes have shown (`discrepancy.toml`).
 """
 
-import math
 import tomllib
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -147,17 +146,31 @@ def law_terms(
     return factors, own_variance(curve, strength, response, places, level)
 
 
-def leak_density(ratio: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:
     """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
 
-    Half of a Gaussian about 0 of standard deviation LEAK_SHARE times the level; nothing where that is 0.
+    Even from `least`, below which it does not show, to LEAK_SHARE times the level, and falling as a Gaussian beyond; nothing where a
+    law of this level leaves nothing that shows.
     """
-    scale = LEAK_SHARE * level
-    if scale == 0.0:
+    most = LEAK_SHARE * level
+    if most <= least:
         return np.zeros_like(ratio)
-    return np.asarray(math.sqrt(2.0 / math.pi) * ratio / scale * np.exp(-0.5 * (ratio / scale) ** 2))
+    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / most) ** 2)) / _leak_width(most, least))
 
 
-def leak_below(ratio: float, level: float) -> float:
-    """Probability that it is less."""
-    return 1.0 if level == 0.0 else math.erf(ratio / (LEAK_SHARE * level) / math.sqrt(2.0))
+def leak_below(ratio: float, level: float, least: float) -> float:
+    """Probability that it is less, or does not show at all."""
+    most = LEAK_SHARE * level
+    if most <= least:
+        return 1.0
+    if ratio <= least:
+        return 0.0
+    inside = np.geomspace(least, ratio, 200)
+    return float(np.trapezoid(leak_density(inside, level, least), np.log(inside)))
+
+
+def _leak_width(most: float, least: float) -> float:
+    """Integral of exp(-(x / most)^2 / 2) over the logarithm of x from `least` on: E1((least / most)^2 / 2) / 2."""
+    from scipy.special import exp1
+
+    return float(0.5 * exp1(0.5 * (least / most) ** 2))

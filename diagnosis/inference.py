@@ -103,6 +103,7 @@ def weigh_hypotheses(
             found = rests.of_kind(found, [single.best])
             alike.append(rests.of_another(single))
         weighed.append((found, of_single))
+    leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
     for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
@@ -111,7 +112,10 @@ def weigh_hypotheses(
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves
         strong, leaves = left_by_the_stronger(observed, pair)
-        weighed.append((found.alone(strong), of_single - math.log(count) + leaves))
+        alone = replace(found.alone(strong), log_evidence=found.log_evidence + leaves)
+        if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
+            leaks[strong] = alone
+    weighed += [(item, of_single) for item in leaks.values()]
     likest = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
     evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)

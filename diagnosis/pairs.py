@@ -119,8 +119,10 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     ratios = lengths[weak] / max(lengths[strong], 1e-12) * second.strengths / second.best
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
-    density = sum(share * leak_density(ratios, level) for share, level in zip(shares, LEVELS.levels, strict=False))
-    low = sum(share * leak_below(float(ratios[0]), level) for share, level in zip(shares, LEVELS.levels, strict=False))
+    least = 1.0 / max(lengths[strong], 1.0)  # a standard deviation
+    levels = list(zip(shares, LEVELS.levels, strict=False))
+    density = sum(share * leak_density(ratios, level, least) for share, level in levels)
+    low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
     top = float(second.log_likelihood.max())
     likelihood = np.exp(second.log_likelihood - top)
     left = float(np.trapezoid(likelihood * density, np.log(second.strengths))) + float(likelihood[0]) * low

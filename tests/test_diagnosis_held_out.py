@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from raytwin.diagnosis.curves import Curve
 from raytwin.diagnosis.held_out import folds_of, held_out
 from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
-from raytwin.diagnosis.local_nuisances import LocalNuisances
 
 
 def problem(*rows, calibrating=0):
@@ -57,21 +57,38 @@ def test_two_exposures_that_occur_once_are_one_in_either_half():
     np.testing.assert_array_equal(folds_of(problem(*once)), [0, 1])
 
 
-@pytest.mark.parametrize(("alternating", "left"), [(False, None), (True, 1.0)])
-def test_what_nuisances_tell_once_they_see_it_is_no_gap_that_an_explanation_leaves(alternating, left):
+def test_a_gap_that_nothing_explains_is_left_and_what_is_planted_and_named_is_gone():
     flats = problem(*[("flat", None, 60.0, 20.0)] * 4)
     probes, series = 20, len(flats.views)
     size = probes * series
     series_of = np.repeat(np.arange(series), probes)
-    departs = 14.0 * (series_of == 1)
-    if alternating:
-        departs *= np.where(np.arange(size) % 2, 1.0, -1.0)
-    flats.residual = np.random.default_rng(1).standard_normal(size) + departs
-    flats.factors = 2.0 * (series_of == 1)[:, None]  # of the second series alone, and pulled by 7 of its sds
-    flats.blocks, flats.parts, flats.series_of = series_of, series_of, series_of
+    pattern = np.where(np.arange(size) % 2, 1.0, -1.0)
+    flats.residual = np.random.default_rng(1).standard_normal(size) + 14.0 * pattern
+    flats.factors = 2.0 * (series_of == 1)[:, None]
+    flats.blocks = flats.parts = flats.groups = flats.places = flats.series_of = series_of
     flats.noise = np.ones(size)
     flats.names = [SimpleNamespace(axis="level")] * size
     nobody = Hypothesis(effects=(UNKNOWN,), probability=1.0, log_evidence=0.0)
-    gap, _, _ = held_out(flats, nobody, LocalNuisances(flats.factors, flats.blocks), np.random.default_rng(0))
-    assert gap.before > 2.0
-    assert gap.left == left
+    gap, _, shares = held_out(flats, nobody, np.random.default_rng(0))
+    assert gap.before == gap.after > 10.0
+    assert shares == {}
+    curve = Curve(
+        effect="stripes",
+        variant="",
+        parameters={},
+        low=1.0,
+        high=100.0,
+        strengths=np.array([1.0]),
+        responses=pattern[None, :],
+    )
+    found = Hypothesis(
+        effects=("stripes",),
+        probability=1.0,
+        log_evidence=0.0,
+        strengths={"stripes": (14.0, 13.0, 15.0)},
+        variants={"stripes": curve},
+        levels={"stripes": 0.0},
+    )
+    gap, _, shares = held_out(flats, found, np.random.default_rng(0))
+    assert gap.after < 1.5
+    assert shares["stripes"][0] == pytest.approx(1.0, abs=0.05)

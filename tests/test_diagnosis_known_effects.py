@@ -199,8 +199,6 @@ class Gap:
     before: float
     after: float
     shrinks_by: float | None = 0.5
-    left: float = 0.5
-    contradicted: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""What a measurement set can tell apart, refinement and veto, on problems whose truth is planted."""
+"""What a measurement set can tell apart, and refinement, on problems whose truth is planted."""
 
 from dataclasses import fields, replace
 from types import SimpleNamespace
@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.diagnosis import veto
 from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.curve_fits import fit_effects
 from raytwin.diagnosis.curves import Curve, node_weights
-from raytwin.diagnosis.doubts import _elsewhere
-from raytwin.diagnosis.held_out import Gap, contradicted_share
-from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
+from raytwin.diagnosis.inference import weigh_hypotheses
 from raytwin.diagnosis.judgement import _threshold
 from raytwin.diagnosis.nuisances import Nuisances
+from raytwin.diagnosis.observed import Observed
 from raytwin.diagnosis.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
-from raytwin.diagnosis.probes import ALONG_ROWS
 from raytwin.diagnosis.problem import Problem
 from raytwin.diagnosis.refine import refine
 from raytwin.diagnosis.seen import Blocks
 from raytwin.diagnosis.series_block import jitter_of
-from raytwin.diagnosis.veto import Misfit, is_refused, leaves_too_much, misfit_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects._light_spread import spread_transfer
 from raytwin.generator.effects.misregistration import parts_px
@@ -143,16 +140,14 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
         }
 
     curves = [item.curve(answer([item])[0]) for item in variants]
-    nuisances = Nuisances(np.zeros((PROBES, 1)))
     groups = np.zeros(PROBES, dtype=np.intp)
-    hypotheses = weigh_hypotheses(residual, curves=curves, nuisances=nuisances, groups=groups, group_names=("all",))
+    observed = Observed(residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups)
+    hypotheses = weigh_hypotheses(observed, fit_effects(observed, curves), parts=groups, part_names=("all",))
     return refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in variants},
         curves=curves,
-        residual=residual,
-        nuisances=nuisances,
-        groups=groups,
+        observed=observed,
         respond=answer,
         whitener=SimpleNamespace(apply=lambda vectors: vectors),
         blocks=blocks,
@@ -287,107 +282,6 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
             assert onsets[name] == ({"calibration"} if name in taken_in_whole else {"always", "calibration"})
 
 
-def test_blurs_and_strays_can_seem_to_displace_a_scene_and_what_is_even_or_electronic_cannot():
-    displacing = {name for name, effect in EFFECTS.items() if effect.shows.places}
-    assert displacing == {
-        "object_scatter",
-        "veiling_glare",
-        "focal_spot",
-        "mtf_tail",
-        "k_fluorescence",
-        "motion_blur",
-        "misregistration",
-        "composition_error",
-    }
-
-
-def test_what_an_effect_cannot_move_whatever_its_law_goes_by_series_and_by_statistic():
-    flat = SeriesRequest(kind="flat", setting=None, frames=5, exposure_ms=50.0)
-    requests = [replace(flat, kind=kind) for kind in ("dark", "flat", "object")]
-    statistics = ("mean frame", "outliers", "outliers in any series", ALONG_ROWS)
-    effects = ("image_lag", "bad_pixels", "gain_map_error", "object_scatter", "kv_error")
-    session = SimpleNamespace(
-        names=[SimpleNamespace(statistic=statistic) for _ in requests for statistic in statistics],
-        views=[SimpleNamespace(session=SimpleNamespace(request=request)) for request in requests],
-        series_of=np.repeat(np.arange(3), len(statistics)),
-        variants=[SimpleNamespace(effect=effect) for effect in effects],
-    )
-    found = {effect: part.reshape(3, len(statistics)) for effect, part in _elsewhere(session).items()}
-    # ghosts lie in all series, but neither make pixels stand out of their neighbours nor move a scene
-    assert found["image_lag"].tolist() == 3 * [[False, True, True, True]]
-    assert found["bad_pixels"].tolist() == 3 * [[False, False, False, True]]
-    assert not found["gain_map_error"][:, 1:3].any()
-    # scatter comes from objects, which it can seem to move; a beam does nothing to a dark
-    assert found["object_scatter"].tolist() == [4 * [True], 4 * [True], [False, True, True, False]]
-    assert found["kv_error"].tolist() == [4 * [True], *(2 * [[False, True, True, True]])]
-
-
-def explanation(effect="veiling_glare", strength=10.0):
-    """One effect at a strength of a plausible range from 1 to 100."""
-    return Hypothesis(
-        effects=(effect,),
-        probability=0.9,
-        log_evidence=100.0,
-        strengths={effect: (strength, 0.9 * strength, 1.1 * strength)},
-        variants={effect: curve(effect, axis(0))},
-    )
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "vetoed"), [(30.0, 16.0, True), (30.0, 4.0, False), (1.1, 1.05, False), (2.5, 1.0, False)]
-)
-def test_an_explanation_must_take_out_most_of_a_clear_gap(before, after, vetoed):
-    assert leaves_too_much(Gap(before=before, after=after, floor=0.6, shrinks_by=None), explanation()) is vetoed
-
-
-@pytest.mark.parametrize(
-    ("left", "strength", "vetoed"), [(0.1, 10.0, False), (0.35, 10.0, True), (0.8, 10.0, True), (0.1, 120.0, True)]
-)
-def test_one_series_far_out_is_no_veto_where_the_typical_probe_is_explained_by_a_plausible_strength(
-    left, strength, vetoed
-):
-    gap = Gap(before=47.0, after=36.0, floor=0.6, shrinks_by=None, left=left)
-    assert leaves_too_much(gap, explanation(strength=strength)) is vetoed
-
-
-@pytest.mark.parametrize(
-    ("strength", "unfit", "refused"),
-    [(10.0, 0.08, False), (120.0, 0.08, True), (120.0, 0.02, False), (0.5, 0.08, False), (10.0, 0.12, True)],
-)
-def test_an_effect_stronger_than_is_plausible_must_leave_less(strength, unfit, refused, monkeypatch):
-    monkeypatch.setattr(veto, "misfit_of", lambda problem, leading: Misfit(left=unfit, pulled=0.0))
-    gap = Gap(before=30.0, after=1.0, floor=0.6, shrinks_by=None, left=0.05)
-    assert is_refused(None, gap, explanation(strength=strength)) is refused
-
-
-@pytest.mark.parametrize(
-    ("effect", "after", "left", "vetoed"),
-    [
-        ("kv_error", 2.4, 0.15, True),
-        ("kv_error", 0.8, 0.25, False),
-        ("image_lag", 2.4, 0.15, False),
-    ],
-)
-def test_a_voltage_must_explain_nearly_all_of_its_gap_and_a_trap_law_need_not(effect, after, left, vetoed):
-    gap = Gap(before=5.8, after=after, floor=0.6, shrinks_by=None, left=left)
-    assert leaves_too_much(gap, explanation(effect)) is vetoed
-
-
-def test_an_explanation_that_sees_a_gap_where_there_is_none_is_refused_however_much_it_explains():
-    rng = np.random.default_rng(2)
-    places = np.repeat(np.arange(4), 50)
-    seen, nothing = np.full(50, 40.0), rng.standard_normal(50)
-    before = np.concatenate([seen, seen, nothing, nothing])
-    off_by_a_third = np.concatenate([0.3 * seen, -0.3 * seen, nothing, nothing])
-    elsewhere = np.concatenate([0.1 * seen, 0.1 * seen, 30.0 + nothing, nothing])
-    assert contradicted_share(before, off_by_a_third, places) == 0.0
-    found = contradicted_share(before, elsewhere, places)
-    assert found == pytest.approx(900.0 / 3200.0, rel=0.05)
-    gap = Gap(before=28.0, after=15.0, floor=0.7, shrinks_by=None, left=0.1, contradicted=found)
-    assert leaves_too_much(gap, explanation())
-    assert not leaves_too_much(replace(gap, contradicted=0.0), explanation())
-
-
 def test_a_repeat_that_would_settle_a_tie_is_proposed_and_one_that_would_not_gives_way_to_what_isolates():
     good = Repeat(series="dark_100ms", times=4, separation=2.0, separation_then=3.9)
     assert repeat_text(good, ["dark_drift"], ["image_lag"]).startswith(
@@ -469,67 +363,6 @@ def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(
             assert np.array_equal(getattr(with_it, name), getattr(without, name)), (request.kind, name)
     # objects show whatever there is
     assert scene.kind in EFFECTS[effect].shows.series
-
-
-def gain_found(residual, made):
-    """A problem of 600 probes in twenty groups, without nuisances, and a hypothesis that a curve explains it at 10."""
-    groups = np.repeat(np.arange(20), 30)
-    problem = SimpleNamespace(residual=residual, factors=np.zeros((residual.size, 1)), groups=groups, blocks=groups)
-    return problem, SimpleNamespace(
-        effects=("gain_map_error",), variants={"gain_map_error": made}, strengths={"gain_map_error": (10.0, 9.0, 11.0)}
-    )
-
-
-def test_what_an_explanation_leaves_beyond_its_law_is_a_share_of_what_there_was():
-    rng = np.random.default_rng(8)
-    size = 600
-    direction, other = np.zeros(size), np.zeros(size)
-    direction[:300] = rng.standard_normal(300)
-    other[300:] = rng.standard_normal(300)
-
-    def misfit(left, off=0.0):
-        response = 30.0 * direction
-        made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
-        noise = 0.7 * rng.standard_normal(size)  # floors make probes' standard deviations wider than their noise
-        residual = response * (1.0 + off) + left * other + noise
-        return misfit_of(*gain_found(residual, made))
-
-    assert misfit(0.0).left == 0.0
-    # a law that is off by a tenth leaves nothing that it may not
-    assert misfit(0.0, off=0.1).left < 0.01
-    assert misfit(30.0 * np.sqrt(0.5)).left == pytest.approx(0.5 / 1.5, abs=0.06)
-    assert misfit(30.0 * np.sqrt(0.3)).refused
-    assert not misfit(30.0 * np.sqrt(0.03)).refused
-
-
-@pytest.mark.parametrize(("size_of_gap", "refused"), [(2.0, False), (30.0, True)])
-def test_a_gap_no_larger_than_noise_may_be_is_not_refused_for_what_the_noise_leaves(size_of_gap, refused):
-    rng = np.random.default_rng(11)
-    size = 600
-    direction, other = np.zeros(size), np.zeros(size)
-    direction[:20] = rng.standard_normal(20)
-    other[300:] = rng.standard_normal(300)
-    response = size_of_gap * direction
-    made = replace(curve("gain", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]))
-    # noise of 0.85, where 0.77 is usual; as large a share of the gap is something else in both
-    residual = response + 0.1 * size_of_gap * other + 0.85 * rng.standard_normal(size)
-    assert misfit_of(*gain_found(residual, made)).refused == refused
-
-
-@pytest.mark.parametrize(("times", "refused"), [(1.0, False), (6.0, True)])
-def test_what_an_effect_does_by_chance_may_not_be_pulled_far_beyond_what_chance_does(times, refused):
-    rng = np.random.default_rng(9)
-    size = 600
-    waves = 0.3 * rng.standard_normal((size, 30))
-    response = np.zeros(size)
-    response[:50] = 3.0
-    made = replace(
-        curve("gain_map_error", np.zeros(PROBES)), responses=response[None, :], strengths=np.array([10.0]), spread=waves
-    )
-    residual = response + 10.0 * waves @ (times * rng.standard_normal(30)) + 0.7 * rng.standard_normal(size)
-    found = misfit_of(*gain_found(residual, made))
-    assert found.pulled == pytest.approx(times, rel=0.35)
-    assert found.refused == refused
 
 
 @pytest.mark.parametrize("alike", [0.0, 0.9])

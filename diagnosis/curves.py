@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _pair_loops
+from . import _node_loops
 
 LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
 STRENGTH_NODES = 37
@@ -88,4 +88,4 @@ class Curve:
 
 def node_weights(nodes: NDArray[np.float64], strengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights (strength, node) with which responses at nodes > 0 add up: Lagrange through the four nearest of 0 and nodes."""
-    return np.asarray(_pair_loops.node_weights(nodes, strengths))
+    return np.asarray(_node_loops.node_weights(nodes, strengths))

@@ -15,7 +15,8 @@ from .coarse import unseen_in_squares
 from .inference import UNKNOWN, Hypothesis, Priors
 from .judgement import judge
 from .known_effects import already_there, lasting
-from .preparation import calibrated_twin, mislabelled, prepare_session
+from .preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
+from .problem import Problem
 from .readings import Suspect
 from .sought_anew import is_to_be_asked, with_sought_anew
 
@@ -49,17 +50,7 @@ def diagnose(
     unseen = unseen_in_squares() if session.factor > 1 else {}
 
     def judged(with_effects: Twin, left_out: Sequence[str]) -> Diagnosis:
-        problem = build_problem(
-            session.acquisition,
-            with_effects,
-            variants=catalogue_variants(without=left_out, side=session.factor),
-            calibrated_elsewhere=session.calibrated_elsewhere,
-            exposed=session.exposed,
-            ends_at_zero=session.ends_at_zero,
-            spectral_point=session.spectral_point,
-            side=session.factor,
-            progress=progress,
-        )
+        problem = problem_of(session, with_effects, without=left_out, progress=progress)
         return judge(problem, with_effects, rng=rng, priors=priors, progress=progress)
 
     try:
@@ -92,6 +83,27 @@ def diagnose(
             progress("calibration with all pixels")
         twin = calibrated_twin(session.all_pixels, rng=rng)
     return in_pixels(result, twin=twin, factor=session.factor)
+
+
+def problem_of(
+    session: PreparedSession,
+    twin: Twin,
+    *,
+    without: Sequence[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Problem:
+    """What inference is asked about a prepared session, with a twin and the catalogue less the effects `without`."""
+    return build_problem(
+        session.acquisition,
+        twin,
+        variants=catalogue_variants(without=without, side=session.factor),
+        calibrated_elsewhere=session.calibrated_elsewhere,
+        exposed=session.exposed,
+        ends_at_zero=session.ends_at_zero,
+        spectral_point=session.spectral_point,
+        side=session.factor,
+        progress=progress,
+    )
 
 
 def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:

@@ -146,6 +146,14 @@ def law_terms(
     return factors, own_variance(curve, strength, response, places, level)
 
 
+def log_rest(ratio: float) -> float:
+    """Log prior, but for a constant, of a rest so many times as long as what the laws beside it do: a Gaussian about 0.
+
+    Its standard deviation is LEAK_SHARE: what is as large as that is no rest of a law that explains it.
+    """
+    return -0.5 * (ratio / LEAK_SHARE) ** 2
+
+
 def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:
     """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
 

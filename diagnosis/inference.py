@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .curves import Curve
-from .discrepancy import LEVELS
+from .discrepancy import LEVELS, log_rest
 from .observed import Observed, Point
 from .pairs import Single, left_by_the_stronger, log_prior, weigh_pairs
 from .unknown import Beyond, beyond
@@ -77,6 +77,7 @@ def weigh_hypotheses(
     parts: NDArray[np.intp],
     part_names: Sequence[str],
     priors: Priors | None = None,
+    rests: bool = True,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -85,13 +86,15 @@ def weigh_hypotheses(
         fits: of each effect's curves to it; several curves of one effect are variants with equal prior.
         parts, part_names: families of probes (probe,) in which an unknown effect may show.
         priors: of the kinds of hypothesis.
+        rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
     """
     priors = priors or Priors()
     singles = _singles(fits)
     count = max(len(singles), 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     none = beyond(observed, parts, part_names)
-    rests = _Rests(observed, parts, part_names)
+    looked_at = _WITH_REST if rests else 0
+    beside = _Rests(observed, parts, part_names)
     weighed = [(Hypothesis(effects=(), probability=0.0, log_evidence=none.allowed), math.log(priors.none))]
     of_single = math.log(priors.single / count)
     alike = []
@@ -99,16 +102,16 @@ def weigh_hypotheses(
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
-        if effect in ranked[:_WITH_REST]:
-            found = rests.of_kind(found, [single.best])
-            alike.append(rests.of_another(single))
+        if effect in ranked[:looked_at]:
+            found = beside.of_kind(found, [single.best])
+            alike.append(beside.of_another(single))
         weighed.append((found, of_single))
     leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
     for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
-        if number < _WITH_REST:
-            found = rests.of_kind(found, list(pair.fits.values()))
+        if number < looked_at:
+            found = beside.of_kind(found, list(pair.fits.values()))
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves
         strong, leaves = left_by_the_stronger(observed, pair)
@@ -138,6 +141,13 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
     return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
+def evidence_with_rest(
+    observed: Observed, points: Sequence[Point], *, parts: NDArray[np.intp], part_names: Sequence[str]
+) -> float:
+    """Log evidence over none of effects at their points with a rest beside them, whatever it is."""
+    return _Rests(observed, parts, part_names).beside(points)[0]
+
+
 class _Rests:
     """What laws leave beside effects, in families of probes."""
 
@@ -149,9 +159,10 @@ class _Rests:
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
         """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
         points = [fit.point for fit in fits]
-        evidence, found = self._beside(points)
+        evidence, found = self.beside(points)
         plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
-        with_rest = evidence + math.log(LEVELS.rest_of_kind)
+        moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in points))
+        with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(found.length / max(moved, 1.0))
         return replace(
             hypothesis,
             log_evidence=float(np.logaddexp(plain, with_rest)),
@@ -163,11 +174,11 @@ class _Rests:
         plain = log_mean_exp(
             np.array([fit.averaged(LEVELS.of_another) for fit in single.fits if len(fit.by_level) > 1])
         )
-        evidence, _ = self._beside([single.best.at_level(LEVELS.levels[-1])], another=True)
+        evidence, _ = self.beside([single.best.at_level(LEVELS.levels[-1])], another=True)
         share = LEVELS.rest_of_another
         return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
 
-    def _beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
+    def beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
         """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
         beside = self._observed
         for point in points:

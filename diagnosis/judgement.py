@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..generator.effects import EFFECTS
 from ..generator.twin import Twin
 from .answer import Cause, Diagnosis, Place
-from .curve_fits import fit_effects
+from .curve_fits import CurveFit, fit_effects
 from .curves import Curve
 from .held_out import held_out
 from .inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
@@ -51,12 +51,12 @@ def judge(
     if changed:
         problem = with_any_strength(problem, changed)
         nuisances = LocalNuisances(problem.factors, problem.blocks)
-    weighed = _weigh(problem, priors=priors or Priors(), tell=tell)
+    weighed = weigh_problem(problem, priors=priors, tell=tell)
     problem = weighed.problem
     hypotheses = weighed.hypotheses
     if changed:
         hypotheses = _of_another_strength(hypotheses, known_strengths(problem, nuisances, of=changed, sd=CHANGED_SD))
-    verdict = _verdict_of(hypotheses)
+    verdict = verdict_of(hypotheses)
     tell("held-out data")
     gap, by_axis, shares = held_out(problem, verdict.leading, rng)
     leading, named = verdict.leading, verdict.named
@@ -91,15 +91,23 @@ def judge(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Weighed:
-    """Hypotheses, most probable first, the problem with what was refined for them, and effects that it could not show."""
+class Weighed:
+    """Hypotheses, most probable first, and what they were weighed with.
+
+    Fields: problem, with what was refined; hypotheses; out_of_reach: effects that it could not show, and why; observed, whitened, and
+    the fits of every curve to it.
+    """
 
     problem: Problem
     hypotheses: tuple[Hypothesis, ...]
     out_of_reach: dict[str, str]
+    observed: Observed
+    fits: Sequence[CurveFit]
 
 
-def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> _Weighed:
+def weigh_problem(
+    problem: Problem, *, priors: Priors | None = None, tell: Callable[[str], None] = lambda stage: None
+) -> Weighed:
     """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
@@ -111,10 +119,10 @@ def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> 
     )
     whitened = whitening.curves(problem.curves)
     fits = fit_effects(observed, whitened)
-    hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
+    first = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, rests=False)
     tell("refinement")
     closer = refine(
-        hypotheses,
+        first,
         variants={(item.effect, item.name): item for item in problem.variants},
         curves=whitened,
         observed=observed,
@@ -126,16 +134,19 @@ def _weigh(problem: Problem, *, priors: Priors, tell: Callable[[str], None]) -> 
         problem = problem.with_variants(closer)
         whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
         fits = fit_effects(observed, whitened)
-        hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
+    tell("all hypotheses")
+    hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
     problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
-    return _Weighed(
+    return Weighed(
         problem=problem,
         hypotheses=tuple(
             replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
             for item in hypotheses
         ),
         out_of_reach=_out_of_reach(problem, whitened, observed),
+        observed=observed,
+        fits=fits,
     )
 
 
@@ -157,7 +168,7 @@ def _of_another_strength(hypotheses: tuple[Hypothesis, ...], known: Sequence[Kno
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Verdict:
+class Verdict:
     """One of VERDICTS, all hypotheses, the one that leads, and those that are tied with it."""
 
     word: str
@@ -171,7 +182,7 @@ class _Verdict:
         return () if self.leading.effects == (UNKNOWN,) else tuple(self.leading.effects)
 
 
-def _verdict_of(hypotheses: tuple[Hypothesis, ...]) -> _Verdict:
+def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
     """What hypotheses, most probable first, amount to before held-out data are asked."""
     # an effect that nearly every likely hypothesis holds is named, whatever companions it is offered with
     core = {effect for effect, value in _by_effect(hypotheses).items() if effect != UNKNOWN and value >= EXPLAINED_FROM}
@@ -193,7 +204,7 @@ def _verdict_of(hypotheses: tuple[Hypothesis, ...]) -> _Verdict:
                 break
         several = len({effect for item in tied for effect in item.effects}) > 1
         word = "ambiguous" if several else "explained"
-    return _Verdict(word=word, hypotheses=hypotheses, leading=leading, tied=tuple(tied))
+    return Verdict(word=word, hypotheses=hypotheses, leading=leading, tied=tuple(tied))
 
 
 def _indistinct(tied: Sequence[Hypothesis]) -> tuple[tuple[str, str], ...]:
@@ -214,7 +225,7 @@ def _indistinct(tied: Sequence[Hypothesis]) -> tuple[tuple[str, str], ...]:
 
 
 def _likeliest_known(
-    problem: Problem, verdict: _Verdict, rng: np.random.Generator
+    problem: Problem, verdict: Verdict, rng: np.random.Generator
 ) -> dict[str, tuple[float, float, float]]:
     """How far the likeliest effect of the catalogue shrinks the gap where an unknown one is likelier; empty elsewhere."""
     known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.effects != (UNKNOWN,)), None)
@@ -225,7 +236,7 @@ def _likeliest_known(
 
 def _causes(
     problem: Problem,
-    verdict: _Verdict,
+    verdict: Verdict,
     shares: Mapping[str, tuple[float, float, float] | None],
     left: tuple[Place, ...],
 ) -> tuple[Cause, ...]:

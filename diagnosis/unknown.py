@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .observed import Observed
 
-_TAU = np.geomspace(0.5, 5000.0, 14)
+SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
 _SWEEPS = 4
 
 
@@ -40,13 +40,21 @@ CHANCE = _learnt()
 class Beyond:
     """What a residual shows beyond what may vary.
 
-    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_chance: log evidence
-    over none of one family that is off by a little.
+    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_size (size,): log
+    evidence over none of one family that is off, by each of `SIZES`; length: root of the sum of the extra variances of all probes, in
+    standard deviations of the first probes.
     """
 
     log_evidence: float
     place: str
-    by_chance: float
+    length: float
+    by_size: NDArray[np.float64]
+
+    @property
+    def by_chance(self) -> float:
+        """Log evidence over none of one family that is off by as much as chance does at most."""
+        small = self.by_size[np.less_equal(SIZES, CHANCE.largest)]
+        return float(np.logaddexp.reduce(small)) - math.log(len(small))
 
     @property
     def allowed(self) -> float:
@@ -68,8 +76,8 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
     squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
     sizes = np.array([len(part) for part in members])
     count = int(np.count_nonzero(sizes))
-    grid = np.concatenate([[0.0], _TAU])
-    one = np.eye(factors.shape[1])
+    grid = np.concatenate([[0.0], SIZES])
+    normal = np.eye(factors.shape[1]) + grams.sum(axis=0)
     tau2 = np.zeros(len(members))
     alone = np.full((len(members), len(grid)), -np.inf)
     base, best = 0.0, -math.inf
@@ -80,7 +88,8 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
                 continue
             weights = 1.0 / (1.0 + tau2)
             weights[g] = 0.0
-            rest: NDArray[np.float64] = np.asarray(np.linalg.cholesky(one + np.tensordot(weights, grams, axes=1)))
+            without = normal - grams[g] / (1.0 + tau2[g])
+            rest: NDArray[np.float64] = np.asarray(np.linalg.cholesky(without))
             found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
             weights[g] = 1.0
             found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
@@ -93,6 +102,7 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
             at = int(np.argmax(found))
             changed |= bool(grid[at] ** 2 != tau2[g])
             tau2[g] = grid[at] ** 2
+            normal = without + grams[g] / (1.0 + tau2[g])
             best = float(found[at])
         if not changed:
             break
@@ -102,9 +112,12 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
         place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
     else:
         place = int(np.argmax(tau2 * sizes))
-    small = CHANCE.largest >= _TAU
-    by_chance = float(np.logaddexp.reduce(own[:, small], axis=None)) - math.log(count * int(np.count_nonzero(small)))
-    return Beyond(log_evidence=best - base, place=str(names[place]), by_chance=by_chance)
+    by_size = np.logaddexp.reduce(own, axis=0) - math.log(count)
+    units = observed.units
+    length = math.sqrt(
+        sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
+    )
+    return Beyond(log_evidence=best - base, place=str(names[place]), length=length, by_size=by_size)
 
 
 def _price(shown: int, count: int) -> float:
@@ -112,7 +125,7 @@ def _price(shown: int, count: int) -> float:
     if not shown:
         return 0.0
     ways = math.lgamma(count + 1) - math.lgamma(shown + 1) - math.lgamma(count - shown + 1)
-    return -math.log(count) - ways - shown * math.log(len(_TAU))
+    return -math.log(count) - ways - shown * math.log(len(SIZES))
 
 
 def _at_each(

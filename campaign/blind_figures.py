@@ -291,9 +291,9 @@ def plot_unknown(outcomes: Sequence[Outcome]) -> bytes:
     )
     _legend(axis, fontsize=8)
     axis = axes[0, 1]
-    verdicts = ("no_gap", "explained", "ambiguous", UNKNOWN, FAILED)
+    verdicts = ("no_gap", "explained", "explained_in_part", "ambiguous", UNKNOWN, FAILED)
     left = np.zeros(len(groups))
-    for verdict, colour in zip(verdicts, (MUTED, RIGHT, "#c98a1b", "#8a5fb0", "black"), strict=True):
+    for verdict, colour in zip(verdicts, (MUTED, RIGHT, "#7fb08a", "#c98a1b", "#8a5fb0", "black"), strict=True):
         share = np.array(
             [sum(item.verdict == verdict for item in members) / max(len(members), 1) for members in groups.values()]
         )

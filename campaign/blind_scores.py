@@ -19,6 +19,7 @@ from .blind_separation import NO_EFFECT, Separation
 UNKNOWN = "unknown_effect"
 NONE = "none"
 FAILED = "failed"
+EXPLAINED = ("explained", "explained_in_part")
 SIGMA_BINS: tuple[tuple[float, float], ...] = ((0, 3), (3, 4), (4, 5), (5, 10), (10, math.inf))
 NAMED_FROM = 0.5  # probability from which an effect of an explained case counts as named
 TOP_SET = 0.9  # probability that the most probable hypotheses of the top set hold together
@@ -377,7 +378,7 @@ def compute_scores(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[
         "effect_probabilities_offered": calibration(p_effect[offered], present[offered])
         | {"from_probability": _MARGINAL_FROM},
         "none": {
-            "false_alarms": share(item.verdict in ("explained", UNKNOWN, FAILED) for item in none),
+            "false_alarms": share(item.verdict in (*EXPLAINED, UNKNOWN, FAILED) for item in none),
             "anything_but_no_gap": share(item.verdict != "no_gap" for item in none),
             "verdicts": _counts(item.verdict for item in none),
         },
@@ -387,7 +388,7 @@ def compute_scores(outcomes: Sequence[Outcome], effects: Sequence[str]) -> dict[
             "auroc_with_none": auroc(_p_unknown(unknown), _p_unknown(catalogue + none)),
             "found": share(item.verdict == UNKNOWN for item in unknown),
             "seen": share(item.verdict not in ("no_gap", FAILED) for item in unknown),
-            "wrongly_explained": share(item.verdict in ("explained", FAILED) for item in unknown),
+            "wrongly_explained": share(item.verdict in (*EXPLAINED, FAILED) for item in unknown),
             "verdicts": _counts(item.verdict for item in unknown),
             "by_effect": {
                 name: _counts(item.verdict for item in unknown if name in item.truth)
@@ -595,7 +596,7 @@ def withheld_scores(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     def confident(item: Outcome) -> bool:
         names = [name for name in item.named if name not in (NONE, UNKNOWN, FAILED)]
         return item.verdict == FAILED or (
-            item.verdict == "explained" and any(item.marginal.get(name, 0.0) >= CONFIDENT for name in names)
+            item.verdict in EXPLAINED and any(item.marginal.get(name, 0.0) >= CONFIDENT for name in names)
         )
 
     return {

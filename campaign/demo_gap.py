@@ -168,7 +168,7 @@ def answer_text(gap: Mapping[str, Any]) -> str:
         f" two measurements of the same thing differ by {sizes['floor']:.1f}."
     )
     causes = diagnosis["causes"]
-    if not causes or diagnosis["verdict"] not in ("explained", "ambiguous"):
+    if not causes or diagnosis["verdict"] not in ("explained", "explained_in_part", "ambiguous"):
         return f"{planted} The diagnosis named no effect (verdict: {diagnosis['verdict'].replace('_', ' ')}). {closing}"
     first = causes[0]
     strength = first["parameters"]["strength"]

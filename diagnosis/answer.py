@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas
 
 VERDICTS = ("no_gap", "explained", "explained_in_part", "ambiguous", "unknown_effect")
+EXPLAINED = ("explained", "explained_in_part")
 _LEFT_LISTED = 5
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.twin import Twin
-from .answer import Diagnosis, in_pixels
+from .answer import EXPLAINED, Diagnosis, in_pixels
 from .assemble import build_problem
 from .changes import catalogue_variants
 from .coarse import unseen_in_squares
@@ -108,7 +108,7 @@ def problem_of(
 
 def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:
     """Whether an explanation of the whole session says why a label looks wrong."""
-    return diagnosis.verdict == "explained" and not set(suspect.or_effects).isdisjoint(diagnosis.named)
+    return diagnosis.verdict in EXPLAINED and not set(suspect.or_effects).isdisjoint(diagnosis.named)
 
 
 def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:

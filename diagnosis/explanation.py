@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..generator.effects import EFFECTS
-from .answer import Cause, Diagnosis, Place
+from .answer import EXPLAINED, Cause, Diagnosis, Place
 from .known_laws import changed_effect
 
 _NAMED_DOUBTS = 3
@@ -132,7 +132,7 @@ def paragraph(diagnosis: Diagnosis) -> str:
         text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
     if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
         text += f" {compared_text(diagnosis)}"
-    if diagnosis.strained and diagnosis.verdict != "explained":
+    if diagnosis.strained and diagnosis.verdict not in EXPLAINED:
         text += f" {strained_text(diagnosis)}"
     for note in diagnosis.notes:
         text += f" {note[0].upper()}{note[1:]}."
@@ -179,7 +179,18 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         text += f" and falls to {gap.after:.2f} once that is added, by {_percent((value, low, high))} of what is above noise."
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
-    return text
+    return text + _rest_text(diagnosis, leading)
+
+
+def _rest_text(diagnosis: Diagnosis, leading: Sequence[Cause]) -> str:
+    """By how much laws of what is named are off here, and where they leave most; empty where they fit."""
+    if diagnosis.verdict != "explained_in_part":
+        return ""
+    off = [f"{title_of(cause.effect)} by some {100.0 * cause.level:.0f} %" for cause in leading if cause.level > 0.0]
+    told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
+    left = leading[0].left if leading else ()
+    place = f", most in the {_place_text(left[0])}" if left else ""
+    return f" The law leaves a rest that is no noise{place}{told}."
 
 
 def task_text(task: Mapping[str, Any]) -> str:

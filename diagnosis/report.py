@@ -233,14 +233,13 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
             strength_text(cause),
             ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
             _SINCE.get(cause.since, "always there"),
+            "" if cause.shrinks_by is None else f"{100.0 * min(cause.shrinks_by[0], 1.0):.0f} %",
+            f"{100.0 * cause.level:.0f} %",
         )
         for cause in diagnosis.causes
     ]
-    return SortedTable(
-        header=("effect", "id", "probability", "strength (95 %)", "inner parameters", "when"),
-        rows=tuple(rows),
-        words=frozenset({0, 1, 4, 5}),
-    )
+    header = ("effect", "id", "probability", "strength (95 %)", "inner parameters", "when", "gap removed", "law off by")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 4, 5}))
 
 
 def _where(answer: Mapping[str, Any]) -> SortedTable:

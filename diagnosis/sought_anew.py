@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..generator.effects import AppliedEffect
-from .answer import Diagnosis
+from .answer import EXPLAINED, Diagnosis
 from .inference import UNKNOWN, Hypothesis
 from .known_effects import lasting
 from .known_laws import changed_effect, says_strength
@@ -31,11 +31,11 @@ def with_sought_anew(result: Diagnosis, anew: Diagnosis, effects: Sequence[Appli
         effects: of the twin.
     """
     had = {item.id: abs(item.parameters.get("strength", 0.0)) for item in lasting(effects)}
-    if anew.verdict != "explained" or not had.keys() <= set(anew.named):
+    if anew.verdict not in EXPLAINED or not had.keys() <= set(anew.named):
         return result
     others = set(anew.named) - had.keys()
     if others:
-        if result.verdict == "explained" and set(result.named) == others:
+        if result.verdict in EXPLAINED and set(result.named) == others:
             return result
         return replace(anew, notes=(*anew.notes, _sought(tuple(had))))
     found = {item.effect: item.strength for item in anew.causes}

@@ -15,12 +15,13 @@ from raytwin.diagnosis.assemble import build_problem
 from raytwin.diagnosis.changes import catalogue_variants
 from raytwin.diagnosis.diagnose_session import _clears
 from raytwin.diagnosis.nuisances import Nuisances
+from raytwin.diagnosis.observed import Observed
 from raytwin.diagnosis.origin import made_of
 from raytwin.diagnosis.plausibility import check_plausibility
 from raytwin.diagnosis.preparation import prepare_session
 from raytwin.diagnosis.readings import Suspect
 from raytwin.diagnosis.session import measured_levels, read_session
-from raytwin.diagnosis.unknown import unknown_evidence
+from raytwin.diagnosis.unknown import beyond
 from raytwin.diagnosis.whitening import Whitening
 from raytwin.generator.effects import EFFECTS
 from raytwin.generator.series import session_conditions
@@ -91,12 +92,13 @@ def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
 
     def unknown(displaced_sds):
         residual = whitening.apply((displaced_sds * found)[None, :])[0]
-        return unknown_evidence(residual, shared, problem.parts, problem.part_names)
+        seen = Observed(residual=residual, nuisances=shared, groups=problem.groups, places=problem.places)
+        return beyond(seen, problem.parts, problem.part_names)
 
-    assert unknown(0.0)[0] < 0.0
-    evidence, place = unknown(8.0)
-    assert evidence > 10.0
-    assert place == "places of scenes"
+    assert unknown(0.0).log_evidence < 0.0
+    found_there = unknown(8.0)
+    assert found_there.log_evidence > 10.0
+    assert found_there.place == "places of scenes"
 
 
 def only(*kinds):

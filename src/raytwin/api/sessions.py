@@ -215,7 +215,7 @@ def diagnose(
 
     Example:
         >>> found = rt.diagnose("session.h5", seed=0)
-        >>> found.verdict in ("no_gap", "explained", "ambiguous", "unknown_effect")
+        >>> found.verdict in ("no_gap", "explained", "explained_in_part", "ambiguous", "unknown_effect")
         True
         >>> found.gap.before > 0
         True

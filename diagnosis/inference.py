@@ -77,6 +77,7 @@ def weigh_hypotheses(
     parts: NDArray[np.intp],
     part_names: Sequence[str],
     priors: Priors | None = None,
+    of_catalogue: int = 0,
     rests: bool = True,
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
@@ -86,11 +87,12 @@ def weigh_hypotheses(
         fits: of each effect's curves to it; several curves of one effect are variants with equal prior.
         parts, part_names: families of probes (probe,) in which an unknown effect may show.
         priors: of the kinds of hypothesis.
+        of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
     """
     priors = priors or Priors()
     singles = _singles(fits)
-    count = max(len(singles), 1)
+    count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     none = beyond(observed, parts, part_names)
     looked_at = _WITH_REST if rests else 0

@@ -119,7 +119,19 @@ def weigh_problem(
     )
     whitened = whitening.curves(problem.curves)
     fits = fit_effects(observed, whitened)
-    first = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, rests=False)
+
+    def weigh(rests: bool) -> tuple[Hypothesis, ...]:
+        return weigh_hypotheses(
+            observed,
+            fits,
+            parts=problem.parts,
+            part_names=problem.part_names,
+            priors=priors,
+            of_catalogue=len(EFFECTS),
+            rests=rests,
+        )
+
+    first = weigh(rests=False)
     tell("refinement")
     closer = refine(
         first,
@@ -135,7 +147,7 @@ def weigh_problem(
         whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
         fits = fit_effects(observed, whitened)
     tell("all hypotheses")
-    hypotheses = weigh_hypotheses(observed, fits, parts=problem.parts, part_names=problem.part_names, priors=priors)
+    hypotheses = weigh(rests=True)
     problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     return Weighed(

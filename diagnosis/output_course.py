@@ -36,6 +36,11 @@ class OutputCourse:
         values, vectors = np.linalg.eigh(between)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
+    def steps(self, request: SeriesRequest, readout_ms: float | None) -> float:
+        """Standard deviation of steps from frame to frame over that of an output that is new in every frame."""
+        step_s = request.interval_s(readout_ms) * request.exposures_per_frame
+        return math.sqrt(1.0 - (1.0 - self.jitter_share) * math.exp(-step_s / self.correlation_s))
+
     def along(self, profile: NDArray[np.float64], request: SeriesRequest, readout_ms: float | None) -> float:
         """Standard deviation of the projection of a series' frames on a profile (frame,)."""
         return math.sqrt(max(float(profile @ self._frames(request, readout_ms) @ profile), 0.0))

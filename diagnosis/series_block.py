@@ -175,7 +175,8 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
                 along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
                 single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / block.sd[index]))
             elif name.statistic == "frame_factor":
-                single.append((place.start + index, 0.5 / block.sd[index]))
+                steps = wanders.steps(request, readout_ms)
+                single.append((place.start + index, 0.5 * steps / block.sd[index]))
     alone = np.zeros((size, len(single)))
     for column, (probe, amount_of_one) in enumerate(single):
         alone[probe, column] = amount_of_one

@@ -48,6 +48,7 @@ from raytwin.campaign.blind_statistics import (
     write_statistics,
 )
 from raytwin.diagnosis.curves import Curve
+from raytwin.diagnosis.observed import Point
 from raytwin.generator.effects import EFFECTS
 
 
@@ -540,6 +541,7 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
         factors=0.5 * rng.standard_normal((size, factors)),
         series_of=np.repeat(np.arange(series), each),
         groups=np.arange(size) % 5,
+        places=np.arange(size) % 5,
         blocks=np.zeros(size, dtype=int),
         noise=np.ones(size),
         views=views,
@@ -557,7 +559,7 @@ def an_effect(response):
         strengths=np.array([1.0]),
         responses=response[None, :],
     )
-    return [(curve, 1.0)]
+    return [Point(curve=curve, strength=1.0, level=0.1)]
 
 
 def test_the_whole_response_added_takes_the_whole_gap_away():
@@ -582,8 +584,9 @@ def test_a_gap_that_is_chance_is_gone_once_the_chance_is_in_the_model():
     rng = np.random.default_rng(23)
     problem = second_day_problem(rng)
     problem.residual = problem.residual + 2.0 * rng.standard_normal(len(problem.residual))
-    ((curve, strength),) = an_effect(np.zeros(len(problem.residual)))
-    found = shrinkage(problem, [(replace(curve, jitter=np.full(len(problem.residual), 4.0)), strength)])
+    (point,) = an_effect(np.zeros(len(problem.residual)))
+    chance = replace(point.curve, jitter=np.full(len(problem.residual), 4.0))
+    found = shrinkage(problem, [replace(point, curve=chance)])
     assert found["value"] == pytest.approx(1.0, abs=0.04)
 
 

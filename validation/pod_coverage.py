@@ -199,7 +199,6 @@ def main() -> int:
             arguments.crossed_luck,
             looks_that_share_luck,
             (
-                ("cloglog", 2, 82, (0.1, 0.3)),
                 ("cloglog", 3, 40, (0.1, 0.3)),
                 ("cloglog", 3, 82, (0.1, 0.3)),
                 ("cloglog", 3, 82, (0.3, 0.1)),

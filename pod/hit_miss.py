@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..results import ByValue
-from .few_groups import ONE_SIDED, TWO_SIDED, Levels, size_from_test, student_quantile
+from .few_groups import ONE_SIDED, TWO_SIDED, Levels, not_short_of_likelihood, size_from_test, student_quantile
 from .likelihood import Curve, size_bound
 from .links import Link
 from .modified import modified_bound
@@ -41,7 +41,7 @@ class Bounds:
 
     modified: the likelihood ratio with a correction for few trials (see `modified.py`, `_averaged_size.py`); None for a
     bias-reduced fit and for scaled repeats. With clusters or random effects all three take Student's quantile (see
-    `few_groups.py`), and wald is the bound of Wald's test at each size (Fieller), which need not be symmetric.
+    `few_groups.py`), and wald is the bound of Wald's test at each size (Fieller), or `modified` where that lies farther out.
     """
 
     likelihood_ratio: float | None = None
@@ -278,6 +278,8 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: 
             modified = None
             if curve.at_maximum:
                 modified = modified_bound(judged, eta=eta, z=z, upper=upper, start=ratio)
+            if clustered is not None:
+                wald = not_short_of_likelihood(wald, ratio if modified is None else modified, upper=upper)
             bounds[key] = Bounds(
                 likelihood_ratio=size_from_x(ratio, log_size=log_size),
                 wald=size_from_x(wald, log_size=log_size),

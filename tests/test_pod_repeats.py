@@ -139,6 +139,9 @@ def test_repeats_widen_the_interval_and_the_naive_one_stands_beside():
     assert fit.a90_low_two_sided.likelihood_ratio < fit.a90 < fit.a90_95.likelihood_ratio
     assert fit.a90_95.likelihood_ratio < fit.a90_95_two_sided.likelihood_ratio
     assert fit.a90_95.modified < fit.a90_95_two_sided.modified
+    # Wald's bound does not stop short of the likelihood's
+    assert fit.a90_95.wald >= fit.a90_95.modified
+    assert fit.a90_low_two_sided.wald <= fit.a90_low_two_sided.modified
 
 
 def test_without_effects_the_crossed_curve_is_the_pooled_one():

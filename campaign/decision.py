@@ -77,9 +77,13 @@ class Verdict:
 
     @property
     def limited_by(self) -> tuple[str, ...]:
-        """Names of the criteria that are not met, failed ones first."""
-        missed = [one for one in self.criteria if one.verdict not in (MEETS, LIKELY)]
-        return tuple(one.name for one in sorted(missed, key=lambda one: one.verdict != FAILS))
+        """Names of the criteria that fail."""
+        return tuple(one.name for one in self.criteria if one.verdict == FAILS)
+
+    @property
+    def not_yet_known(self) -> tuple[str, ...]:
+        """Names of the criteria of which it is open whether they are met."""
+        return tuple(one.name for one in self.criteria if one.verdict == OPEN)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -396,9 +400,12 @@ def decision_sentence(
     facts = "; ".join(criterion_text(one, unit=unit) for one in recommended.criteria)
     if recommended.verdict == MEETS:
         return f"{asked} {tally} Take {recommended.label}: {facts}."
-    not_met = ", ".join(WORDS[name] for name in recommended.limited_by)
-    state = "is open in" if recommended.verdict == OPEN else "fails in"
-    return f"{asked} {tally} {recommended.label} comes closest and {state} {not_met}: {facts}."
+    failed, unknown = (
+        ", ".join(WORDS[name] for name in names) for names in (recommended.limited_by, recommended.not_yet_known)
+    )
+    state = f" and fails in {failed}" if failed else ""
+    state += f"; not yet known: {unknown}" if unknown else ""
+    return f"{asked} {tally} {recommended.label} comes closest{state}. It has {facts}."
 
 
 # ---------------------------------------------------------------------------------------------------- the whole
@@ -459,6 +466,7 @@ def decide(
                 "verdict": one.verdict,
                 "criteria": [asdict(part) for part in one.criteria],
                 "limited_by": list(one.limited_by),
+                "not_yet_known": list(one.not_yet_known),
                 "changes": [asdict(part) for part in one.changes],
             }
             for one in verdicts

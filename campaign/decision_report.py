@@ -108,6 +108,7 @@ def _setting_row(one: Mapping[str, Any], taken: bool) -> dict[str, Any]:
         "taken": taken,
         "margins": [_percent(part["margin"], mark=" *" if part["predicted"] else "") for part in one["criteria"]],
         "limited_by": ", ".join(WORDS[name] for name in one["limited_by"]),
+        "not_yet_known": ", ".join(WORDS[name] for name in one["not_yet_known"]),
         "helps": change_text(Change(**one["changes"][0])) if one["changes"] and one["verdict"] != MEETS else "",
     }
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .links import Link
+from .trials import Trials
 
 Array = NDArray[np.float64]
 Codes = NDArray[np.intp]
@@ -76,6 +77,27 @@ class Laplace:
         if self.expected:
             _, logdet = self._solve(weight, np.zeros_like(b), s1, s2)
         return best + logdet
+
+    @classmethod
+    def of(cls, table: Trials, *, factors: list[Codes], link: Link, expected: bool) -> "Laplace":
+        """The deviance of trials with one or two crossed factors."""
+        return cls(
+            hits=table.hits,
+            misses=table.misses,
+            first=factors[0],
+            second=factors[1] if len(factors) > 1 else None,
+            link=link,
+            expected=expected,
+        )
+
+    def information(self, offset: Array, sd: Array) -> float:
+        """Expected information on the constant, of all looks with the effects at their mode; in 1 / eta squared."""
+        self.deviance(offset, sd)
+        eta = offset + sd[0] * self.mode[: self._n1][self.first]
+        if self.second is not None:
+            eta = eta + sd[1] * self.mode[self._n1 :][self.second]
+        parts = self.link.log_parts(eta)
+        return -float((self.hits + self.misses) @ (parts.log_hit_1 * parts.log_miss_1))
 
     def _spread(self, rows: Array, s1: float, s2: float) -> Array:
         up = np.asarray(s1 * np.bincount(self.first, weights=rows, minlength=self._n1), dtype=float)

@@ -67,6 +67,7 @@ def fit_answer(fit: PodFit) -> dict[str, Any]:
         "a90_95": asdict(fit.a90_95),
         "a90_95_two_sided": asdict(fit.a90_95_two_sided),
         "a90_low_two_sided": asdict(fit.a90_low_two_sided),
+        "degrees_of_freedom": fit.degrees_of_freedom,
         "separated": fit.separated,
         "reaches_90": fit.reaches_90,
         "warnings": list(fit.warnings),

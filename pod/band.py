@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FitError
 from ..files import whole_file
+from .few_groups import TWO_SIDED, student_quantile
 from .hit_miss import PodFit
 from .likelihood import eta_band
 from .links import link_from_name
@@ -23,9 +24,9 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
     """POD with the ends of its two-sided 95 % band at each size, three arrays of the shape of `size`, 0 to 1.
 
     Likelihood-ratio band, each size for itself or (`simultaneous`) the whole curve at once, from the joint region. With
-    crossed random effects the population-averaged curve, its band by the delta method on the link's scale (two degrees
-    of freedom where simultaneous). For `cluster` the pooled curve, the band widened by the inflation of its variance
-    and by Student's quantile, as its bounds are.
+    crossed random effects the population-averaged curve, its band by the delta method on the logit scale. For `cluster`
+    the pooled curve and the likelihood of as many trials as have its variance. Both take Student's quantile as the
+    bounds on a90 do (Scheffe's F with 2 and as many degrees of freedom where simultaneous).
 
     Args:
         fit: a fit that has a curve.
@@ -33,6 +34,11 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
 
     Raises:
         FitError: the fit has no curve.
+
+    >>> from raytwin.pod import fit_pod
+    >>> fit = fit_pod([1, 2, 3, 4, 5, 6, 7, 8], [0, 0, 1, 0, 1, 0, 1, 1], link="logit")
+    >>> [float(ends.round(2)[0]) for ends in curve_with_band(fit, [4.0])]
+    [0.43, 0.09, 0.8]
     """
     if fit.curve is None or fit.c0 is None or fit.c1 is None:
         raise FitError("there is no curve to draw: " + "; ".join(fit.warnings))
@@ -42,12 +48,15 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
     quantile = CHI2_95[2 if simultaneous else 1]
     if fit.crossed is None:
         curve = fit.curve
-        if fit.repeats == "cluster" and fit.se0 and fit.se1:
-            from dataclasses import replace
-
-            inflation = max(fit.se0**2 / curve.covariance[0, 0], fit.se1**2 / curve.covariance[1, 1])
-            curve = replace(curve, divisor=curve.divisor * float(inflation) * fit.few_clusters)
-        low, high = eta_band(curve, x.ravel(), quantile=quantile)
+        allowed = np.full(x.size, quantile)
+        if fit.clustered is not None:
+            toward = np.stack((np.ones(x.size), x.ravel()), axis=1)
+            variance, freedom = fit.clustered.variance(toward)
+            allowed = _quantile(freedom, simultaneous=simultaneous)
+            allowed = allowed * variance / np.einsum("ki,ij,kj->k", toward, curve.covariance, toward)
+        low, high = eta_band(curve, x.ravel(), quantile=allowed)
+        if fit.spread_unknown:
+            low, high = np.full(x.size, -np.inf), np.full(x.size, np.inf)
         eta = curve.coefficients[0] + curve.coefficients[1] * x
         ends = (link.pod_from_eta(np.asarray(np.clip(end, -1e3, 1e3))).reshape(x.shape) for end in (low, high))
         return (np.asarray(link.pod_from_eta(eta)), *ends)  # type: ignore[return-value]
@@ -68,10 +77,21 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
         behind[index] -= width
         rise.append((pod_at(ahead) - pod_at(behind)) / (2 * width) / np.maximum(pod * (1 - pod), 1e-300))
     gradient = np.stack(rise, axis=-1)
-    spread = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", gradient, fit.crossed.covariance, gradient), 0.0))
-    spread = math.sqrt(quantile) * spread
+    variance = np.maximum(np.einsum("...i,ij,...j->...", gradient, fit.crossed.covariance, gradient), 0.0)
+    variance, freedom = fit.crossed.levels.spread(variance, gradient[..., 0])
+    spread = np.sqrt(_quantile(freedom, simultaneous=simultaneous) * variance)
     low, high = (1 / (1 + np.exp(-np.clip(odds + side * spread, -700, 700))) for side in (-1, 1))
     return pod, np.asarray(low), np.asarray(high)
+
+
+def _quantile(freedom: Array, *, simultaneous: bool) -> Array:
+    """What a squared deviation over its variance stays below with 95 %: of one size, or of all at once."""
+    if not simultaneous:
+        return student_quantile(TWO_SIDED, freedom) ** 2
+    from scipy.special import fdtri
+
+    known = np.isfinite(freedom)
+    return np.asarray(np.where(known, 2 * fdtri(2, np.where(known, freedom, 1.0), 0.95), CHI2_95[2]))
 
 
 def curve_rows(fit: PodFit, *, points: int = 101) -> dict[str, Array]:

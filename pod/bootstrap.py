@@ -2,7 +2,11 @@
 
 Resampling both draws networks and images independently and multiplies their counts (the pigeonhole bootstrap): somewhat
 too wide, never far too narrow. A resample whose hits and misses do not overlap has no a90: it counts as unknown.
-Source: Owen, Ann. Appl. Stat. 1 (2007) 386, doi:10.1214/07-AOAS122; Efron & Tibshirani (1993), ch. 13.
+Resamples of k networks or images spread (1 - 1/k)^(1/2) of what they should, and know nothing of Student's quantile: their
+percentiles are moved out to Phi(t_(k-1) (k / (k - 1))^(1/2)) (expanded percentiles), and a percentile beyond all resamples is
+None.
+Source: Owen, Ann. Appl. Stat. 1 (2007) 386, doi:10.1214/07-AOAS122; Efron & Tibshirani (1993), ch. 13; Hesterberg, Am. Stat. 69
+(2015) 371, doi:10.1080/00031305.2015.1089789.
 """
 
 import math
@@ -12,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
+from .few_groups import student_quantile
 from .links import link_from_name
 from .separation import separated_batch
 from .solver import fit_batch
@@ -26,8 +31,9 @@ UNITS = ("row", "image", "network", "both")
 class BootstrapSizes:
     """Refits: a50 and a90 (replicate,) in the data's unit, NaN where a resample has none (separated, or not rising).
 
-    a90_95: 95th percentile; a90_low, a90_high: 2.5th and 97.5th percentiles. A resample without a90 counts as larger
-    than any; None where the percentile falls among them. unknown: their share.
+    a90_95: 95th percentile; a90_low, a90_high: 2.5th and 97.5th percentiles, each expanded where networks or images are
+    drawn. A resample without a90 counts as larger than any; None where the percentile falls among them or beyond all
+    resamples. unknown: their share.
     """
 
     a50: Array
@@ -112,8 +118,15 @@ def bootstrap_pod(
     a50, a90 = (sizes_at(coefficients, shape.eta_from_pod(p), log_size=log_size) for p in (0.5, 0.9))
     ordered = np.sort(np.where(np.isfinite(a90), a90, np.inf))
 
+    drawn = [codes for name, codes in (("network", table.network), ("image", table.image)) if by in (name, "both")]
+    fewest = min((int(codes.max()) + 1 for codes in drawn if codes is not None), default=None)
+
     def percentile(share: float) -> float | None:
-        value = float(ordered[min(max(math.ceil(share * replicates) - 1, 0), replicates - 1)])
+        moved = share if fewest is None else expanded_share(share, fewest)
+        # a share of one resample or less is beyond what they tell
+        if fewest is not None and min(moved, 1 - moved) * replicates < 1:
+            return None
+        value = float(ordered[min(max(math.ceil(moved * replicates) - 1, 0), replicates - 1)])
         return value if math.isfinite(value) else None
 
     return BootstrapSizes(
@@ -125,6 +138,21 @@ def bootstrap_pod(
         a90_high=percentile(0.975),
         unknown=float(np.mean(~np.isfinite(a90))),
     )
+
+
+def expanded_share(share: float, groups: int) -> float:
+    """The percentile of resamples of so many groups that serves for `share`, 0 to 1; 0 or 1 with one group.
+
+    >>> round(expanded_share(0.975, 82), 3)
+    0.977
+    """
+    from scipy.special import ndtr
+
+    if groups < 2:
+        return float(share > 0.5)
+    side = 1.0 if share > 0.5 else -1.0
+    quantile = float(student_quantile(max(share, 1 - share), groups - 1.0))
+    return float(ndtr(side * quantile * math.sqrt(groups / (groups - 1))))
 
 
 def fit_many(x: Array, hits: Array, misses: Array, *, link: str, log_size: bool = False) -> Array:

@@ -1,9 +1,9 @@
 """Are two POD curves the same? Real against generated, before against after.
 
 difference = a90_second - a90_first, ratio = a90_second / a90_first, both with 95 % intervals built from the two
-curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. Verdict at a
-stated margin on the ratio by two one-sided tests: equivalent when the 90 % interval of the ratio lies within [1 / (1 +
-m), 1 + m].
+curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. Few networks enter
+by Student's quantile, in intervals and tests. Verdict at a stated margin on the ratio by two one-sided tests: equivalent
+when the 90 % interval of the ratio lies within [1 / (1 + m), 1 + m].
 Source: Zou & Donner, Stat. Med. 27 (2008) 1693, doi:10.1002/sim.3095; Schuirmann, J. Pharmacokin. Biopharm. 15 (1987)
 657.
 """
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
 from .crossed import usable_factors
-from .hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, PodFit
+from .few_groups import ONE_SIDED, TWO_SIDED, student_quantile
+from .hit_miss import PodFit
 from .likelihood import Curve
 from .links import LINKS
 from .mixed import fit_mixed
 from .repeats import fit_trials
-from .robust import bread, clustered_covariance, clustered_meat, few_clusters_factor, score_rows
+from .robust import bread, clustered_curve, clustered_meat, clustered_total, score_rows
 from .solver import fit_batch
 from .trials import Trials
 
@@ -144,15 +145,16 @@ def compare_pod(
                 high=None if logs.high is None else math.exp(logs.high),
             )
             # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
-            share = Z_ONE_SIDED / Z_TWO_SIDED
+            freedoms = [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
+            shares = [float(student_quantile(ONE_SIDED, m) / student_quantile(TWO_SIDED, m)) for m in freedoms]
             short = _mover(
-                math.log(b), math.log(a), *_log_ends(fits[1], share), *_log_ends(fits[0], share), correlation
+                math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation
             )
             low90 = None if short.low is None else math.exp(short.low)
             high90 = None if short.high is None else math.exp(short.high)
             edge = math.log1p(margin)
             middle = math.log(b / a)
-            p = _p_equivalence(middle, logs, edge)
+            p = _p_equivalence(middle, logs, edge, min(freedoms))
             inside = low90 is not None and high90 is not None and low90 > math.exp(-edge) and high90 < math.exp(edge)
             apart = (ratio.low is not None and ratio.low > 1) or (ratio.high is not None and ratio.high < 1)
             verdict = _verdict(inside=inside, apart=apart)
@@ -226,17 +228,18 @@ def _mover(
     return Interval(value=b - a, low=low, high=high)
 
 
-def _p_equivalence(middle: float, logs: Interval, edge: float) -> float | None:
+def _p_equivalence(middle: float, logs: Interval, edge: float, freedom: float) -> float | None:
     """The larger p of the two one-sided tests of |ln ratio| >= edge, each with the spread of its own side."""
-    from statistics import NormalDist
+    from scipy.special import ndtr, stdtr
 
     if logs.low is None or logs.high is None:
         return None
-    spread_low, spread_high = (middle - logs.low) / Z_TWO_SIDED, (logs.high - middle) / Z_TWO_SIDED
+    quantile = float(student_quantile(TWO_SIDED, freedom))
+    spread_low, spread_high = (middle - logs.low) / quantile, (logs.high - middle) / quantile
     if not (spread_low > 0 and spread_high > 0):
         return None
-    normal = NormalDist()
-    return max(1 - normal.cdf((middle + edge) / spread_low), normal.cdf((middle - edge) / spread_high))
+    deviations = -(middle + edge) / spread_low, (middle - edge) / spread_high
+    return max(float(stdtr(freedom, one) if math.isfinite(freedom) else ndtr(one)) for one in deviations)
 
 
 def _correlation(
@@ -245,10 +248,10 @@ def _correlation(
     """Correlation of the two a90 from what they share, by the clustered spread of their difference, as pooled curves.
 
     Each look adds to a90 what its score says; summed over both tables with opposite signs these make the difference.
-    Its variance is the largest of those clustered by network, by image and by both (one estimate alone may fall
-    short), with Student's quantile for few clusters.
+    Its variance is clustered by network and image (`robust.clustered_total`). The correlation is the one with which the
+    interval of the difference is as wide as Student's quantile times that standard error, each at its degrees of freedom.
     """
-    influences, variances = [], []
+    influences, arms = [], []
     apart = repeats == "pooled"  # looks taken as independent: only a look at the same image by the same network pairs
     for table, fit, sign in zip((first, second), fits, (-1.0, 1.0), strict=True):
         curve = fit.curve
@@ -257,25 +260,24 @@ def _correlation(
         x90 = (curve.link.eta_from_pod(0.9) - curve.coefficients[0]) / curve.coefficients[1]
         gradient = -np.array([1.0, x90]) / curve.coefficients[1]
         groups = [codes for codes in (table.network, table.image) if codes is not None and codes.max() > 0]
-        covariance = curve.covariance
+        variance, freedom = np.asarray(gradient @ curve.covariance @ gradient), np.array(np.inf)
         if groups and not apart:
-            covariance = clustered_covariance(table, curve, groups=groups, log_size=log_size)
-        variances.append(float(gradient @ covariance @ gradient))
+            clustered = clustered_curve(table, curve, groups=groups, log_size=log_size)
+            if clustered is None:
+                return 0.0
+            variance, freedom = clustered.variance(gradient)
+        arms.append(math.sqrt(float(variance)) * float(student_quantile(TWO_SIDED, freedom)))
         scores = score_rows(table, curve, log_size=log_size)
         influences.append(sign * scores @ bread(table, curve, log_size=log_size) @ gradient)
     both = _stacked(first, second, shared)
     codes = [one for one in (both.network, both.image) if one is not None]
-    if not codes or not all(variance > 0 for variance in variances):
+    if not codes or not all(arm > 0 for arm in arms):
         return 0.0
     if apart and len(codes) > 1:
         codes = [np.unique(codes[0] * (int(codes[1].max()) + 1) + codes[1], return_inverse=True)[1].astype(np.intp)]
-    rows = np.concatenate(influences)[:, None]
-    ways = [float(clustered_meat(rows, rows, [one])[0, 0]) for one in codes]
-    ways.append(float(clustered_meat(rows, rows, codes)[0, 0]))
-    fewest = min(int(one.max()) + 1 for one in codes)
-    # the arms of a clustered interval carry Student's quantile already
-    difference = max(ways) * (1.0 if repeats == "cluster" else few_clusters_factor(fewest))
-    value = (sum(variances) - difference) / (2 * math.sqrt(variances[0] * variances[1]))
+    of_difference, its_freedom = clustered_total(np.concatenate(influences), codes)
+    arm = math.sqrt(of_difference) * float(student_quantile(TWO_SIDED, its_freedom))
+    value = (arms[0] ** 2 + arms[1] ** 2 - arm**2) / (2 * arms[0] * arms[1])
     # what is shared moves both alike; an estimate below 0 is noise of few images or networks
     return min(max(value, 0.0), 0.99)
 

@@ -1,8 +1,8 @@
 """POD against several properties at once: g(POD) = c0 + sum_j c_j x_j.
 
 a_p of one property at given values v of the others: (g(p) - c0 - sum_k c_k v_k) / c.
-Bounds: Wald, and likelihood ratio from the profile over all other coefficients. With repeated looks both are made
-robust to networks and images as `repeats.fit_cluster` does.
+Bounds: Wald, and likelihood ratio from the profile over all other coefficients. With repeated looks both take the variances
+and Student's quantile of `repeats.fit_cluster`.
 """
 
 import math
@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
+from .few_groups import ONE_SIDED, size_from_test, student_quantile
 from .hit_miss import Z_ONE_SIDED, Bounds, size_from_x, size_in_range
 from .links import Link, link_from_name
-from .robust import clustered_meat
+from .robust import Clustered, clustered_fit
 from .separation import check_separation
 from .solver import fit_batch
 from .trials import Trials
@@ -28,7 +29,8 @@ class CovariateFit:
     """A fit on several properties. coefficients, errors, p: one each for the constant and `names`, in that order.
 
     Coefficients are per unit of the property (of its ln where `logs` says so); errors are robust to repeats where
-    networks or images repeat; p is that of a Wald test. covariance goes with the errors.
+    networks or images repeat; p is that of a Wald test, of Student's distribution there. covariance goes with the errors;
+    clustered holds the variances where looks repeat.
     """
 
     names: tuple[str, ...]
@@ -44,6 +46,7 @@ class CovariateFit:
     aic: float
     separated: bool
     robust: bool
+    clustered: Clustered | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +80,8 @@ def fit_covariates(
 
     Raises:
         InputError: a property without spread, not above 0 where its logarithm is asked for, or a copy of others.
-        FitError: the data separate under `ml`, or all trials ended alike.
+        FitError: the data separate under `ml`, all trials ended alike, or looks repeat and nothing tells how much networks
+            and images differ.
     """
     shape = link_from_name(link)
     design = design_from_columns(columns, logs=logs, rows=len(table.size))
@@ -98,16 +102,25 @@ def fit_covariates(
     weight = -(table.hits + table.misses) * parts.log_hit_1 * parts.log_miss_1
     covariance = _inverse((design * weight[:, None]).T @ design)
     groups = [codes for codes in (table.network, table.image) if codes is not None and 0 < codes.max() < table.n - 1]
+    clustered = None
+    freedom = np.full(design.shape[1], np.inf)
+    errors = np.sqrt(np.diag(covariance))
     if groups:
         first = table.hits * parts.log_hit_1 + table.misses * parts.log_miss_1
-        rows = design * first[:, None]
-        meat = clustered_meat(rows, rows, groups)
-        if np.linalg.eigvalsh(meat).min() <= 0:
-            meat = sum((clustered_meat(rows, rows, [codes]) for codes in groups), np.zeros_like(meat))
-        covariance = covariance @ meat @ covariance
-    errors = np.sqrt(np.diag(covariance))
-    from scipy.special import ndtr
+        looks = weight[:, None, None] * design[:, :, None] * design[:, None, :]
+        clustered = None if separated else clustered_fit(design * first[:, None], looks, groups)
+        if clustered is None:
+            raise FitError(
+                "networks or images repeat, and nothing tells how much they differ: there are fewer than three, one alone"
+                " holds up the fit, or hits and misses do not overlap"
+            )
+        covariance = clustered.covariance()
+        variances, freedom = clustered.variance(np.eye(design.shape[1]))
+        errors = np.sqrt(variances)
+    from scipy.special import ndtr, stdtr
 
+    deviation = -np.abs(coefficients / errors)
+    known = np.isfinite(freedom)
     total = table.hits + table.misses
     with np.errstate(divide="ignore", invalid="ignore"):
         saturated = np.where(table.hits > 0, table.hits * np.log(table.hits / total), 0.0)
@@ -119,13 +132,14 @@ def fit_covariates(
         method=used,
         coefficients=coefficients,
         errors=errors,
-        p=np.asarray(2 * ndtr(-np.abs(coefficients / errors))),
+        p=np.asarray(2 * np.where(known, stdtr(np.where(known, freedom, 1.0), deviation), ndtr(deviation))),
         covariance=covariance,
         log_likelihood=log_likelihood,
         deviance=2 * (float(saturated.sum()) - log_likelihood),
         aic=2 * design.shape[1] - 2 * log_likelihood,
         separated=separated,
         robust=bool(groups),
+        clustered=clustered,
     )
 
 
@@ -176,19 +190,24 @@ def size_at(
         eta = shape.eta_from_pod(0.9)
         x90 = (eta - base) / slope
         point[place] = x90
-        variance = float(point @ fit.covariance @ point)
+        variance, z = float(point @ fit.covariance @ point), Z_ONE_SIDED
+        if fit.clustered is not None:
+            spread, freedom = fit.clustered.variance(point)
+            variance, z = float(spread), float(student_quantile(ONE_SIDED, freedom))
         error = math.sqrt(variance) / slope
         ratio = None
         if fit.method == "ml":
             design = design_from_columns(
                 columns, logs=tuple(n for n, log in zip(fit.names, fit.logs, strict=True) if log), rows=len(table.size)
             )
-            ratio = _profile_bound(fit, table, design, place, point, eta, x90, error, shape, variance)
+            ratio = _profile_bound(fit, table, design, place, point, eta, x90, z * error, shape, z * z * variance)
             if ratio is None:
                 notes.append("the likelihood gives no upper bound on a90")
         bounds = Bounds(
             likelihood_ratio=size_from_x(ratio, log_size=log_size),
-            wald=size_from_x(x90 + Z_ONE_SIDED * error, log_size=log_size),
+            wald=size_from_x(
+                _wald_bound(fit, point, place, base, slope, eta, x90, z * error, values), log_size=log_size
+            ),
         )
     return SizeAt(name=name, held=kept, a50=found[50], a90=found[90], a90_95=bounds, warnings=tuple(notes))
 
@@ -231,17 +250,20 @@ def _profile_bound(
     point: Array,
     eta: float,
     x90: float,
-    error: float,
+    reach: float,
     link: Link,
-    variance: float,
+    wide: float,
 ) -> float | None:
-    """One-sided 95 % likelihood-ratio bound on x of one property, the curve held at eta there."""
+    """One-sided 95 % likelihood-ratio bound on x of one property, the curve held at eta there.
+
+    reach: about how far from x90 it lies; wide: the squared quantile times the variance of eta at x90.
+    """
     from scipy.optimize import brentq
 
     parts = link.log_parts(design @ fit.coefficients)
     weight = -(table.hits + table.misses) * parts.log_hit_1 * parts.log_miss_1
     plain = float(point @ _inverse((design * weight[:, None]).T @ design) @ point)
-    allowed = Z_ONE_SIDED**2 * variance / plain
+    allowed = wide / plain
     scale = np.maximum(np.abs(design[:, 1:] - point[1:]).max(axis=0), 1e-300)
     state = fit.coefficients[1:] * scale
 
@@ -254,12 +276,37 @@ def _profile_bound(
         state, value = _maximise(columns, eta, table, link, state)
         return 2 * (fit.log_likelihood - value) - allowed
 
-    inside, outside = x90, x90 + Z_ONE_SIDED * error
+    inside, outside = x90, x90 + reach
     for _ in range(30):
         if excess(outside) > 0:
             return float(brentq(excess, inside, outside, xtol=1e-10 * (1 + abs(x90))))
         inside, outside = outside, outside + 2 * (outside - x90)
     return None
+
+
+def _wald_bound(
+    fit: CovariateFit,
+    point: Array,
+    place: int,
+    base: float,
+    slope: float,
+    eta: float,
+    x90: float,
+    reach: float,
+    values: Array,
+) -> float | None:
+    """One-sided 95 % Wald bound on x of one property; where looks repeat, where Wald's test stops to reject (Fieller)."""
+    clustered = fit.clustered
+    if clustered is None:
+        return x90 + reach
+
+    def excess(at: float) -> tuple[float, float, float]:
+        held = point.copy()
+        held[place] = at
+        variance, freedom = clustered.variance(held)
+        return base + slope * at - eta, float(variance), float(freedom)
+
+    return size_from_test(excess, below=ONE_SIDED, upper=True, start=x90, span=float(np.ptp(values)))
 
 
 def _maximise(columns: Array, offset: float, table: Trials, link: Link, start: Array) -> tuple[Array, float]:

@@ -28,8 +28,9 @@ def false_alarm_rate(
 ) -> FalseAlarmRate:
     """False-alarm rate (0 to 1) with a 95 % interval.
 
-    Clopper-Pearson on the effective number of looks, n V_binomial / V_clustered, V_clustered by networks and by images
-    (never more than n). Without repeats it is the exact binomial interval.
+    Clopper-Pearson on the effective number of looks, n V_binomial / V_clustered (never more than n), times (t(n - 1) / t(m))^2
+    for a variance known with m degrees of freedom, t Student's quantile at 97.5 %. V_clustered is by networks and images
+    (`robust.clustered_total`). Without repeats it is the exact binomial interval.
     Source: Clopper & Pearson, Biometrika 26 (1934) 404; Korn & Graubard, Survey Methodology 24 (1998) 193.
 
     Args:
@@ -38,7 +39,8 @@ def false_alarm_rate(
     """
     from scipy.special import betaincinv
 
-    from .robust import clustered_meat
+    from .few_groups import TWO_SIDED, student_quantile
+    from .robust import clustered_total
     from .trials import codes_from_labels
 
     alarm = np.asarray(false_alarm, dtype=float)
@@ -54,10 +56,9 @@ def false_alarm_rate(
             if 0 < codes.max() < n - 1:
                 groups.append(codes)
     if groups and 0 < count < n:
-        residual = (alarm - rate)[:, None]
-        variance = max(float(clustered_meat(residual, residual, [codes])[0, 0]) for codes in groups)
-        both = float(clustered_meat(residual, residual, groups)[0, 0])
-        effective = min(n, n * n * rate * (1 - rate) / max(variance, both, 1e-300))
+        variance, freedom = clustered_total(alarm - rate, groups)
+        few = float(student_quantile(TWO_SIDED, n - 1) / student_quantile(TWO_SIDED, freedom)) ** 2
+        effective = few * min(n, n * n * rate * (1 - rate) / max(variance, 1e-300))
     elif groups:
         # none or all: the spread cannot be seen, so one look for each level of the smaller factor is what is sure
         effective = float(min(int(codes.max()) + 1 for codes in groups))

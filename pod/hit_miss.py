@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..results import ByValue
+from .few_groups import ONE_SIDED, TWO_SIDED, Levels, not_short_of_likelihood, size_from_test, student_quantile
 from .likelihood import Curve, size_bound
 from .links import Link
 from .modified import modified_bound
+from .robust import Clustered
 from .separation import check_separation
 from .solver import fit_batch
 from .trials import Trials, group_by_size
@@ -37,8 +39,9 @@ Z_TWO_SIDED = 1.959963984540054
 class Bounds:
     """One bound by each construction, in the size's unit; None where the data support none.
 
-    modified: the likelihood ratio with Skovgaard's correction for few trials (see `modified.py`); None where the fit
-    is not a maximum-likelihood one of independent trials.
+    modified: the likelihood ratio with a correction for few trials (see `modified.py`, `_averaged_size.py`); None for a
+    bias-reduced fit and for scaled repeats. With clusters or random effects all three take Student's quantile (see
+    `few_groups.py`), and wald is the bound of Wald's test at each size (Fieller), or `modified` where that lies farther out.
     """
 
     likelihood_ratio: float | None = None
@@ -54,7 +57,7 @@ class CrossedEffects(ByValue):
     """Random effects on the scale of eta: standard deviations between networks and between images (None: not fitted).
 
     `a50_conditional` and `a90_conditional` are the sizes of an average network at an average image. covariance: of
-    (c0, c1, sd_network, sd_image), those that were fitted.
+    (c0, c1, sd_network, sd_image), those that were fitted. levels: what few networks and images add to a variance.
     """
 
     sd_network: float | None
@@ -64,6 +67,7 @@ class CrossedEffects(ByValue):
     a50_conditional: float | None
     a90_conditional: float | None
     covariance: Array = field(repr=False)
+    levels: Levels = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,8 +77,9 @@ class PodFit(ByValue):
     a90_95: one-sided 95 % upper bound on a90. a90_95_two_sided: upper end of the two-sided 95 % interval;
     a90_low_two_sided: its lower end. c0, c1 with se0, se1: coefficients per unit of size (of ln size if `log_size`).
     deviance: against the saturated model of the rows as given. `curve`: what bands and plots need (None where no fit).
-    `naive`: the same fit with the repeats ignored, beside a fit that heeds them. few_clusters: what the clustered bounds'
-    variance was multiplied by for Student's quantile.
+    `naive`: the same fit with the repeats ignored, beside a fit that heeds them. degrees_of_freedom: of Student's quantile in
+    the bounds on a90 where networks or images repeat (None: the normal's quantile). clustered: the variances of repeats
+    `cluster`. spread_unknown: networks or images repeat, and nothing tells how much they differ: no bounds and no band.
     """
 
     link: str
@@ -103,7 +108,9 @@ class PodFit(ByValue):
     warnings: tuple[str, ...] = ()
     curve: Curve | None = field(default=None, repr=False)
     crossed: CrossedEffects | None = None
-    few_clusters: float = 1.0
+    degrees_of_freedom: float | None = None
+    clustered: Clustered | None = field(default=None, repr=False)
+    spread_unknown: bool = False
     naive: "PodFit | None" = field(default=None, repr=False)
 
 
@@ -209,17 +216,18 @@ class Sizes:
     low: Bounds
     reaches_90: bool
     warnings: tuple[str, ...]
+    degrees_of_freedom: float | None = None
 
 
-def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, robust: Array | None = None) -> Sizes:
+def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: Clustered | None = None) -> Sizes:
     """a50, a90 and its bounds in the data's unit; a size outside the tested range is None with its reason.
 
     Args:
         curve: the fitted curve.
         table: the trials it was fitted to.
         log_size: whether the curve is on ln size.
-        robust: covariance (2, 2) to take for the Wald bounds, and for the likelihood's divisor at a90, in the place of
-            the curve's own.
+        clustered: variances to take in the place of the curve's own, with their degrees of freedom. Likelihood bounds are
+            then those of as many independent trials as have this variance of eta at a90 (the design effect).
     """
     notes: list[str] = []
     smallest, largest = float(curve.x[0]), float(curve.x[-1])
@@ -243,23 +251,35 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, robust: Arr
             notes.append(note)
     reaches_90 = (curve.link.eta_from_pod(0.9) - c0) / c1 <= largest
     one = two = low = NO_BOUNDS
+    freedom = math.inf
     if at[90] is not None:
         x90 = math.log(at[90]) if log_size else at[90]
         toward = np.array([1.0, x90])
-        covariance = curve.covariance if robust is None else robust
-        error = math.sqrt(max(float(toward @ covariance @ toward), 0.0)) / c1
-        divisor = curve.divisor
-        if robust is not None:
-            divisor *= float(toward @ robust @ toward) / float(toward @ curve.covariance @ toward)
-        judged = curve if robust is None else replace(curve, divisor=divisor)
+        error = math.sqrt(max(float(toward @ curve.covariance @ toward), 0.0)) / c1
+        judged = curve
+        if clustered is not None:
+            spread, freedom_at = clustered.variance(toward)
+            freedom = float(freedom_at)
+            judged = effective_trials(curve, float(spread) / float(toward @ curve.covariance @ toward))
         eta = curve.link.eta_from_pod(0.9)
         bounds = {}
-        for key, z, upper in (("one", Z_ONE_SIDED, True), ("two", Z_TWO_SIDED, True), ("low", Z_TWO_SIDED, False)):
+        for key, below, upper in (("one", ONE_SIDED, True), ("two", TWO_SIDED, True), ("low", TWO_SIDED, False)):
+            z = float(student_quantile(below, freedom))
             ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=x90)
-            wald = x90 + z * error if upper else x90 - z * error
+            wald: float | None = x90 + z * error if upper else x90 - z * error
+            if clustered is not None:
+                wald = size_from_test(
+                    lambda at: _excess(curve, clustered, eta=eta, x=at),
+                    below=below,
+                    upper=upper,
+                    start=x90,
+                    span=largest - smallest,
+                )
             modified = None
-            if curve.at_maximum and robust is None:
+            if curve.at_maximum:
                 modified = modified_bound(judged, eta=eta, z=z, upper=upper, start=ratio)
+            if clustered is not None:
+                wald = not_short_of_likelihood(wald, ratio if modified is None else modified, upper=upper)
             bounds[key] = Bounds(
                 likelihood_ratio=size_from_x(ratio, log_size=log_size),
                 wald=size_from_x(wald, log_size=log_size),
@@ -284,7 +304,27 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, robust: Arr
         low=low,
         reaches_90=bool(reaches_90),
         warnings=tuple(notes),
+        degrees_of_freedom=freedom if at[90] is not None and clustered is not None else None,
     )
+
+
+def effective_trials(curve: Curve, design_effect: float) -> Curve:
+    """The curve with its trials divided by the design effect: as many independent trials as would have its variance.
+
+    Source: Rao & Scott, Biometrics 48 (1992) 577, doi:10.2307/2532311.
+    """
+    return replace(
+        curve,
+        hits=curve.hits / design_effect,
+        misses=curve.misses / design_effect,
+        supremum=curve.supremum / design_effect,
+        covariance=curve.covariance * design_effect,
+    )
+
+
+def _excess(curve: Curve, clustered: Clustered, *, eta: float, x: float) -> tuple[float, float, float]:
+    variance, freedom = clustered.variance(np.array([1.0, x]))
+    return curve.coefficients[0] + curve.coefficients[1] * x - eta, float(variance), float(freedom)
 
 
 def size_in_range(

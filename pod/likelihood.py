@@ -147,7 +147,7 @@ def _wald_variance(curve: Curve, x: float) -> float:
     return float(toward @ curve.covariance @ toward) / max(curve.coefficients[1] ** 2, 1e-300)
 
 
-def eta_band(curve: Curve, x: Array, *, quantile: float) -> tuple[Array, Array]:
+def eta_band(curve: Curve, x: Array, *, quantile: Array | float) -> tuple[Array, Array]:
     """Likelihood-ratio limits (low, high) of eta at each x, each (point,); -inf and +inf where there is none.
 
     With a 1-degree quantile each point's own interval, with a 2-degree quantile the band of the whole curve.
@@ -160,7 +160,7 @@ def eta_band(curve: Curve, x: Array, *, quantile: float) -> tuple[Array, Array]:
     )
     limits = []
     for side in (-1.0, 1.0):
-        eta = centre + side * spread * math.sqrt(allowed)
+        eta = centre + side * spread * np.sqrt(allowed)
         slope = np.full(len(x), c1)
         for _ in range(60):
             value, slope, pull = profile(curve, x, eta, slope)

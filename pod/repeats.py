@@ -4,14 +4,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .crossed import fit_crossed
+from .crossed import ONE_NETWORK, SEPARATED, fit_crossed, without_bounds
 from .hit_miss import METHODS, PodFit, fit_pooled, sizes_from_curve
 from .links import Link, link_from_name
 from .mixed import LARGEST_SD
-from .robust import clustered_covariance, few_clusters_factor
+from .robust import FEWEST_CLUSTERS, clustered_curve
 from .trials import Trials, check_trials
 
 __all__ = ["REPEATS", "fit_cluster", "fit_crossed_where_finite", "fit_pod", "fit_scaled", "fit_trials"]
@@ -47,10 +48,11 @@ def fit_scaled(table: Trials, *, link: Link, log_size: bool, method: str) -> Pod
 def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> PodFit:
     """The pooled curve with intervals robust to repeats: two-way clustered by network and by image (or site).
 
-    Wald bounds take the sandwich covariance, likelihood-ratio bounds divide the likelihood by the inflation of the
-    variance of eta at a90; both with Student's quantile for the fewest clusters. The curve is a population-averaged
-    one.
-    Source: Cameron, Gelbach & Miller, J. Bus. Econ. Stat. 29 (2011) 238; Chandler & Bate, Biometrika 94 (2007) 167.
+    Variances are jackknifed (`robust.Clustered`), quantiles Student's with Satterthwaite's degrees of freedom, likelihood
+    bounds those of as many independent trials as have the same variance of eta at a90. The curve is a population-averaged
+    one. There are no bounds where nothing tells the variance: with two networks or images, where hits and misses do not
+    overlap, and where one network or image alone holds up the curve.
+    Source: Cameron, Gelbach & Miller, J. Bus. Econ. Stat. 29 (2011) 238; Rao & Scott, Biometrics 48 (1992) 577.
 
     Raises:
         InputError: neither network, image nor site is known.
@@ -70,21 +72,30 @@ def fit_cluster(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     notes = [note for note in naive.warnings if "bound" not in note]
     if not groups:
         return replace(naive, repeats="cluster", naive=naive)
-    covariance = clustered_covariance(table, naive.curve, groups=groups, log_size=log_size)
-    fewest = min(int(codes.max()) + 1 for codes in groups)
-    stretch = few_clusters_factor(fewest)
-    sizes = sizes_from_curve(naive.curve, table=table, log_size=log_size, robust=covariance * stretch)
-    if fewest < 20:
-        notes.append(f"only {fewest} clusters: cluster-robust intervals may be somewhat short below some 20")
+    if table.network is not None and table.network.max() == 0:
+        notes.append(ONE_NETWORK)
+    clustered = None
+    if naive.separated:
+        why = SEPARATED
+    elif any(codes.max() + 1 < FEWEST_CLUSTERS for codes in groups):
+        why = "two clusters (networks or images) differ in one way only, which tells no spread: no bounds on a90"
+    else:
+        why = "one network or image alone holds up the curve: no bounds on a90"
+        clustered = clustered_curve(table, naive.curve, groups=groups, log_size=log_size)
+    if clustered is None:
+        return without_bounds(replace(naive, repeats="cluster", naive=naive, warnings=(*notes, why)))
+    sizes = sizes_from_curve(naive.curve, table=table, log_size=log_size, clustered=clustered)
+    error0, error1 = (math.sqrt(float(clustered.variance(unit)[0])) for unit in np.eye(2))
     return replace(
         naive,
         repeats="cluster",
-        se0=math.sqrt(covariance[0, 0]),
-        se1=math.sqrt(covariance[1, 1]),
+        se0=error0,
+        se1=error1,
         a90_95=sizes.one_sided,
         a90_95_two_sided=sizes.two_sided,
         a90_low_two_sided=sizes.low,
-        few_clusters=stretch,
+        degrees_of_freedom=sizes.degrees_of_freedom,
+        clustered=clustered,
         warnings=tuple(dict.fromkeys((*notes, *sizes.warnings))),
         naive=naive,
     )

@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FitError, InputError
 from ..results import ByValue
-from .hit_miss import NO_BOUNDS, Z_ONE_SIDED, Z_TWO_SIDED, Bounds, size_from_x, size_in_range
+from .few_groups import ONE_SIDED, TWO_SIDED, size_from_test, student_quantile
+from .hit_miss import NO_BOUNDS, Bounds, size_from_x, size_in_range
 from .links import LINKS
-from .robust import clustered_meat
+from .robust import Clustered, clustered_fit
 from .trials import codes_from_labels
 
 Array = NDArray[np.float64]
@@ -117,6 +118,8 @@ def fit_response_pod(
     matrix = np.array([[1.0, 0.0, -threshold], [0.0, 1.0, 0.0]])
     parameter_covariance = np.linalg.inv(line.information(line.q))
     divisor = 1.0
+    clustered: Clustered | None = None
+    unknown = False
     if repeats == "cluster":
         groups = [
             codes
@@ -126,14 +129,13 @@ def fit_response_pod(
             )
             if codes is not None and codes.max() > 0
         ]
+        robust = parameter_covariance
         if groups:
-            scores = line.score_rows(line.q)
-            meat = clustered_meat(scores, scores, groups)
-            if np.linalg.eigvalsh(meat).min() <= 0:
-                meat = sum((clustered_meat(scores, scores, [codes]) for codes in groups), np.zeros((3, 3)))
-            robust = parameter_covariance @ meat @ parameter_covariance
+            clustered = clustered_fit(line.score_rows(line.q), line.information_rows(line.q), groups)
+            unknown = clustered is None
+            if clustered is not None:
+                robust = clustered.covariance()
         else:
-            robust = parameter_covariance
             notes.append("no repeated network or image: the bounds are those of independent rows")
     elif repeats == "pooled":
         robust = parameter_covariance
@@ -157,20 +159,40 @@ def fit_response_pod(
         a50, a90 = found[50], found[90]
     else:
         notes.append("the response does not rise with size: no a50 and no a90")
-    if a90 is not None:
+    if a90 is not None and unknown:
+        notes.append(
+            "fewer than three networks or images, or one that alone holds up the line, tell no spread: no bounds on a90"
+        )
+    elif a90 is not None:
         x90 = (_PROBIT.eta_from_pod(0.9) - c0) / c1
         toward = np.array([1.0, x90])
-        variance = float(toward @ covariance @ toward)
+        variance, freedom = float(toward @ covariance @ toward), math.inf
+        if clustered is not None:
+            spread, freedom_at = clustered.variance(toward @ matrix)
+            variance, freedom = float(spread), float(freedom_at)
         error = math.sqrt(variance) / c1
         divisor = variance / float(toward @ matrix @ parameter_covariance @ matrix.T @ toward)
+
+        def wald(below: float, z: float, side: float) -> float | None:
+            if clustered is None:
+                return x90 + side * z * error
+            variances = clustered.variance
+
+            def excess(at: float) -> tuple[float, float, float]:
+                value, m = variances(np.array([1.0, at]) @ matrix)
+                return c0 + c1 * at - _PROBIT.eta_from_pod(0.9), float(value), float(m)
+
+            return size_from_test(excess, below=below, upper=side > 0, start=x90, span=largest - smallest)
+
         bounds = [
             Bounds(
                 likelihood_ratio=size_from_x(
                     _bound(line, threshold, x90, side * z * error, z * z * divisor), log_size=log_size
                 ),
-                wald=size_from_x(x90 + side * z * error, log_size=log_size),
+                wald=size_from_x(wald(below, z, side), log_size=log_size),
             )
-            for z, side in ((Z_ONE_SIDED, 1.0), (Z_TWO_SIDED, 1.0), (Z_TWO_SIDED, -1.0))
+            for below, side in ((ONE_SIDED, 1.0), (TWO_SIDED, 1.0), (TWO_SIDED, -1.0))
+            for z in (float(student_quantile(below, freedom)),)
         ]
         one, two, low = bounds
         if two.likelihood_ratio is None:
@@ -246,6 +268,13 @@ class _Line:
         matrix = (self.rows * -second[:, None]).T @ self.rows
         matrix[2, 2] += self.exact.sum() / q[2] ** 2
         return np.asarray(matrix)
+
+    def information_rows(self, q: Array) -> Array:
+        """Contribution of each row to the information, (row, 3, 3)."""
+        _, _, second = self.terms(q)
+        rows = -second[:, None, None] * self.rows[:, :, None] * self.rows[:, None, :]
+        rows[:, 2, 2] += self.exact / q[2] ** 2
+        return np.asarray(rows)
 
     def score_rows(self, q: Array) -> Array:
         _, first, _ = self.terms(q)

@@ -25,7 +25,15 @@ if TYPE_CHECKING:
     from .network import build_network, choose_device, predict_probabilities
     from .recipe import RECIPES, Recipe, recipe_for_fine_tuning
     from .runs import detect_with_networks, split_for_training, train_networks
-    from .runs_io import NetworkResult, Runs, finished_networks, open_runs, read_result, read_weights
+    from .runs_io import (
+        NetworkResult,
+        Runs,
+        finished_networks,
+        open_runs,
+        read_result,
+        read_weights,
+        recipe_of_start,
+    )
     from .scaling import SCALINGS, crop_to_shape, pad_to_multiple, scale_min_max, scale_residual
     from .segmenters import Segmenter, detect_with_segmenters, segmenter_from_module, segmenter_from_onnx
     from .training import EpochResult, TrainingState, count_epochs, iterate_training, learning_rate_at
@@ -49,7 +57,15 @@ _LAZY = {
     "network": ("build_network", "choose_device", "predict_probabilities"),
     "recipe": ("RECIPES", "Recipe", "recipe_for_fine_tuning"),
     "runs": ("detect_with_networks", "split_for_training", "train_networks"),
-    "runs_io": ("NetworkResult", "Runs", "finished_networks", "open_runs", "read_result", "read_weights"),
+    "runs_io": (
+        "NetworkResult",
+        "Runs",
+        "finished_networks",
+        "open_runs",
+        "read_result",
+        "read_weights",
+        "recipe_of_start",
+    ),
     "scaling": ("SCALINGS", "crop_to_shape", "pad_to_multiple", "scale_min_max", "scale_residual"),
     "segmenters": ("Segmenter", "detect_with_segmenters", "segmenter_from_module", "segmenter_from_onnx"),
     "training": ("EpochResult", "TrainingState", "count_epochs", "iterate_training", "learning_rate_at"),
@@ -97,6 +113,7 @@ __all__ = [
     "read_weights",
     "recall_in_mask",
     "recipe_for_fine_tuning",
+    "recipe_of_start",
     "scale_min_max",
     "scale_residual",
     "segmenter_from_module",

@@ -139,7 +139,9 @@ def rate_of_crossed_trials(
     The variance of the mean is that of crossed random effects, S_image^2 / M + S_network^2 / N - S_rest^2 / (N M), with
     S^2 the sample variances of the image means, of the network means and of what is left; it is never less than that of
     N M independent trials. It gives the number n* = p (1 - p) / variance of independent trials worth the same (the
-    number of images M where p is 0 or 1, or where there is one network), and Clopper-Pearson's interval is taken at n*.
+    number of images M where p is 0 or 1, or where there is one network), times (t(N M - 1) / t(m))^2 for a variance known
+    with m degrees of freedom (Satterthwaite), t Student's quantile. Clopper-Pearson's interval is taken at n*. With one
+    network the interval is of that network.
 
     Args:
         successes: (trial,) 0 or 1 (or shares, such as recalls), each network on each image once.
@@ -152,7 +154,7 @@ def rate_of_crossed_trials(
     Source: Clopper and Pearson 1934; Korn and Graubard 1998, Survey Methodology 24:193 (effective sample size); Owen
     2007, Ann. Appl. Stat. 1:386 (crossed effects).
     """
-    from scipy.special import betaincinv
+    from scipy.special import betaincinv, stdtrit
 
     values = np.asarray(successes, dtype=np.float64)
     if not values.size:
@@ -171,7 +173,11 @@ def rate_of_crossed_trials(
         from_networks = float(network_mean.var(ddof=1)) / n_networks
         variance = from_images + from_networks - rest_variance / (n_images * n_networks)
         binomial = share * (1.0 - share) / values.size
-        effective = share * (1.0 - share) / max(variance, from_images, from_networks, binomial)
+        variance = max(variance, from_images, from_networks, binomial)
+        parts = from_images**2 / (n_images - 1) + from_networks**2 / (n_networks - 1)
+        freedom = max(variance**2 / parts, 1.0) if parts > 0 else np.inf
+        few = (float(stdtrit(values.size - 1, 0.975)) / float(stdtrit(min(freedom, values.size - 1), 0.975))) ** 2
+        effective = few * share * (1.0 - share) / variance
     tail = (1.0 - confidence) / 2.0
     count = share * effective
     low = float(betaincinv(count, effective - count + 1.0, tail)) if count > 0 else 0.0

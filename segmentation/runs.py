@@ -14,6 +14,7 @@ from .examples import examples_from_dataset
 from .network import build_network, probabilities_from_scaled
 from .recipe import Recipe
 from .runs_io import (
+    OF_NETWORK,
     NetworkResult,
     Runs,
     create_or_resume_runs,
@@ -286,8 +287,7 @@ def _state_or_none(runs: Runs, number: int, say: Callable[[str], None]) -> Train
 
 def _starting_weights(path: Any, recipe: Recipe) -> dict[str, Any]:
     held, weights = read_weights(path)
-    names = ("scaling", "classes", "architecture", "encoder", "encoder_depth")
-    different = [name for name in names if getattr(held, name) != getattr(recipe, name)]
+    different = [name for name in OF_NETWORK if getattr(held, name) != getattr(recipe, name)]
 
     def said(of: Recipe) -> str:
         values = ((name.replace("_", " "), getattr(of, name)) for name in different)

@@ -317,6 +317,30 @@ def starting_weights_files(path: str | os.PathLike[str], networks: Iterable[int]
     return {number: network_folder(runs, number) / "weights.pt" for number in networks}
 
 
+OF_NETWORK = ("scaling", "classes", "architecture", "encoder", "encoder_depth")
+
+
+def recipe_of_start(path: str | os.PathLike[str], *, otherwise: Recipe) -> tuple[Recipe, bool]:
+    """The recipe of networks that start from trained ones, and whether its length and rate are those of fine-tuning already.
+
+    Networks that were fine-tuned themselves give the whole recipe; others say what network it is, and `otherwise` the rest.
+
+    Args:
+        path: a RUNS folder, a weights.pt of one, or a .safetensors file.
+        otherwise: how a network is trained, as far as the start does not say it.
+
+    Raises:
+        FileFormatError: not there, or another kind of file.
+    """
+    source = Path(path)
+    folder = source if source.is_dir() else source.parent.parent
+    runs = open_runs(folder) if source.is_dir() or (folder / "run.json").is_file() else None
+    held = runs.recipe if runs is not None else read_weights(source)[0]
+    if runs is not None and runs.configuration.get("started_from"):
+        return held, True
+    return dataclasses.replace(otherwise, **{name: getattr(held, name) for name in OF_NETWORK}), False
+
+
 def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     different = []
     for key in ("dataset_sha256", "seed", "started_from", "fresh_noise"):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..acquisition.dataset_io import Dataset
 
 _BATCH = 8
+CLASSES = ("exclusive", "independent")  # how the classes of one pixel stand to each other
 
 
 class Segmenter(Protocol):
@@ -35,18 +36,32 @@ def segmenter_from_module(
     *,
     scaling: str | None = None,
     probabilities: bool = False,
+    classes: str | None = None,
     device: str = "cpu",
     multiple_px: int = 32,
+    warn: Callable[[str], None] | None = None,
 ) -> Segmenter:
     """A torch module as a segmenter; it is put into evaluation mode.
 
+    What its answer means follows from its shape:
+
+    - (image, row, column) or one class, (image, 1, row, column): a sigmoid makes probabilities of logits.
+    - several classes, (image, class, row, column): the last one is the foreign object. Logits do not tell whether a pixel has one
+      class or may have several, so `classes` says it: `exclusive` takes a softmax over the classes, `independent` a sigmoid of
+      the last. Without it they are taken as exclusive, and `warn` is told so.
+    - whole numbers or truth values, (image, row, column): marks, 0 or 1 (an argmax over two classes).
+
     Args:
-        module: called with (image, 2, row, column) float32; gives (image, row, column), or (image, class, row, column) whose last
-            class is the foreign object.
+        module: called with (image, 2, row, column) float32.
         scaling: of the images that it was trained on, a key of `SCALINGS`; None: log images as they are.
-        probabilities: whether it gives these; False: logits, which a sigmoid makes probabilities of.
+        probabilities: whether it gives these; False: logits.
+        classes: `exclusive`, `independent`, or None.
         device: torch device that it is brought to.
         multiple_px: images are padded to a multiple of it, as networks with a stride ask for; 1: not at all.
+        warn: called once with a line where the classes were taken as exclusive without being told.
+
+    Raises:
+        InputError: an unknown scaling or word for the classes; when called, an answer of another shape, or labels above 1.
 
     Example:
         >>> import numpy as np, torch
@@ -61,9 +76,15 @@ def segmenter_from_module(
     def run(batch: NDArray[np.float32]) -> NDArray[Any]:
         with torch.inference_mode():
             found = network(torch.from_numpy(batch).to(device))
-            return np.asarray((found if probabilities else found.sigmoid()).float().cpu().numpy())
+            if not isinstance(found, torch.Tensor):
+                raise InputError(
+                    "torch module", received=f"an answer that is a {type(found).__name__}", expected="one tensor"
+                )
+            return np.asarray((found.float() if found.is_floating_point() else found).cpu().numpy())
 
-    return _scaled(run, scaling=scaling, multiple_px=multiple_px)
+    return _scaled(
+        run, scaling=scaling, multiple_px=multiple_px, probabilities=probabilities, classes=classes, warn=warn
+    )
 
 
 def segmenter_from_onnx(
@@ -71,7 +92,9 @@ def segmenter_from_onnx(
     *,
     scaling: str | None = None,
     probabilities: bool = False,
+    classes: str | None = None,
     multiple_px: int = 32,
+    warn: Callable[[str], None] | None = None,
 ) -> Segmenter:
     """The network of an ONNX file as a segmenter, run by onnxruntime on the processor; arguments as of `segmenter_from_module`.
 
@@ -116,27 +139,67 @@ def segmenter_from_onnx(
                 received=f"images of {batch.shape[1:]} that the network refuses ({str(error).strip().splitlines()[0]})",
                 expected=f"its input, {inputs[0].shape}",
             ) from None
-        values = np.asarray(found, dtype=np.float64)
-        return values if probabilities else 1.0 / (1.0 + np.exp(-np.clip(values, -700, 700)))
+        return np.asarray(found)
 
-    return _scaled(run, scaling=scaling, multiple_px=multiple_px)
+    return _scaled(
+        run, scaling=scaling, multiple_px=multiple_px, probabilities=probabilities, classes=classes, warn=warn
+    )
 
 
 def _scaled(
-    run: Callable[[NDArray[np.float32]], NDArray[Any]], *, scaling: str | None, multiple_px: int
+    run: Callable[[NDArray[np.float32]], NDArray[Any]],
+    *,
+    scaling: str | None,
+    multiple_px: int,
+    probabilities: bool,
+    classes: str | None,
+    warn: Callable[[str], None] | None,
 ) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     if scaling is not None and scaling not in SCALINGS:
         raise InputError("scaling", received=repr(scaling), expected="None or one of " + ", ".join(SCALINGS))
 
+    if classes is not None and classes not in CLASSES:
+        raise InputError("classes", received=repr(classes), expected="None or one of " + ", ".join(CLASSES))
+    told = False
+
     def segment(images: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = images if scaling is None else np.stack([SCALINGS[scaling](image) for image in images])
         padded = pad_to_multiple(np.asarray(wanted, dtype=np.float32), multiple=multiple_px)
-        found = run(np.ascontiguousarray(padded))
-        if found.ndim == 4:
-            found = found[:, -1]  # the last class is the foreign object
+        nonlocal told
+        answer = run(np.ascontiguousarray(padded))
+        found = _object_probability(answer, probabilities=probabilities, classes=classes)
+        if classes is None and not probabilities and answer.ndim == 4 and answer.shape[1] > 1 and not told:
+            told = True
+            if warn is not None:
+                warn(
+                    f"logits of {answer.shape[1]} classes: taken as exclusive (softmax), the last one as the foreign object;"
+                    " say classes independent where a pixel may have several"
+                )
         return np.asarray(crop_to_shape(found, shape=images.shape[-2:]), dtype=np.float32)
 
     return segment
+
+
+def _object_probability(answer: NDArray[Any], *, probabilities: bool, classes: str | None) -> NDArray[Any]:
+    """Probability of the foreign object (image, row, column) from a network's answer; see `segmenter_from_module`."""
+    if answer.dtype.kind in "bui":
+        if answer.ndim != 3 or not np.all((answer == 0) | (answer == 1)):
+            raise InputError(
+                "network",
+                received=f"whole numbers of shape {answer.shape} up to {np.max(answer)}",
+                expected="marks 0 or 1, (image, row, column)",
+                remedy="give a function that marks the foreign object's class, or the network before its argmax",
+            )
+        return answer.astype(np.float64)
+    values = answer.astype(np.float64)
+    several = values.ndim == 4 and values.shape[1] > 1
+    if not probabilities:
+        if several and classes != "independent":
+            values = np.exp(values - values.max(axis=1, keepdims=True))
+            values /= values.sum(axis=1, keepdims=True)
+        else:
+            values = 1.0 / (1.0 + np.exp(-np.clip(values, -700, 700)))
+    return np.asarray(values[:, -1] if values.ndim == 4 else values)
 
 
 def detect_with_segmenters(

@@ -170,7 +170,11 @@ def test_the_decision_says_what_was_asked_and_what_was_found(answer):
         " 3 uGy. Of 3 settings 1 meets it, 1 is open, 1 fails. Take a90 1.5:"
     )
     assert "a90 at most 1.8 mm, asked for 2 mm (10 % to spare)" in sentence
-    assert answer["decision"]["settings"][2]["limited_by"] == ["detection", "throughput", "false_alarms"]
+    # a setting is held back by what fails; what was not tried is not yet known
+    assert answer["decision"]["settings"][2]["limited_by"] == ["detection", "throughput"]
+    assert answer["decision"]["settings"][2]["not_yet_known"] == ["false_alarms"]
+    assert answer["decision"]["settings"][1]["limited_by"] == []
+    assert answer["decision"]["settings"][1]["not_yet_known"] == ["detection", "false_alarms"]
     # a change that changes nothing is no advice
     assert [one["kind"] for one in answer["decision"]["settings"][0]["changes"]] == ["quanta"]
 
@@ -179,7 +183,7 @@ def test_where_nothing_meets_it_the_closest_is_named_with_what_is_missing():
     rows = [row(upper=2.1)]
     judged = [judge_row(rows[0], ASKED)]
     text = decide(rows, ASKED, judged, recommended=0, unit="mm", changes_by="")["sentence"]
-    assert "0 meet it, 1 is open" in text and "comes closest and is open in detection" in text
+    assert "0 meet it, 1 is open" in text and "comes closest; not yet known: detection" in text
     assert "(5 % too much)" in text
     assert "None was tried" in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]
 

@@ -107,7 +107,9 @@ def test_every_further_option_adds_its_part(capsys, tmp_path):
     assert result["covariates"]["held"]["size_mm"] > 0
     assert all(Path(path).exists() for path in result["plots"])
     assert (tmp_path / "curve.csv").read_text().startswith("contrast,pod,")
-    assert any("intervals are too narrow" in note for note in result["warnings"])
+    assert result["lapse"]["ceiling"]["value"] > 0.5
+    assert result["lapse"]["ceiling"]["low"] is result["lapse"]["a90_95"] is None
+    assert any("values without intervals" in note for note in result["warnings"])
     again = answer_of(capsys, *words, "--json")
     assert again["bootstrap"] == result["bootstrap"]
     assert main(words) == 0

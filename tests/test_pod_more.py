@@ -270,7 +270,8 @@ def test_the_property_that_made_the_hits_explains_them_best():
     assert found[0].gain > found[1].gain > 0.05
     assert abs(found[2].gain) < 0.02
     assert found[1].behind > 2 * found[1].behind_error
-    assert found[0].p_beyond < 1e-6
+    # Student's distribution with some five degrees of freedom: a deviation of nine standard errors
+    assert found[0].p_beyond < 1e-3
     assert found[2].p_beyond > 1e-4
     assert 0.4 < found[2].area < 0.6
     assert joint.robust

@@ -10,8 +10,9 @@ from raytwin.errors import FitError, InputError
 from raytwin.pod import LINKS, PodFit, bootstrap_pod, check_trials, curve_with_band, false_alarm_rate, fit_many, fit_pod
 from raytwin.pod._laplace import Laplace
 from raytwin.pod.bootstrap import bootstrap_weights
+from raytwin.pod.few_groups import levels_of
 from raytwin.pod.mixed import averaged_eta, averaged_pod, fit_mixed
-from raytwin.pod.robust import clustered_meat
+from raytwin.pod.robust import clustered_curve, clustered_meat, score_rows
 
 
 def crossed_data(seed: int, networks: int = 8, images: int = 60, sds=(0.5, 0.8), link: str = "cloglog"):
@@ -138,6 +139,9 @@ def test_repeats_widen_the_interval_and_the_naive_one_stands_beside():
     assert fit.a90_low_two_sided.likelihood_ratio < fit.a90 < fit.a90_95.likelihood_ratio
     assert fit.a90_95.likelihood_ratio < fit.a90_95_two_sided.likelihood_ratio
     assert fit.a90_95.modified < fit.a90_95_two_sided.modified
+    # Wald's bound does not stop short of the likelihood's
+    assert fit.a90_95.wald >= fit.a90_95.modified
+    assert fit.a90_low_two_sided.wald <= fit.a90_low_two_sided.modified
 
 
 def test_without_effects_the_crossed_curve_is_the_pooled_one():
@@ -156,10 +160,10 @@ def test_crossed_fit_finds_the_effects_that_made_the_data():
     assert abs(fit.c1 - 20.0) < 4 * fit.se1
 
 
-def test_one_network_leaves_its_spread_out_and_says_so():
+def test_the_curve_of_one_network_is_said_to_be_of_it_alone():
     data = crossed_data(8, networks=1)
     fit = fit_pod(**data, repeats="crossed")
-    assert any("only one network" in note for note in fit.warnings)
+    assert any("of this network alone" in note for note in fit.warnings)
     assert fit.a90 == pytest.approx(fit.naive.a90)
 
 
@@ -169,12 +173,92 @@ def test_one_image_is_one_size():
     assert any("same size" in note for note in fit.warnings)
 
 
-def test_few_networks_are_warned_of():
-    fit = fit_pod(**crossed_data(9, networks=3), repeats="crossed")
-    assert any("only 3 networks" in note for note in fit.warnings)
+def test_few_networks_widen_the_bounds_by_students_quantile():
+    """The same looks at the same images: with the quantile of few networks in the place of the normal's."""
+    fit = fit_pod(**crossed_data(9, networks=3, sds=(1.0, 0.5)), repeats="crossed")
+    assert fit.crossed.sd_network > 0.3
+    assert 1 <= fit.degrees_of_freedom < 10
+    many = fit_pod(**crossed_data(9, networks=25, sds=(1.0, 0.5)), repeats="crossed")
+    assert many.degrees_of_freedom > 2 * fit.degrees_of_freedom
+    # nothing stands beside the bounds to say that they are not to be believed
+    assert not [note for note in fit.warnings if "low" in note or "short" in note]
 
 
-def test_separated_repeats_give_the_bias_reduced_curve_and_say_that_repeats_are_ignored():
+def test_the_mean_of_few_levels_has_their_degrees_of_freedom_and_variance():
+    # looks without noise of their own: Student's t of k levels, variance sd^2 / (k - 1) from the maximum-likelihood sd
+    k, sd = 4, 0.7
+    found = levels_of(np.array([sd]), [np.full(k, 1 / k)], information=1e12)
+    variance, freedom = found.spread(sd**2 / k, 1.0)
+    assert float(variance) == pytest.approx(sd**2 / (k - 1))
+    assert float(freedom) == pytest.approx(k - 1)
+    # half of the variance from elsewhere: four times the degrees of freedom
+    _, freedom = found.spread(sd**2 / k + sd**2 / (k - 1), 1.0)
+    assert float(freedom) == pytest.approx(4 * (k - 1), rel=1e-6)
+
+
+def test_clusters_alike_in_design_have_one_degree_less_than_their_number():
+    data = crossed_data(12, networks=6)
+    table = check_trials(data["size"], data["hits"], network=data["network"])
+    curve = fit_pod(data["size"], data["hits"]).curve
+    found = clustered_curve(table, curve, groups=[table.network], log_size=False)
+    direction = np.array([[1.0, 0.1], [1.0, 0.3]])
+    variance, freedom = found.variance(direction)
+    assert freedom == pytest.approx([5.0, 5.0])
+    # each leaves out a sixth of the same design: steps are 6/5 of the influence, and the variance k / (k - 1) of their squares
+    scores = score_rows(table, curve, log_size=False)
+    x = data["size"]
+    parts = curve.link.log_parts(curve.coefficients[0] + curve.coefficients[1] * x)
+    design = np.stack((np.ones_like(x), x), axis=1)
+    inverse = np.linalg.inv((design * (-parts.log_hit_1 * parts.log_miss_1)[:, None]).T @ design)
+    influence = np.stack([scores[data["network"] == k].sum(axis=0) for k in range(6)]) @ inverse
+    assert variance == pytest.approx(1.2 * ((direction @ influence.T) ** 2).sum(axis=1))
+
+
+def test_a_cluster_with_far_more_weight_than_the_others_leaves_few_degrees_of_freedom():
+    random = np.random.default_rng(5)
+    image = np.concatenate((np.zeros(300, int), np.arange(1, 11).repeat(6)))
+    size = random.uniform(0.01, 0.35, len(image))
+    hit = (random.random(len(image)) < LINKS["logit"].pod_from_eta(-2.5 + 20 * size)).astype(float)
+    table = check_trials(size, hit, image=image)
+    curve = fit_pod(size, hit, link="logit").curve
+    found = clustered_curve(table, curve, groups=[table.image], log_size=False)
+    assert 1 <= float(found.variance(np.array([1.0, 0.2]))[1]) < 3
+
+
+def test_bounds_of_three_networks_cover_as_often_as_they_say():
+    """Looks that follow one curve and share luck by network and image (a Gaussian copula)."""
+    from scipy.special import ndtr
+
+    random = np.random.default_rng(9)
+    link, (c0, c1) = LINKS["logit"], (-2.5, 20.0)
+    true = (link.eta_from_pod(0.9) - c0) / c1
+    network, image = (codes.ravel() for codes in np.indices((3, 60)))
+    covered = []
+    for _ in range(200):
+        size = random.uniform(0.01, 0.45, 60)[image]
+        luck = math.sqrt(0.2) * random.normal(size=3)[network] + math.sqrt(0.3) * random.normal(size=60)[image]
+        hit = ndtr(luck + math.sqrt(0.5) * random.normal(size=180)) < link.pod_from_eta(c0 + c1 * size)
+        fit = fit_pod(size, hit.astype(float), link="logit", repeats="cluster", network=network, image=image)
+        bound = fit.a90_95.modified or fit.a90_95.likelihood_ratio
+        if bound is not None:
+            covered.append(bound >= true)
+    assert len(covered) > 180
+    # three standard errors of a share of 95 %
+    assert np.mean(covered) > 0.95 - 3 * math.sqrt(0.95 * 0.05 / len(covered))
+
+
+def test_two_networks_tell_no_spread_to_the_clustered_curve():
+    fit = fit_pod(**crossed_data(9, networks=2), repeats="cluster")
+    assert fit.a90 is not None
+    assert fit.a90_95.likelihood_ratio is None
+    assert fit.a90_95.wald is None
+    assert any("two clusters" in note for note in fit.warnings)
+    _, low, high = curve_with_band(fit, [0.1, 0.2])
+    assert np.all(low < 1e-12)
+    assert np.all(high > 1 - 1e-12)
+
+
+def test_separated_repeats_give_the_bias_reduced_curve_without_bounds():
     size = np.tile(np.linspace(0.1, 1, 10), 3)
     fit = fit_pod(
         size,
@@ -185,7 +269,10 @@ def test_separated_repeats_give_the_bias_reduced_curve_and_say_that_repeats_are_
     )
     assert fit.separated
     assert fit.method == "firth"
-    assert any("ignore the repeats" in note for note in fit.warnings)
+    assert fit.a90 is not None
+    assert fit.a90_95.likelihood_ratio is None
+    assert fit.a90_95_two_sided.wald is None
+    assert any("there are no bounds" in note for note in fit.warnings)
 
 
 def test_bias_reduction_with_random_effects_is_refused_with_a_way_out():

@@ -139,6 +139,10 @@ def test_results_have_pages_and_other_things_are_refused(tmp_path: Path) -> None
     curve = rt.fit_pod(POD_TABLE, link="logit")
     pod = rt.report(curve, tmp_path / "pod.html", interactive=False).read_text(encoding="utf-8")
     assert curve.a90 is not None and f"{curve.a90:.3g}" in pod
+    # a table of hits is fitted as `fit_pod` does by default
+    of_table = rt.report(POD_TABLE, tmp_path / "table.html", interactive=False).read_text(encoding="utf-8")
+    usual = rt.fit_pod(POD_TABLE)
+    assert usual.a90 is not None and f"{usual.a90:.3g}" in of_table
     with pytest.raises(InputError, match=r"ends in \.html"):
         rt.report(curve, tmp_path / "pod.png")
     with pytest.raises(InputError, match="expected a twin, a validation"):

@@ -108,8 +108,23 @@ def test_identical_networks_are_worth_one():
     repeated = rate_of_crossed_trials(
         np.tile(one, 10), networks=np.repeat(np.arange(10), 40), images=np.tile(np.arange(40), 10)
     )
-    # the sample variance of the image means has 39 in its denominator where the binomial one has 40
-    assert (repeated.low, repeated.high) == pytest.approx((alone.low, alone.high), abs=0.005)
+    # the variance of 40 images is known with 39 degrees of freedom, which alone is that of a binomial: 5 % of the number
+    assert (repeated.low, repeated.high) == pytest.approx((alone.low, alone.high), abs=0.01)
+    assert repeated.low < alone.low
+    assert repeated.high > alone.high
+
+
+def test_few_networks_that_differ_widen_the_interval_by_students_quantile():
+    # three networks with shares 0.2, 0.5 and 0.8: t of two degrees of freedom leaves (1.96 / 4.30)^2 of the looks' worth
+    hits = np.concatenate([np.arange(100) < 100 * share for share in (0.2, 0.5, 0.8)])
+    networks, images = (
+        np.repeat(np.arange(3), 100),
+        np.concatenate([np.random.default_rng(k).permutation(100) for k in range(3)]),
+    )
+    found = rate_of_crossed_trials(hits, networks=networks, images=images)
+    mean_error = np.std([0.2, 0.5, 0.8], ddof=1) / np.sqrt(3)
+    assert found.high - found.low > 2 * 1.96 * mean_error
+    assert found.low < 0.5 - 1.9 * mean_error
 
 
 def test_independent_trials_are_worth_all_of_them():

@@ -72,6 +72,62 @@ def test_scaling_and_padding_are_those_that_were_asked_for():
         segmenter_from_module(Looks(), scaling="minmax")
 
 
+def test_several_classes_are_exclusive_unless_it_is_said_and_said_where_it_is_taken():
+    torch = pytest.importorskip("torch", reason="needs the extra `segmentation`")
+    images = np.random.default_rng(2).uniform(0.1, 2.0, (2, 2, 32, 32)).astype(np.float32)
+    network = torch.nn.Conv2d(2, 3, 1)
+    with torch.inference_mode():
+        logits = network(torch.from_numpy(images))
+    lines = []
+    found = segmenter_from_module(network, warn=lines.append)
+    assert np.allclose(found(images), logits.softmax(dim=1)[:, 2].numpy(), atol=1e-6)
+    found(images)
+    assert len(lines) == 1 and "logits of 3 classes: taken as exclusive (softmax)" in lines[0]
+    lines.clear()
+    said = segmenter_from_module(network, classes="exclusive", warn=lines.append)
+    assert np.allclose(said(images), found(images))
+    apart = segmenter_from_module(network, classes="independent", warn=lines.append)
+    assert np.allclose(apart(images), logits[:, 2].sigmoid().numpy(), atol=1e-6)
+    one = segmenter_from_module(torch.nn.Conv2d(2, 1, 1), warn=lines.append)(images)
+    assert one.shape == (2, 32, 32) and not lines
+    with pytest.raises(InputError, match=r"classes.*exclusive, independent"):
+        segmenter_from_module(network, classes="both")
+
+
+def test_labels_of_two_classes_are_marks_and_of_more_are_refused():
+    torch = pytest.importorskip("torch", reason="needs the extra `segmentation`")
+    images = np.random.default_rng(2).uniform(0.1, 2.0, (2, 2, 32, 32)).astype(np.float32)
+
+    class Largest(torch.nn.Module):
+        def __init__(self, classes):
+            super().__init__()
+            self.inner = torch.nn.Conv2d(2, classes, 1)
+
+        def forward(self, batch):
+            return self.inner(batch).argmax(dim=1)
+
+    two = Largest(2)
+    with torch.inference_mode():
+        expected = two(torch.from_numpy(images)).numpy()
+    assert np.array_equal(segmenter_from_module(two)(images), expected)
+    many = Largest(3)
+    with torch.no_grad():
+        many.inner.bias[:] = torch.tensor([0.0, 0.0, 50.0])
+    with pytest.raises(InputError, match=r"whole numbers .* up to 2; expected marks 0 or 1"):
+        segmenter_from_module(many)(images)
+
+
+def test_a_module_of_several_classes_is_told_of_by_detect(references):
+    torch = pytest.importorskip("torch", reason="needs the extra `segmentation`")
+    network = weighted(torch)
+    told = rt.detect(network, references, split="all")
+    assert [line for line in told.warnings if "2 classes" in line]
+    # a class whose logit is 0: the softmax is the sigmoid of the other
+    said = rt.detect(network, references, split="all", classes="independent")
+    assert not said.warnings
+    assert said.rows == told.rows
+
+
 def test_an_onnx_file_gives_what_its_module_gives(references, tmp_path):
     torch = pytest.importorskip("torch", reason="needs the extra `segmentation`")
     pytest.importorskip("onnxruntime", reason="needs the extra `onnx`")

@@ -28,6 +28,7 @@ from raytwin.segmentation import (
     predict_probabilities,
     read_weights,
     recipe_for_fine_tuning,
+    recipe_of_start,
     split_for_training,
     train_networks,
 )
@@ -501,6 +502,31 @@ def test_networks_of_a_folder_start_from_the_ones_of_the_same_number(dataset_fil
         assert held == {str(number): trained[1][number].weights_sha256 for number in (0, 1)}
         with pytest.raises(InputError, match=r"start from: got .* finished networks \[0, 1\].*train network 2 there"):
             train_networks(dataset, tmp_path / "s", recipe=recipe, networks=3, start_from=trained[0])
+
+
+def test_the_command_goes_on_from_networks_that_were_fine_tuned_from_the_starter(dataset_file, tmp_path, capsys):
+    """The folder knows encoder, depth, scaling and length: none of them stands on the command line."""
+    pytest.importorskip("safetensors", reason="needs the extra `segmentation`")
+    first, second, third = (str(tmp_path / name) for name in ("a", "b", "c"))
+    words = ["train", str(dataset_file), "--steps", "2", "--batch", "2", "--device", "cpu"]
+    assert main([*words, "-o", first, "--start-from", "starter"]) == 0
+    assert main([*words, "-o", second, "--start-from", first]) == 0
+    held, again = (open_runs(path).recipe for path in (first, second))
+    assert again == held
+    # a length on the command line is the one that counts, and a file of weights knows as much as its folder
+    weights = network_folder(open_runs(second), 0) / "weights.pt"
+    assert main([*words, "-o", third, "--start-from", str(weights), "--learning-rate", "1e-5"]) == 0
+    assert open_runs(third).recipe == dataclasses.replace(held, learning_rate=1e-5)
+    capsys.readouterr()
+
+
+def test_networks_that_were_not_fine_tuned_say_what_they_are_and_no_more(trained):
+    held = open_runs(trained[0]).recipe
+    other = dataclasses.replace(RECIPES["raytwin"], encoder="resnet18", scaling="min_max")
+    recipe, tuned = recipe_of_start(trained[0], otherwise=other)
+    assert not tuned
+    assert (recipe.encoder, recipe.scaling, recipe.encoder_depth) == (held.encoder, held.scaling, held.encoder_depth)
+    assert (recipe.steps, recipe.epochs) == (other.steps, other.epochs)
 
 
 def test_starting_from_a_network_of_another_recipe_is_refused(dataset_file, trained, tmp_path):

@@ -26,7 +26,7 @@ def main() -> int:
         "| link, networks x images | repeats | paired | holds 0 % | relative width | curve test rejects % | simulations |"
     )
     print("|---" * 7 + "|")
-    for link, networks, images in (("cloglog", 20, 82), ("logit", 10, 82)):
+    for link, networks, images in (("cloglog", 20, 82), ("logit", 10, 82), ("cloglog", 3, 82), ("logit", 5, 82)):
         counts = {True: [0, 0, 0.0, 0], False: [0, 0, 0.0, 0]}
         for _ in range(arguments.simulations):
             size = random.uniform(0.01, 0.35, images)

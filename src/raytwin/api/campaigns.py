@@ -77,10 +77,11 @@ class SweepPlan(Result):
 class Decision(Result):
     """Which settings do what is asked of the line, with what margin, and what would make the answer surer.
 
-    Fields: requirement (what was asked); sentence (the answer in words); recommended (LOW;HIGH of the setting that is taken, or comes
-    closest); verdict (on it: `meets`, `open`, `fails`); settings (a mapping a setting: verdict; criteria with value, bound and
-    margin; limited_by; changes); changes_by (who says what changes would do to a90); front (settings that no other beats in a90,
-    dose and throughput, a90 of networks or expected); measurements (what to measure on the real line, most useful first).
+    Fields: requirement (what was asked); sentence (the answer in words); recommended (LOW;HIGH of the setting that is taken, or
+    comes closest); verdict (on it: `meets`, `open`, `fails`); settings (a mapping a setting: verdict; criteria with value, bound
+    and margin; limited_by, the criteria that fail; not_yet_known, those that are open; changes); changes_by (who says what
+    changes would do to a90); front (settings that no other beats in a90, dose and throughput, a90 of networks or expected);
+    measurements (what to measure on the real line, most useful first).
     """
 
     requirement: Mapping[str, Any]
@@ -98,11 +99,12 @@ class Decision(Result):
         return found | {"meets": [one["setting"] for one in found["settings"] if one["verdict"] == "meets"]}
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row a setting: verdict, limited_by, and value, bound, margin and verdict of each criterion."""
+        """A row a setting: verdict, limited_by, not_yet_known, and value, bound, margin and verdict of each criterion."""
         rows = []
         for one in self.settings:
             row = {"setting": one["setting"], "label": one["label"], "verdict": one["verdict"]}
-            row["limited_by"] = ", ".join(one["limited_by"])
+            for names in ("limited_by", "not_yet_known"):
+                row[names] = ", ".join(one.get(names, ()))
             for part in one["criteria"]:
                 row |= {f"{part['name']}_{field}": part[field] for field in ("value", "bound", "margin", "verdict")}
             row |= {f"a90_factor_{change['kind']}": change["factor"] for change in one["changes"]}
@@ -116,7 +118,7 @@ class Decision(Result):
         rows = []
         for one in self.settings:
             margins = ["" if part["margin"] is None else f"{100 * part['margin']:+.0f} %" for part in one["criteria"]]
-            helps = change_text(Change(**one["changes"][0])) if one["changes"] and one["limited_by"] else ""
+            helps = change_text(Change(**one["changes"][0])) if one["changes"] and one["verdict"] != "meets" else ""
             rows.append((str(one["label"]), str(one["verdict"]), *margins, helps))
         taken = next((str(one["label"]) for one in self.settings if one["setting"] == self.recommended), None)
         meets = sum(one["verdict"] == "meets" for one in self.settings)

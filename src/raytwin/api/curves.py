@@ -480,7 +480,7 @@ def _hit_curve(
     if ceiling or floor:
         asked["lapse"] = lambda: _lapse(trials, fit, ceiling=ceiling, floor=floor, warnings=warnings)
     if bootstrap is not None:
-        asked["bootstrap"] = lambda: _bootstrap(table, fit, replicates=bootstrap, by=by, seed=seed)
+        asked["bootstrap"] = lambda: _bootstrap(table, fit, replicates=bootstrap, by=by, seed=seed, warnings=warnings)
     if covariates:
         asked["covariates"] = lambda: _covariates(table, fit, covariates, method=method, warnings=warnings)
     if explain:
@@ -500,14 +500,30 @@ def _lapse(trials: "Trials", fit: "PodFit", *, ceiling: bool, floor: bool, warni
     from ..pod import fit_lapse_pod
 
     found = fit_lapse_pod(trials, link=fit.link, log_size=fit.log_size, ceiling=ceiling, floor=floor)
-    if fit.repeats != "pooled":
-        warnings.append("ceiling and floor take all looks as independent: their intervals are too narrow")
     warnings += [f"with ceiling or floor: {note}" for note in found.warnings]
-    return asdict(found)
+    answer = asdict(found)
+    if fit.repeats != "pooled" and _looks_repeat(trials):
+        warnings.append("ceiling and floor take all looks as independent, and looks repeat: values without intervals")
+        answer |= {"p_plain": None, "a90_95": None, "a90_95_two_sided": None}
+        for name in ("ceiling", "floor"):
+            answer[name] |= {"low": None, "high": None}
+    return answer
+
+
+def _looks_repeat(trials: "Trials") -> bool:
+    """Whether a network, image or site was part of more than one look, by more than one of them."""
+    labels = (trials.network, trials.image, trials.site)
+    return any(codes is not None and 0 < codes.max() < len(codes) - 1 for codes in labels)
 
 
 def _bootstrap(
-    table: PodTable, fit: "PodFit", *, replicates: int, by: str | None, seed: "int | np.random.Generator"
+    table: PodTable,
+    fit: "PodFit",
+    *,
+    replicates: int,
+    by: str | None,
+    seed: "int | np.random.Generator",
+    warnings: list[str],
 ) -> dict[str, Any]:
     from ..pod import bootstrap_pod
 
@@ -526,6 +542,10 @@ def _bootstrap(
         replicates=replicates,
         rng=generator_of(seed),
     )
+    if None in (found.a90_95, found.a90_low, found.a90_high) and found.unknown < 0.025:
+        warnings.append(
+            "the bootstrap gives no bound there: so few networks or images need more resamples than were drawn"
+        )
     return {
         "by": by,
         "replicates": replicates,

@@ -538,7 +538,8 @@ def train(
         output: folder of networks of one dataset, recipe, seed and start, new or to go on with.
         networks: how many the folder holds at the end.
         recipe: `raytwin`, `as_published`, or a `Recipe`; the arguments up to encoder change it. None: `raytwin`, or that of
-            the starter where networks start from it.
+            the starter where networks start from it. Where they start from other networks, these say what network it is
+            (architecture, encoder and its depth, classes, scaling), and all of the recipe where they were fine-tuned themselves.
         epochs, steps: passes over the training images, or training steps.
         batch, learning_rate, crop_px: of a step.
         encoder_weights: `imagenet` (downloaded once).
@@ -617,11 +618,15 @@ def train(
 def _recipe(
     recipe: "Recipe | str | None", *, start_from: Any, length: Mapping[str, Any], changes: Mapping[str, Any]
 ) -> "Recipe":
-    from ..segmentation import RECIPES, recipe_for_fine_tuning, starter_recipe
+    from ..segmentation import RECIPES, recipe_for_fine_tuning, recipe_of_start, starter_recipe
 
     if recipe is None and str(start_from) == "starter":
         recipe = starter_recipe()
         start_from = None  # its steps and rate are those of fine-tuning already
+    elif recipe is None and start_from is not None:
+        recipe, tuned = recipe_of_start(start_from, otherwise=RECIPES["raytwin"])
+        if tuned:
+            start_from = None
     recipe = "raytwin" if recipe is None else recipe
     if isinstance(recipe, str):
         if recipe not in RECIPES:
@@ -679,6 +684,7 @@ def detect(
     threshold: float = 0.5,
     scaling: str | None = None,
     probabilities: bool = False,
+    classes: str | None = None,
     device: str = "auto",
     threads: int | None = None,
     progress: Progress | bool | None = None,
@@ -698,6 +704,8 @@ def detect(
         threshold: probability above which a pixel is marked, 0 or more and below 1.
         scaling: of the images that a torch module or an ONNX file was trained on, `min_max` or `residual`; None: log images.
         probabilities: whether a torch module or an ONNX file gives these; False: logits.
+        classes: of a torch module or an ONNX file with several, the last of them the foreign object: `exclusive` (a softmax) or
+            `independent` (a sigmoid of the last); None: exclusive, with a line in `warnings`.
         device, threads: as for `train`.
         progress: True for a bar, or a function of (stage, done, total).
 
@@ -723,7 +731,8 @@ def detect(
     if split is not None and split not in SPLITS:
         raise InputError("split", received=repr(split), expected="one of " + ", ".join(SPLITS))
     warnings: list[str] = []
-    foreign = _segmenters(runs, scaling=scaling, probabilities=probabilities, device=device, threads=threads)
+    meant: dict[str, Any] = {"scaling": scaling, "probabilities": probabilities, "classes": classes}
+    foreign = _segmenters(runs, meant, device=device, threads=threads, warn=warnings.append)
     with _as_dataset(dataset) as images, Telling(progress, unit="image") as telling:
         words: dict[str, Any] = {"threshold": threshold, "progress": telling.advance, "warn": warnings.append}
         if foreign is not None:
@@ -766,17 +775,20 @@ def detect(
 
 
 def _segmenters(
-    given: Any, *, scaling: str | None, probabilities: bool, device: str, threads: int | None
+    given: Any, meant: Mapping[str, Any], *, device: str, threads: int | None, warn: Callable[[str], None]
 ) -> "dict[int, Segmenter] | None":
-    """Networks made elsewhere, by number; None where a folder of raytwin's own was given."""
+    """Networks made elsewhere, by number; None where a folder of raytwin's own was given.
+
+    meant: scaling, probabilities and classes, what images and answers of a torch module or an ONNX file mean.
+    """
     several = list(given) if isinstance(given, list | tuple) else [given]
     one_file = isinstance(given, str | os.PathLike) and Path(given).suffix.lower() != ".onnx"
     if isinstance(given, TrainedNetworks) or one_file:
-        if scaling is not None or probabilities:
+        if any(meant.values()):
             raise InputError(
-                "scaling and probabilities",
+                "scaling, probabilities and classes",
                 received="given with networks that raytwin trained",
-                expected="none: their recipe says both",
+                expected="none: their recipe says all three",
             )
         return None
     if not several:
@@ -786,13 +798,13 @@ def _segmenters(
         if isinstance(one, str | os.PathLike):
             from ..segmentation import segmenter_from_onnx
 
-            found[number] = segmenter_from_onnx(one, scaling=scaling, probabilities=probabilities)
+            found[number] = segmenter_from_onnx(one, warn=warn, **meant)
         elif hasattr(one, "state_dict") and hasattr(one, "eval"):
             from ..segmentation import choose_device, segmenter_from_module
 
             _use_threads(threads)
             where = choose_device(device)
-            found[number] = segmenter_from_module(one, scaling=scaling, probabilities=probabilities, device=where)
+            found[number] = segmenter_from_module(one, device=where, warn=warn, **meant)
         elif callable(one):
             found[number] = one
         else:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ._given import PathLike, as_any_twin, dataset_of
-from .curves import PodCurve, is_response
+from .curves import PodCurve, fit_pod, is_response
 from .images import GeneratedPairs
 
 if TYPE_CHECKING:
@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from ..generator.tube_twin import TubeTwin
     from ..generator.twin import Twin
 
-_EXPECTED = (
-    "a twin, a validation, a POD curve, generated pairs, a dataset, a diagnosis, or the file of a twin or dataset"
-)
+_EXPECTED = "a twin, a validation, a POD curve, generated pairs, a dataset, a diagnosis, or the file of a twin, a dataset or hits"
 
 
 def report(
@@ -33,7 +31,8 @@ def report(
     CSV.
 
     Args:
-        result: what a function of raytwin returned, or the file of a twin or a dataset, or a shipped calibration's name.
+        result: what a function of raytwin returned, or the file of a twin, a dataset or a table of hits (HITS.csv), or a shipped
+            calibration's name. A table of hits is fitted as `fit_pod` does by default.
         output: the page, a name that ends in .html.
         interactive: figures that answer to the pointer, which adds 1.3 MB; None: where Bokeh is installed (extra `explore`).
 
@@ -85,6 +84,8 @@ def _page_of(result: Any) -> Any:
     if isinstance(result, GeneratedPairs):
         return _pairs_page(result)
     is_file = isinstance(result, str | os.PathLike)
+    if is_file and Path(result).suffix.lower() == ".csv":
+        return _pod_page(fit_pod(result))
     if isinstance(result, dataset_io.Dataset) or (is_file and format_of_file(result) == dataset_io.FORMAT):
         from ..campaign.dataset_page import dataset_page
 

@@ -42,6 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--probabilities", action="store_true", help="an ONNX file gives probabilities (default: logits)"
     )
+    parser.add_argument(
+        "--classes",
+        choices=("exclusive", "independent"),
+        help="of an ONNX file with several, the last one the foreign object: exclusive (softmax, the default) or independent",
+    )
     parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
     parser.add_argument("--threads", type=int, help="processor threads (all)")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
@@ -62,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
             threshold=arguments.threshold,
             scaling=arguments.scaling,
             probabilities=arguments.probabilities,
+            classes=arguments.classes,
             device=arguments.device,
             threads=arguments.threads,
             progress=bar,

@@ -7,7 +7,6 @@ numbers of every figure as CSV. `calibrate`, `validate` and `pod` write theirs w
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from ._answer import answer
 
@@ -30,12 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin report`."""
-    from ..api.curves import fit_pod
     from ..api.reports import report
 
-    shown: Any = arguments.file
-    if Path(arguments.file).suffix.lower() == ".csv":
-        shown = fit_pod(arguments.file)
-    page = report(shown, arguments.output, interactive=False if arguments.static else None)
+    page = report(arguments.file, arguments.output, interactive=False if arguments.static else None)
     answer({"report": str(page)}, as_json=arguments.json, text=f"report: {page}")
     return 0

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of all randomness (0)")
     parser.add_argument(
         "--recipe",
-        help="raytwin (default), as_published; with --start-from starter its own, a small network, by default",
+        help="raytwin (default), as_published; with --start-from that of the networks named there, by default",
     )
     parser.add_argument("--architecture", help="of segmentation-models-pytorch, such as FPN or Unet (DeepLabV3Plus)")
     parser.add_argument("--encoder", help="of segmentation-models-pytorch, such as resnet18 (efficientnet-b0)")

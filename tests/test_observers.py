@@ -261,7 +261,7 @@ def test_bad_input_is_one_line(line, call, message):
         call(line)
 
 
-@given(st.floats(-0.3, 0.99), st.floats(-0.3, 0.99), st.floats(10.0, 1e6), st.floats(1e-4, 0.3))
+@given(st.floats(-0.3, 0.99), st.floats(-0.3, 0.99), st.floats(100.0, 1e6), st.floats(1e-4, 0.3))
 @settings(deadline=None, max_examples=50)
 def test_the_threshold_is_where_the_chance_is_the_rate(row, column, area, rate):
     found = {"row_correlation": row, "column_correlation": column}

@@ -38,10 +38,12 @@ def test_the_table_is_of_the_spekpy_that_is_installed() -> None:
 
 
 @pytest.mark.parametrize(("model", "kV"), [("casim", 10), ("casim", 47), ("casim", 300), ("kqp", 23), ("kqp", 69)])
-def test_entries_are_spekpys_answers_to_the_bit(model: str, kV: int) -> None:
+def test_entries_are_spekpys_answers_but_for_a_processors_last_bits(model: str, kV: int) -> None:
     packaged = _packaged.packaged_fluence("W", 12.0, model, kV)
     assert packaged is not None
-    np.testing.assert_array_equal(packaged, tube._spekpy_fluence("W", 12.0, model, kV), err_msg=REMAKE)
+    found = tube._spekpy_fluence("W", 12.0, model, kV)
+    # exponentials and sums in another order: some last bits of sums of thousands of terms
+    np.testing.assert_allclose(packaged, found, rtol=1e-12, atol=1e-12 * float(found.max()), err_msg=REMAKE)
 
 
 @pytest.mark.parametrize("model", tube.MODELS)

@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo docs wheel-check bounds-check lock stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
+.PHONY: demo discrepancy docs wheel-check bounds-check lock stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -92,6 +92,12 @@ validation-simulators: $(READY)
 	for line in usual coarse hard soft three even counting; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
 	for line in csi gos "flat panel"; do OMP_NUM_THREADS=1 $(BIN)/python validation/catsim_sessions.py --line "$$line" --json "build/catsim_$$line.json" || exit 1; done
 	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
+
+# how far laws of a kind depart from ours, for diagnosis/discrepancy.toml: an hour and a half on one core
+discrepancy: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python validation/learn_discrepancy.py --line usual --seed 9001 --json build/discrepancy/usual.json
+	for line in usual coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/learn_discrepancy.py --line $$line --families --seed 9001 --json build/discrepancy/$${line}_families.json || exit 1; done
+	$(BIN)/python validation/learn_discrepancy.py --learn build/discrepancy/*.json
 
 # the diagnosis on sealed cases, hours: `make blind-check SEED=...` with one that nobody has looked at; a stopped run goes on
 CASES ?= 600

@@ -1,9 +1,9 @@
 """How far laws of an effect's kind depart from the catalogue's: learnt from sessions of the second simulator.
 
-Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at
-each level of discrepancy, with and without a rest, tells how often each occurs (empirical Bayes, by expectation and
-maximisation); the same of what looks most like it once it is left out of the catalogue; and sessions without an effect tell how
-often one family of probes is off by chance. The answers themselves are told beside it.
+Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at each
+level of discrepancy, with and without a rest, tells how often each occurs (empirical Bayes, by expectation and maximisation); the
+same of what looks most like it once it is left out of the catalogue. The answers themselves are told beside it, and in how many
+sessions without an effect one family of probes is off.
 
     python validation/learn_discrepancy.py --line usual --families --json build/discrepancy/usual.json
     python validation/learn_discrepancy.py --learn build/discrepancy/*.json
@@ -29,6 +29,7 @@ from raytwin.diagnosis.preparation import prepare_session
 from raytwin.diagnosis.unknown import beyond
 
 _ROUNDS = 300
+_CLEAR = 3.0  # log evidence from which something is said
 _NONE = 1e-3  # least frequency of a level: none is impossible
 
 
@@ -65,9 +66,9 @@ def told(hypotheses) -> dict:
 def frequencies(rows: list[list[float]]) -> tuple[list[float], float]:
     """Frequencies of the levels, and of a rest, that make evidences (session, level and last the one with a rest) likeliest.
 
-    A session in which neither says anything (all within 3) tells nothing and is left out.
+    A session in which the effect does not show tells nothing and is left out.
     """
-    known = [np.array(row) for row in rows if max(row) > 3.0 and len(row) == len(LEVELS.levels) + 1]
+    known = [np.array(row) for row in rows if max(row) > _CLEAR and len(row) == len(LEVELS.levels) + 1]
     levels, rest = np.full(len(LEVELS.levels), 1.0 / len(LEVELS.levels)), 0.5
     for _ in range(_ROUNDS):
         taken, with_rest = np.zeros(len(levels)), 0.0
@@ -96,6 +97,8 @@ def learn(paths: list[Path]) -> None:
     print(f"# a wrong name {len(wrong)}; once left out unknown or none ", end="")
     left = [row["left_out"]["verdict"] for row in single if "left_out" in row]
     print(f"{sum(word in (UNKNOWN, 'no_gap') for word in left)} of {len(left)}")
+    off = [max(row["by_chance"]) > _CLEAR for row in rows if "by_chance" in row]
+    print(f"# without an effect: one family off in {sum(off)} of {len(off)}")
 
 
 def main() -> None:

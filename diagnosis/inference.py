@@ -49,16 +49,6 @@ class Hypothesis:
     location: str = ""
     rest: str = ""
 
-    def alone(self, effect: str) -> "Hypothesis":
-        """One of its effects, as it stands here."""
-        return replace(
-            self,
-            effects=(effect,),
-            strengths={effect: self.strengths[effect]},
-            variants={effect: self.variants[effect]},
-            levels={effect: self.levels[effect]},
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
@@ -99,7 +89,7 @@ def weigh_hypotheses(
     beside = _Rests(observed, parts, part_names)
     weighed = [(Hypothesis(effects=(), probability=0.0, log_evidence=none.allowed), math.log(priors.none))]
     of_single = math.log(priors.single / count)
-    alike = []
+    alike, whole = [], {}
     for effect in ranked:
         single = singles[effect]
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
@@ -108,6 +98,7 @@ def weigh_hypotheses(
             found = beside.of_kind(found, [single.best])
             alike.append(beside.of_another(single))
         weighed.append((found, of_single))
+        whole[effect] = found
     leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
     for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
@@ -117,7 +108,7 @@ def weigh_hypotheses(
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves
         strong, leaves = left_by_the_stronger(observed, pair)
-        alone = replace(found.alone(strong), log_evidence=found.log_evidence + leaves)
+        alone = replace(whole[strong], log_evidence=found.log_evidence + leaves, rest=found.rest)
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]

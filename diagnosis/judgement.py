@@ -265,7 +265,8 @@ def _causes(
     for effect in order:
         if effect not in listed and marginal[effect] < _WORTH_LISTING and effect not in shares:
             continue
-        best = next(item for item in verdict.hypotheses if effect in item.effects)
+        # of what is named, as it stands in the explanation that leads
+        best = next(item for item in (verdict.leading, *verdict.hypotheses) if effect in item.effects)
         curve = best.variants[effect]
         variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
         causes.append(

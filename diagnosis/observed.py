@@ -99,11 +99,14 @@ class Observed:
         )
 
     def length(self, curve: Curve, strength: float) -> float:
-        """How far from none a curve (in these units) lies at a strength, once the nuisances took their part: standard deviations."""
-        response = curve.response(strength)[None, :]
-        if curve.by_chance_alone and curve.spread is not None:
-            response = strength * curve.spread.T
-        return math.sqrt(max(float(np.trace(self.nuisances.inner(response, response))), 0.0))
+        """How far a curve (in these units) moves the probes at a strength, by its law and by chance, nuisances aside; sd."""
+        moved = curve.response(strength)[None, :]
+        if curve.spread is not None:
+            moved = np.concatenate([moved, strength * curve.spread.T])
+        squares = float(np.trace(self.nuisances.inner(moved, moved)))
+        if curve.jitter is not None:
+            squares += strength**2 * float(np.sum(curve.jitter))
+        return math.sqrt(max(squares, 0.0))
 
 
 def slope(curve: Curve, strength: float) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -112,6 +112,11 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     for numbers in ranked.values():
         for number in numbers[:_VARIANTS]:
             found[number] = fit_curve(observed, curves[number])
+        for number in numbers[_VARIANTS:]:
+            if not curves[number].by_chance_alone:  # else it is the same at all levels
+                # of the others no more is counted than an exact law's part, as often as laws are exact
+                exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])
+                found[number] = replace(found[number], log_evidence=exact)
     return found
 
 

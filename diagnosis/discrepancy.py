@@ -1,9 +1,9 @@
 """Model discrepancy: how far laws of an effect's kind depart from ours, and what effects do by chance.
 
 At a level k a law is off by a random factor of relative size k in each group of probes, by half of that in each probe of its own,
-and by a share of that in probes of a place where it acts but foretells less; and what it leaves may look like another effect, a share
-of k times as large as what it does. Levels are no choice for a session: evidence is
-averaged over them, with the frequencies that laws of many shapes have shown (`discrepancy.toml`).
+and by a share of that in probes of a place where it acts but foretells less. What it leaves may look like another effect, a share of
+k times as large as what it does. Levels are no choice for a session: evidence is averaged over them, with the frequencies that laws
+of many shapes have shown (`discrepancy.toml`). The shares below are choices: no script has fitted them.
 """
 
 import tomllib
@@ -52,13 +52,11 @@ def _learnt() -> Levels:
 
 
 LEVELS = _learnt()
-LEAK_SHARE = (
-    0.5  # of a level: what a law leaves in the shape of another effect, over what it does, as a standard deviation
-)
-FARTHEST_LEVEL = (
-    0.4  # beyond it a law does not carry the probes: what is off by more than half of itself explains anything
-)
-USUAL_LEVEL = 0.1  # geometric middle of the levels that most laws of the right kind show
+# of a level: what a law leaves in the shape of another effect, over what it does; and the sd of a rest over it
+LEAK_SHARE = 0.5
+# beyond it a law does not carry the probes: what is off by more than half of itself explains anything
+FARTHEST_LEVEL = 0.4
+USUAL_LEVEL = 0.1  # of refinement, of laws that a twin has, and of what is fitted on half of a session
 USUAL = Levels(levels=(USUAL_LEVEL,), of_kind=(1.0,), of_another=(1.0,))
 PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place

@@ -1,4 +1,4 @@
-"""Tube spectra that come with the package: SpekPy's answers at every whole kV of the default tube, bit for bit."""
+"""Tube spectra that come with the package: SpekPy's answers at every whole kV of the default tube, but for the last bits of a processor."""
 
 from functools import lru_cache
 from pathlib import Path

@@ -122,7 +122,7 @@ def tube_fluence_interpolated(
         for_sums: weights of a sum over energy rather than heights of the spectrum.
 
     Returns:
-        (n,) fluence, in about 0.3 ms. Spectra of the default tube come with the package at every whole kV, bit for bit
+        (n,) fluence, in about 0.3 ms. Spectra of the default tube come with the package at every whole kV, but for last bits
         those of SpekPy; for another anode or angle SpekPy computes up to four at the first call (0.4 to 10 s each),
         which are kept on disk.
 

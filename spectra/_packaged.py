@@ -1,4 +1,4 @@
-"""Tube spectra that come with the package: SpekPy's answers at every whole kV of the default tube, but for the last bits of a processor."""
+"""Tube spectra that come with the package: SpekPy's answers for the default tube at every whole kV, but for last bits."""
 
 from functools import lru_cache
 from pathlib import Path

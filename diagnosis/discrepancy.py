@@ -62,7 +62,7 @@ PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
-_LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
+LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
 )
@@ -99,15 +99,21 @@ class LawFactors:
 
 
 def law_factors(
-    curve: Curve, strength: float, response: NDArray[np.float64], groups: NDArray[np.intp], level: float
+    curve: Curve,
+    strength: float,
+    response: NDArray[np.float64],
+    groups: NDArray[np.intp],
+    level: float,
+    *,
+    chance: bool = True,
 ) -> LawFactors:
-    """What is random about an effect at a strength: its law's inaccuracy, and its own spread."""
+    """What is random about an effect at a strength: its law's inaccuracy, and, with `chance`, its own spread."""
     if curve.exact is not None:
         response = np.where(curve.exact, 0.0, response)
-    spread = curve.spread
-    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < _LEAST_MOVED:
+    spread = curve.spread if chance else None
+    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < LEAST_MOVED:
         spread = np.zeros((len(response), 0))
-    moves = float(np.max(np.abs(response), initial=0.0)) * level >= _LEAST_MOVED
+    moves = float(np.max(np.abs(response), initial=0.0)) * level >= LEAST_MOVED
     return LawFactors(group_factors(response, groups, level if moves else 0.0), spread * strength)
 
 

@@ -61,11 +61,14 @@ class Observed:
         """A curve in the units of the first probes, in these."""
         return curve if self.root is None else curve.over(self.root)
 
-    def widened(self, curve: Curve, strength: float, level: float) -> "Observed | None":
-        """The same residual where a curve's law (in these units) is off by a level at a strength; None: that moves nothing."""
+    def widened(self, curve: Curve, strength: float, level: float, *, chance: bool = True) -> "Observed | None":
+        """The same residual where a curve's law (in these units) is off by a level at a strength; None: that moves nothing.
+
+        chance: with what the effect does by chance there, its spread; what it gives each probe by itself counts in either case.
+        """
         effective = self.nuisances.solve(curve.response(strength))
         effective = credible(effective, self.left, self.places)
-        law = law_factors(curve, strength, effective, self.groups, level)
+        law = law_factors(curve, strength, effective, self.groups, level, chance=chance)
         own = own_variance(curve, strength, effective, self.places, level)
         if not law and float(own.max()) < LEAST_FACTOR:
             return None

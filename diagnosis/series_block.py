@@ -161,7 +161,8 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     ]
     if not lit:
         return None
-    wanders = OutputCourse(variant.parameters["correlation_s"], variant.parameters["jitter_share"])
+    own = variant.parameters
+    wanders = OutputCourse(own["correlation_s"], own["jitter_share"], own.get("idle_s", 0.0))
     means = wanders.means([block.session.request for block, _ in lit], readout_ms)
     single = []  # (probe, what it does by itself)
     levels = np.zeros((size, means.shape[1]))

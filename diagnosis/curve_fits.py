@@ -94,7 +94,7 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 
 
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
-    """Every curve fitted: with all levels of discrepancy those variants of each effect that are likeliest, or close to it, if exact."""
+    """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
     found = [fit_curve(observed, curve, exact=True) for curve in curves]
     ranked: dict[str, list[int]] = {}
     for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):

@@ -93,9 +93,17 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
     )
 
 
+def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
+    """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
+    alone = observed.standing(curve.effect)
+    fit = fit_curve(alone, alone.scaled(curve), exact=exact)
+    more = observed.over_none(curve.effect)
+    return replace(fit, curve=curve, by_level=fit.by_level + more, log_evidence=fit.log_evidence + more)
+
+
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
     """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
-    found = [fit_curve(observed, curve, exact=True) for curve in curves]
+    found = [fit_effect(observed, curve, exact=True) for curve in curves]
     ranked: dict[str, list[int]] = {}
     for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
         ranked.setdefault(curves[number].effect, []).append(number)
@@ -103,7 +111,7 @@ def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
         least = found[numbers[0]].log_evidence - _CLOSE
         close = max(_VARIANTS, sum(found[number].log_evidence > least for number in numbers))
         for number in numbers[:close]:
-            found[number] = fit_curve(observed, curves[number])
+            found[number] = fit_effect(observed, curves[number])
         for number in numbers[close:]:
             # of the others no more is counted than an exact law's part, as often as laws are exact
             exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])

@@ -14,11 +14,9 @@ from .changes import catalogue_variants
 from .coarse import unseen_in_squares
 from .inference import UNKNOWN, Hypothesis, Priors
 from .judgement import judge
-from .known_effects import already_there, lasting
 from .preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
 from .problem import Problem
 from .readings import Suspect
-from .sought_anew import is_to_be_asked, with_sought_anew
 
 
 def diagnose(
@@ -36,7 +34,7 @@ def diagnose(
         acquisition: open acquisition file, anything from two flats with darks to the full protocol; frames of more than
             LARGEST_PIXELS are compared as means of squares of pixels.
         twin: calibrated elsewhere; absent, the session's own calibrating series make it. Effects that it has are part of what is
-            expected: the gap is what they leave.
+            expected: the gap is what they leave. One that the session shows at another strength is named with that strength.
         rng: source of randomness.
         without: effects to leave out of the catalogue.
         priors: probabilities of the kinds of hypothesis before looking.
@@ -46,28 +44,15 @@ def diagnose(
         InputError: nothing in the session can be judged.
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-    had = {} if twin is None else already_there(twin.effects)
     unseen = unseen_in_squares() if session.factor > 1 else {}
-
-    def judged(with_effects: Twin, left_out: Sequence[str]) -> Diagnosis:
-        problem = problem_of(session, with_effects, without=left_out, progress=progress)
-        return judge(problem, with_effects, rng=rng, priors=priors, progress=progress)
-
     try:
-        result = judged(session.twin, (*without, *had, *unseen))
+        problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+        result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
     except InputError as error:
         if session.suspects:
             raise mislabelled(acquisition, session.suspects) from error
         raise
-    if had and not session.suspects and is_to_be_asked(result, session.twin.effects):
-        if progress is not None:
-            progress("effects of the twin sought anew")
-        rest = tuple(item for item in session.twin.effects if item not in lasting(session.twin.effects))
-        anew = judged(replace(session.twin, effects=rest), (*without, *unseen))
-        result = with_sought_anew(result, anew, session.twin.effects)
     result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
-    still = {effect: why for effect, why in had.items() if effect not in result.named}
-    result = replace(result, not_tested={**still, **result.not_tested})
     cleared = [item for item in session.suspects if _clears(result, item)]
     notes = tuple(
         f"{item.text}, or with {' and '.join(result.named)}, which explains the rest as well" for item in cleared

@@ -10,10 +10,8 @@ from ..acquisition.acquisition_io import AcquisitionFile
 from ..generator.effects import EFFECTS
 from ..generator.twin import Twin
 from ..results import Result, Table, axes_or_new, frame, plain
-from .assemble import build_problem
-from .changes import catalogue_variants
 from .coarse import unseen_in_squares
-from .known_effects import already_there
+from .diagnose_session import problem_of
 from .plan import Distinguishability, distinguishability
 from .preparation import mislabelled, prepare_session
 
@@ -106,19 +104,8 @@ def plan_session(
     suspects = tuple(item for item in session.suspects if not item.or_effects)
     if suspects:
         raise mislabelled(acquisition, suspects)
-    unseen = {
-        **({} if twin is None else already_there(twin.effects)),
-        **(unseen_in_squares() if session.factor > 1 else {}),
-    }
-    problem = build_problem(
-        session.acquisition,
-        session.twin,
-        variants=catalogue_variants(without=(*without, *unseen), side=session.factor),
-        calibrated_elsewhere=session.calibrated_elsewhere,
-        exposed=session.exposed,
-        side=session.factor,
-        progress=progress,
-    )
+    unseen = unseen_in_squares() if session.factor > 1 else {}
+    problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
     found = distinguishability(problem)
     shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
     return SessionPlan(

@@ -22,7 +22,6 @@ from .explanation import (
     verdict_text,
 )
 from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, task_charts, transmission_curves
-from .known_laws import changed_effect
 
 _MAPS = 4  # series whose maps are drawn
 _SINCE = {"calibration": "since the calibration"}
@@ -105,10 +104,7 @@ def headline(diagnosis: Diagnosis) -> str:
         return "Labels look wrong"
     if diagnosis.verdict == "no_gap":
         return "No gap: the session agrees with its twin"
-    changed = changed_effect(diagnosis.unknown_location)
     if diagnosis.verdict == "unknown_effect":
-        if changed is not None:
-            return _sentence(f"{title_of(changed)} is of another strength than the twin's")
         return "An effect that is not in the catalogue"
     if diagnosis.verdict == "ambiguous":
         names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
@@ -165,7 +161,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
             ),
             *measured,
         ]
-    if diagnosis.verdict == "unknown_effect" and changed_effect(diagnosis.unknown_location) is None:
+    if diagnosis.verdict == "unknown_effect":
         return [
             *measured,
             step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),

@@ -67,11 +67,11 @@ def judge_session(
     import numpy as np
 
     from ..acquisition import open_acquisition
-    from ..diagnosis.answer import diagnosis_answer
-    from ..diagnosis.assemble import build_problem
-    from ..diagnosis.changes import catalogue_variants
+    from ..diagnosis.checks.preparation import calibrated_twin
     from ..diagnosis.diagnose_session import diagnose
-    from ..diagnosis.preparation import calibrated_twin
+    from ..diagnosis.judgement.answer import diagnosis_answer
+    from ..diagnosis.model.changes import catalogue_variants
+    from ..diagnosis.problem.assemble import build_problem
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
     from .blind_statistics import session_features, session_statistics, write_statistics

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import open_acquisition
-from ..diagnosis.assemble import build_problem
-from ..diagnosis.explanation import title_of
-from ..diagnosis.preparation import prepare_session
-from ..generator.twin import Twin
-from ..generator.twin_io import read_twin
+from ..diagnosis.checks.preparation import prepare_session
+from ..diagnosis.problem.assemble import build_problem
+from ..diagnosis.report.explanation import title_of
+from ..generator.line.twin import Twin
+from ..generator.twins.twin_io import read_twin
 
 Step = Callable[..., dict[str, Any]]
 

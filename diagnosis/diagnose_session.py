@@ -7,18 +7,18 @@ import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
-from ..generator.twin import Twin
-from .answer import EXPLAINED, Diagnosis, in_pixels
-from .assemble import build_problem
-from .changes import catalogue_variants
-from .coarse import unseen_in_squares
-from .inference import UNKNOWN, Hypothesis, Priors
-from .judgement import judge
-from .known_effects import already_there, lasting
-from .preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
-from .problem import Problem
-from .readings import Suspect
-from .sought_anew import is_to_be_asked, with_sought_anew
+from ..generator.line.twin import Twin
+from .checks.preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
+from .checks.readings import Suspect
+from .inference.inference import UNKNOWN, Hypothesis, Priors
+from .judgement.answer import EXPLAINED, Diagnosis, in_pixels
+from .judgement.judgement import judge
+from .judgement.sought_anew import is_to_be_asked, with_sought_anew
+from .model.changes import catalogue_variants
+from .problem.assemble import build_problem
+from .problem.known_effects import already_there, lasting
+from .problem.problem import Problem
+from .session.coarse import unseen_in_squares
 
 
 def diagnose(

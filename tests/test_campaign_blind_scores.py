@@ -47,8 +47,8 @@ from raytwin.campaign.blind_statistics import (
     session_statistics,
     write_statistics,
 )
-from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.observed import Point
+from raytwin.diagnosis.inference.observed import Point
+from raytwin.diagnosis.model.curves import Curve
 from raytwin.generator.effects import EFFECTS
 
 

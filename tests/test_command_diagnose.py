@@ -51,7 +51,7 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     assert found["gap"]["after"] < 0.7 * found["gap"]["before"]
     assert {place["axis"] for place in found["where"]} >= {"noise"}
     assert sum(item["probability"] for item in found["hypotheses"]) == pytest.approx(1.0, abs=1e-6)
-    from raytwin.generator.twin_io import read_twin
+    from raytwin.generator.twins.twin_io import read_twin
 
     assert "excess_noise" in [effect.id for effect in read_twin(sessions / "noisy" / "twin.h5").effects]
     page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.held_out import folds_of, held_out
-from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.judgement.held_out import folds_of, held_out
+from raytwin.diagnosis.model.curves import Curve
 
 
 def problem(*rows, calibrating=0):

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from raytwin.cli import main
-from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.inference import UNKNOWN, Hypothesis
-from raytwin.diagnosis.judgement import _of_another_strength
-from raytwin.diagnosis.known_effects import already_there, lasting, with_found
-from raytwin.diagnosis.known_laws import (
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.inference.local_nuisances import LocalNuisances
+from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.judgement.judgement import _of_another_strength
+from raytwin.diagnosis.judgement.sought_anew import is_to_be_asked, with_sought_anew
+from raytwin.diagnosis.model.curves import Curve
+from raytwin.diagnosis.problem.known_effects import already_there, lasting, with_found
+from raytwin.diagnosis.problem.known_laws import (
     CHANGED_SD,
     beside_known,
     changed_effect,
     known_strengths,
     with_any_strength,
 )
-from raytwin.diagnosis.local_nuisances import LocalNuisances
-from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.sought_anew import is_to_be_asked, with_sought_anew
 from raytwin.generator.effects import AppliedEffect
 
 

@@ -21,12 +21,12 @@ import numpy as np
 import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
+from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.diagnose_session import problem_of
-from raytwin.diagnosis.discrepancy import LEVELS
-from raytwin.diagnosis.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
-from raytwin.diagnosis.judgement import verdict_of, weigh_problem
-from raytwin.diagnosis.preparation import prepare_session
-from raytwin.diagnosis.unknown import beyond
+from raytwin.diagnosis.inference.discrepancy import LEVELS
+from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
+from raytwin.diagnosis.inference.unknown import beyond
+from raytwin.diagnosis.judgement.judgement import verdict_of, weigh_problem
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
@@ -85,7 +85,7 @@ def frequencies(rows: list[list[float]]) -> tuple[list[float], float]:
 
 
 def learn(paths: list[Path]) -> None:
-    """Print the table of `diagnosis/discrepancy.toml`, and the scores of the sessions that it comes from."""
+    """Print the table of `diagnosis/inference/discrepancy.toml`, and the scores of the sessions that it comes from."""
     rows = [row for path in paths for row in json.loads(path.read_text())]
     kind, rest_of_kind = frequencies([row["kind"] for row in rows if "kind" in row])
     another, rest_of_another = frequencies([row["another"] for row in rows if "another" in row])

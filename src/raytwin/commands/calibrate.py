@@ -124,7 +124,7 @@ def _instrument(arguments: argparse.Namespace) -> "Instrument | None":
         InputError: an acquisition states its own tube.
     """
     from ..acquisition.instrument import Instrument
-    from ..generator.predict_settings import as_filters
+    from ..generator.predictions.predict_settings import as_filters
 
     options = {name: getattr(arguments, name) for name in ("anode", "angle", "inherent")}
     given = [f"--{name}" for name, value in options.items() if value is not None]

@@ -1,0 +1,1 @@
+"""Numbers with known noise that frames and forward model both give."""

@@ -1,0 +1,1 @@
+"""A session and its twin as one problem: residual, nuisances, responses to every effect."""

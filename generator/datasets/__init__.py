@@ -1,0 +1,1 @@
+"""Dual-energy images with masks, from references, descriptions or known path lengths."""

@@ -1,0 +1,1 @@
+"""Compiled and torch loops that draw frames and project thicknesses."""

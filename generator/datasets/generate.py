@@ -24,7 +24,7 @@ from ..frames.present_line import present_line
 from ..kernels.projection import project_polychromatic
 from ..line.binning import refuse_binning
 from ..line.spectral_signal import OpenBeam, gain_behind_object
-from ..line.twin import Level, Twin
+from ..line.twin import BAD_PIXEL_MAP, Level, Twin
 from ..line.twin_spectrum import secondary_gain_DN, slope_share, spectral_model_of
 from ..predictions.predict import predict_flatfield
 from ..references.as_published import published_parameters, sample_as_published
@@ -49,6 +49,20 @@ DEFAULT_PRODUCT = "chicken_breast"
 DEFAULT_FOREIGN = "rib_bone"
 BAD_PIXELS = ("repaired", "measured")
 _GAIN_THICKNESSES_MM = np.array([0.0, 1, 2, 4, 7, 11, 16, 22, 30, 40, 55, 75, 100, 140])
+
+
+def refuse_pair(low: Setting, high: Setting, *, bad_pixels: str) -> None:
+    """Raise where images of two settings cannot be asked for so.
+
+    Raises:
+        InputError: an unknown treatment of bad pixels, or settings that are not low kV and high kV.
+    """
+    if bad_pixels not in BAD_PIXELS:
+        raise InputError(BAD_PIXEL_MAP, received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
+    if high.kV <= low.kV:
+        raise InputError(
+            "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -504,13 +518,7 @@ class ReferenceImages:
         refuse_binning(low, high)
         if recipe not in RECIPES:
             raise InputError("recipe", received=recipe, expected="one of " + ", ".join(RECIPES))
-        if bad_pixels not in BAD_PIXELS:
-            raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
-        refuse_binning(low, high)
-        if high.kV <= low.kV:
-            raise InputError(
-                "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
-            )
+        refuse_pair(low, high, bad_pixels=bad_pixels)
         if reference.shape != twin.maps.shape:
             raise InputError(
                 "reference",
@@ -715,7 +723,7 @@ def generate_dataset(
         "recipe": recipe,
         "product_material": product_material,
         "foreign_material": foreign_material if drawn.transfers else None,
-        "bad_pixels": bad_pixels,
+        BAD_PIXEL_MAP: bad_pixels,
         "registration_px": None if registration_px is None else str(registration_px),
         **effects_provenance(twin if recipe == "raytwin" else None),
     }

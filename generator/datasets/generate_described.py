@@ -15,11 +15,11 @@ from ...errors import InputError
 from ...files import sha256_of_file
 from ..frames.present_line import present_line
 from ..line.binning import refuse_binning
-from ..line.twin import Twin
+from ..line.twin import BAD_PIXEL_MAP, Twin
 from ..references.transfer import Channel
 from ..scenes.describe import Description, Individual, Scene, choose_kind, sample_individual, sample_scene
 from ..spread._fine_picture import FINE
-from .generate import BAD_PIXELS, ChannelModel, GenerationSummary, detector_noise, effect_warnings, effects_provenance
+from .generate import ChannelModel, GenerationSummary, detector_noise, effect_warnings, effects_provenance, refuse_pair
 from .image_effects import AffectedImage
 from .render import (
     SUPERSAMPLING,
@@ -68,12 +68,7 @@ class DescribedScenes:
     ) -> None:
         refuse_binning(low, high)
         refuse_without_spectrum(twin)
-        if bad_pixels not in BAD_PIXELS:
-            raise InputError("bad_pixels", received=bad_pixels, expected="one of " + ", ".join(BAD_PIXELS))
-        if high.kV <= low.kV:
-            raise InputError(
-                "settings", received=f"low {low.kV:g} kV, high {high.kV:g} kV", expected="low kV below high kV"
-            )
+        refuse_pair(low, high, bad_pixels=bad_pixels)
         if not 1 <= supersampling <= 9:
             raise InputError("supersampling", received=supersampling, expected="1 to 9 sub-pixels along each axis")
         line = present_line(twin)
@@ -250,7 +245,7 @@ def generate_from_description(
         "pixel_mm": twin.instrument.pixel_mm,
         "seed": seed,
         "recipe": "raytwin",
-        "bad_pixels": bad_pixels,
+        BAD_PIXEL_MAP: bad_pixels,
         "supersampling": supersampling,
         **effects_provenance(twin),
     }

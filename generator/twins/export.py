@@ -20,7 +20,7 @@ from ...errors import InputError
 from ...files import whole_file
 from ...results import plain
 from ..line.spectral_signal import OpenBeam
-from ..line.twin import SpectralPosterior, Twin
+from ..line.twin import BAD_PIXEL_MAP, SpectralPosterior, Twin
 from ..line.twin_spectrum import spectral_model_of
 from ..predictions.predict_settings import as_setting, predict_setting
 from ..spread.psf import optical_kernel_1d
@@ -181,7 +181,7 @@ def _detector_of(line: _Line) -> dict[str, Any]:
         "read_noise_DN": twin.noise.read_noise_DN.as_dict(),
         "spread": spread_answer(twin.noise.spread),
         "white_fraction": twin.noise.white_fraction,
-        "bad_pixels": int(np.count_nonzero(twin.maps.bad_pixels)),
+        BAD_PIXEL_MAP: int(np.count_nonzero(twin.maps.bad_pixels)),
     }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from ...acquisition.setting import text_from_filters
 from ...materials import material_from_name, mu_per_mm
 from ...results import Table, interval_text
-from ..line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
+from ..line.twin import BAD_PIXEL_MAP, Estimate, SpectralPosterior, SpreadEstimate, Twin
 from ..predictions.tube_twin import TubeTwin
 
 _EQUIVALENT_KEV = 30.0
@@ -73,10 +73,10 @@ def calibration_answer(twin: Twin | TubeTwin) -> dict[str, Any]:
             }
             for level in twin.levels
         ],
-        "bad_pixels": {
+        BAD_PIXEL_MAP: {
             "count": int(np.count_nonzero(twin.maps.bad_pixels)),
             "share_percent": 100.0 * float(np.mean(twin.maps.bad_pixels > 0)),
-            "reasons": twin.evidence.get("bad_pixels", {}),
+            "reasons": twin.evidence.get(BAD_PIXEL_MAP, {}),
         },
         "undetermined": list(spectral.undetermined) if spectral is not None else [],
         "next_measurement": twin.evidence.get("next_measurement"),
@@ -168,7 +168,7 @@ def _tube_answer(twin: TubeTwin) -> dict[str, Any]:
         "inherent_filtration_mm_Al": equivalent_filtration(twin.spectral, seen_by_detector=False).as_dict(),
         "flux_scale": None if flux is None else flux.as_dict(),
         "levels": [],
-        "bad_pixels": None,
+        BAD_PIXEL_MAP: None,
         "undetermined": list(twin.spectral.undetermined),
         "next_measurement": None,
         "evidence": dict(twin.evidence),

@@ -18,6 +18,7 @@ from ...files import whole_file
 from ..effects import AppliedEffect, in_order
 from ..line.spectral_signal import SpectrumCorrection
 from ..line.twin import (
+    BAD_PIXEL_MAP,
     DetectorMaps,
     Estimate,
     Level,
@@ -33,7 +34,7 @@ from ..spread.psf import Spread
 FORMAT = "raytwin-twin"
 VERSION = 1
 TUBE = "tube"
-_MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", "bad_pixels")
+_MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
 
 
 def _put_estimate(group: Any, name: str, estimate: Estimate | None) -> None:
@@ -264,7 +265,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             dark_DN_per_ms=_array(maps, "dark_DN_per_ms", np.float32),
             gain_relative=_array(maps, "gain_relative", np.float32),
             read_variance_DN2=_array(maps, "read_variance_DN2", np.float32),
-            bad_pixels=_array(maps, "bad_pixels", np.uint8),
+            bad_pixels=_array(maps, BAD_PIXEL_MAP, np.uint8),
         ),
         noise=NoiseModel(
             spread=_spread(noise, path),

@@ -367,7 +367,6 @@ def generate(
         "high": targets[1],
         "images": n,
         "seed": whole_seed(seed),
-        "bad_pixels": bad_pixels,
         "with_counts": counts,
         "twin_sha256": twin_sha256(twin),
     }
@@ -385,7 +384,9 @@ def generate(
                         received="a description as REFERENCE",
                         expected="reference images: the option is about those",
                     )
-            summary = generate_from_description(known, description, path, progress=telling.reach, **common)
+            summary = generate_from_description(
+                known, description, path, bad_pixels=bad_pixels, progress=telling.reach, **common
+            )
         else:
             from ..generator.datasets.generate import generate_dataset
 
@@ -400,6 +401,7 @@ def generate(
                     recipe=recipe,
                     product_material=product_material,
                     foreign_material=foreign_material,
+                    bad_pixels=bad_pixels,
                     registration_px=registration_px,
                     split=split,
                     reference_setting=fallback,

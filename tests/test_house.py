@@ -145,6 +145,8 @@ def imports_among(files):
             if isinstance(node, ast.ImportFrom) and node.level:
                 base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
                 places = [base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)]
+                if node.module:
+                    places.append(base / "__init__.py")
                 found.update(known[place.resolve()] for place in places if place.resolve() in known)
     return graph
 
@@ -219,6 +221,35 @@ def test_the_check_of_rings_between_packages_sees_a_planted_one(tmp_path):
     assert [path.name for path in ring_in(imports_among_packages(graph, tmp_path))] == ["a", "b", "a"]
     files[3].write_text("from ..top import f\n")
     assert ring_in(imports_among_packages(imports_among(files), tmp_path)) == []
+    # what a package offers itself is imported from it as well
+    files.append(tmp_path / "a" / "__init__.py")
+    files[-1].write_text("")
+    files[3].write_text("from ..a import f\n")
+    assert [path.name for path in ring_in(imports_among_packages(imports_among(files), tmp_path))] == ["a", "b", "a"]
+
+
+@pytest.mark.parametrize("room", ["generator", "diagnosis"])
+def test_packages_import_in_the_order_of_the_architecture_page(room):
+    page = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    rows = re.findall(rf"^\| (`{room}/\w.*?) \|", page.partition("## From a frame")[0], re.MULTILINE)
+    order = [ROOT / folder for row in rows for folder in re.findall(r"`([\w/]+)/`", row)]
+    graph = imports_among_packages(imports_among([path for _, path in python_files()]), ROOT / room)
+    assert {path for path in graph if path.is_dir()} == set(order)
+    for number, package in enumerate(order):
+        above = {path for path in graph[package] if path.is_dir()} - set(order[:number])
+        assert not above, f"{package.name} imports {above}"
+
+
+def test_docstrings_of_packages_name_their_files():
+    """Effects apart, whose files stand in a dict."""
+    folders = [ROOT / folder for folder in subpackages_on_disk().values() if folder != "generator/effects"]
+    folders += [ROOT / room for room in ("acquisition", "calibration", "campaign", "observers", "spectra")]
+    for folder in folders:
+        told = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
+        files = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+        assert files <= set(re.findall(r"\w+", told)), folder
+        listed = re.findall(r"^ {4}(\w+)", told, re.MULTILINE)
+        assert listed and set(listed) <= files, folder
 
 
 # the map of the pixels that calibration found bad bears the name of an effect; this file names the map, for all others

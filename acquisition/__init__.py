@@ -1,5 +1,34 @@
 """What was measured: settings, the instrument, acquisition and dataset files, and the pairs made of them.
 
+Files:
+    setting               tube voltage, load, filter, exposure, and their text form
+    instrument            the line as its owner describes it
+    acquisition_io        the acquisition file
+    dataset_io            the dataset file
+    pairs                 dark and flat correction, pairs by scene
+    contrast              contrast of a foreign object in a pair
+    sessions              several sessions as one; one layer of a dual-layer panel
+    coarser               squares of pixels as pixels
+    log_images            frames of I/I0 or its logarithm as light
+    cut_off               frames that end at 0
+    import_any            the layout of a folder, and a sidecar to start from
+    import_report         what an import read and skipped
+    images                folders of images with a sidecar
+    nxtomo, dicom, emva1288, xtekct, zenodo, reference
+                          one importer each
+    image_header          what an image file says of its setting
+    export_acquisition    DICONDE, NXtomo, TIFF
+    export_dataset        COCO, YOLO, TIFF
+    export_zarr           Zarr groups
+    tiff_folder           the folders of the paper's data
+    tiff_tags             TIFF with pixel pitch and setting
+    mask_shapes           masks as boxes, run lengths and outlines
+    _image_files          reading of image formats; _dicom_files, _fabio_files, _his_files: one format each
+    _image_header         words of headers; _tiff_header: those of TIFF
+    _picture_checks       what every reader asks of a picture
+    _sidecar              the sidecar's words
+    _hdf5                 faults of HDF5 files
+
 Names that need h5py or scipy are loaded when they are first asked for.
 """
 

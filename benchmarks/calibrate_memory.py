@@ -22,10 +22,10 @@ from scipy.ndimage import gaussian_filter
 
 from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.acquisition.setting import Setting, filters_from_text
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.shipped import shipped_calibrations
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.spread.psf import blur_variance_share
+from raytwin.generator.twins.shipped import shipped_calibrations
+from raytwin.generator.twins.twin_io import read_twin
 
 SHAPE = (760, 956)
 BEAMS = ((40.0, "Cu:0.05"), (90.0, "Cu:0.05"), (40.0, ""), (90.0, ""))

@@ -29,7 +29,7 @@ from raytwin.generator import (
     sample_frames,
 )
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
 
 SIZES = ((64, 64), (128, 128), (380, 478), (760, 956), (1520, 1912))
 ENERGIES = (25, 50, 100, 200)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from raytwin.generator import noise_kernel_1d, project_polychromatic, sample_frames
-from raytwin.generator.as_published import sample_as_published
+from raytwin.generator.references.as_published import sample_as_published
 
 SHAPE = (760, 956)
 SIGMA_PX = 0.6

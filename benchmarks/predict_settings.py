@@ -25,7 +25,7 @@ from raytwin.generator import (
     predict_flatfield,
     spectral_model_of,
 )
-from raytwin.generator.predict_many import predict_levels
+from raytwin.generator.predictions.predict_many import predict_levels
 from raytwin.materials import transmission
 from raytwin.spectra import MODELS, detector_response, tube_fluence_interpolated
 

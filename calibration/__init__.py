@@ -1,5 +1,37 @@
 """From measured darks and flats to a twin: frame sums, photon transfer, optical spread, spectral posterior, validation.
 
+Files:
+    calibrate             a session to a twin, top to bottom
+    photon_transfer       darks and flats to maps, noise and levels, top to bottom
+    frame_sums            sums over the frames of a series, in one pass
+    dark_frames           dark level, growth with exposure, read noise
+    bad_pixels            pixels that are bad, and why
+    full_scale            series that reach the end of the ADC's range
+    flat_levels           each series as photon transfer sees it, the level of each beam, the gain map
+    flat_evidence         drift, lag, linearity, repeats, shape of the noise
+    noise_power           noise power of one series
+    spread_fit            optical spread, gain and read noise from the noise power of all series
+    noise_of_flats        the series that this fit takes
+    repeated_frames       noise where flats are single frames
+    spectral_fit          posterior of tube, filtration and scintillator
+    priors                what is known before flats are looked at
+    wedges                plates of known thickness
+    tube                  a tube calibrated with a dosimeter
+    dose_data             dosimeter readings as data of the spectral fit
+    output_table          dose tables
+    transmission_table    transmission tables
+    validate              predictions against measured flats and wedges
+    next_measurement      the measurement that would narrow predictions most
+    check                 what measurements allow, and what is suspicious
+    findings              codes and sentences of a check
+    series_scan           what a check asks of one series' frames
+    frame_checks          copies of frames, change of scene
+    frame_signs           signs of processing
+    label_checks          labels that do not fit the frames
+    _measured_table       CSV tables
+    _kept_sums            sums of many series, on disk where they are large
+    _kernels              compiled loops
+
 Names are loaded when they are first asked for.
 """
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import Series
-from ..generator.twin import BAD_PIXEL_CODES
+from ..generator.line.twin import BAD_PIXEL_CODES
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
 

@@ -10,9 +10,9 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter
 from ..errors import FitError
-from ..generator.spectral_signal import OTHER_TABLES, OpenBeam
-from ..generator.twin import BAD_PIXEL_CODES, Twin
-from ..generator.twin_answer import calibration_answer
+from ..generator.line.spectral_signal import OTHER_TABLES, OpenBeam
+from ..generator.line.twin import BAD_PIXEL_CODES, BAD_PIXEL_MAP, Twin
+from ..generator.twins.twin_answer import calibration_answer
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
     DEFAULT_MODEL,
@@ -142,7 +142,7 @@ def calibrate_twin(
                 )
     else:
         warnings.append("no series states its kV: no spectral part, no prediction at other settings")
-    evidence["bad_pixels"] = bad_pixel_counts(transfer)
+    evidence[BAD_PIXEL_MAP] = bad_pixel_counts(transfer)
     twin = Twin(
         instrument=acquisition.instrument,
         maps=transfer.maps,

@@ -19,9 +19,9 @@ from ..acquisition.import_any import draft_sidecar, import_folder, layout_of
 from ..acquisition.pairs import object_pairs
 from ..acquisition.setting import text_from_filters
 from ..errors import FileFormatError, InputError
-from ..generator.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
-from ..generator.twin_io import FORMAT as TWIN_FORMAT
-from ..generator.twin_io import read_any_twin
+from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
+from ..generator.twins.twin_io import FORMAT as TWIN_FORMAT
+from ..generator.twins.twin_io import read_any_twin
 from ..results import Result, Table, frame, plain
 from . import frame_signs
 from .findings import Finding, FindingCode, Severity

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import Series
-from ..generator.twin import Estimate, estimate_from_sd
+from ..generator.line.twin import Estimate, estimate_from_sd
 from ._kept_sums import KeptSums
 from .frame_sums import effective_frames
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter
-from ..generator.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel, absorber_thickness_name
+from ..generator.line.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel, absorber_thickness_name
 from .priors import Prior
 
 DOSIMETER_CALIBRATION = "log_dosimeter"

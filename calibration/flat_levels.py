@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, text_from_filters
-from ..generator.twin import Estimate, Level, estimate_from_sd
+from ..generator.line.twin import Estimate, Level, estimate_from_sd
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames, shrinkage
 from .frame_sums import effective_frames

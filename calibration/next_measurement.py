@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
-from ..generator.predict import spectral_model_of
-from ..generator.spectral_signal import OpenBeam
-from ..generator.twin import Estimate, Twin
+from ..generator.line.spectral_signal import OpenBeam
+from ..generator.line.twin import Estimate, Twin
+from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, transmission
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..errors import InputError
-from ..generator.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
+from ..generator.line.twin import DetectorMaps, Estimate, Level, NoiseModel, SpreadEstimate, estimate_from_sd
 from ._kept_sums import KeptSums, SumsKeeper
 from .bad_pixels import cluster_evidence, find_bad_pixels
 from .dark_frames import DarkFrames, dark_estimate, dark_map_sd, read_variance_map, sum_darks

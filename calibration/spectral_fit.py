@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import Filter, text_from_filters
 from ..errors import FitError, InputError
-from ..generator.spectral_signal import (
+from ..generator.line.spectral_signal import (
     ALTERNATIVE_SCINTILLATOR,
     KERMA_OUTPUT,
     OTHER_TABLES,
@@ -28,8 +28,8 @@ from ..generator.spectral_signal import (
     absorber_of_parameter,
     attenuation_scale_name,
 )
-from ..generator.twin import Level, NoiseModel, SpectralPosterior
-from ..generator.twin_spectrum import slope_over_gain
+from ..generator.line.twin import Level, NoiseModel, SpectralPosterior
+from ..generator.line.twin_spectrum import slope_over_gain
 from ..spectra import BIN_WIDTH_KEV, Spectrum
 from .dose_data import (
     DOSE_FILTRATION,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
-from ..generator.psf import CLEAR_LAYER, Spread
+from ..generator.spread.psf import CLEAR_LAYER, Spread
 from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, smeared, spread_of_bins, usable
 
 FloatArray = NDArray[np.float64]

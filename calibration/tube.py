@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import text_from_filters
 from ..errors import InputError
-from ..generator.spectral_signal import OpenBeam, absorber_of_parameter
-from ..generator.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
-from ..generator.twin import SpectralPosterior
-from ..generator.twin_spectrum import model_of_posterior
+from ..generator.line.spectral_signal import OpenBeam, absorber_of_parameter
+from ..generator.line.twin import SpectralPosterior
+from ..generator.line.twin_spectrum import model_of_posterior
+from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
 from .dose_data import DOSIMETER_CALIBRATION, DOSIMETER_HARDNESS, KermaRatio, KermaReading
 from .output_table import OutputTable
 from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum

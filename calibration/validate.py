@@ -16,9 +16,9 @@ from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..files import sha256_of_file
 from ..generator.effects import effect_of
-from ..generator.predict import predict_flatfield
-from ..generator.present_line import present_line
-from ..generator.twin import Estimate, Twin
+from ..generator.frames.present_line import present_line
+from ..generator.line.twin import Estimate, Twin
+from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, frame, plain
 from .frame_sums import effective_frames, sum_frames
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence

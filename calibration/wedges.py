@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.setting import Filter, filters_from_text, text_from_filters
 from ..errors import InputError
-from ..generator.predict import spectral_model_of
-from ..generator.spectral_signal import OTHER_TABLES, OpenBeam, attenuation_scale_name
-from ..generator.twin import DetectorMaps, Estimate, SpectralPosterior, Twin, estimate_from_log_draws
+from ..generator.line.spectral_signal import OTHER_TABLES, OpenBeam, attenuation_scale_name
+from ..generator.line.twin import DetectorMaps, Estimate, SpectralPosterior, Twin, estimate_from_log_draws
+from ..generator.predictions.predict import spectral_model_of
 from ..materials import material_from_name, optical_depth
 from .frame_sums import sum_frames
 from .priors import ATTENUATION_SCALE, SHARES_CORRELATION, TABLE_SHARE

@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
-from ..diagnosis.assemble import build_problem
-from ..diagnosis.changes import Variant, catalogue_variants
-from ..diagnosis.discrepancy import USUAL_LEVEL
-from ..diagnosis.held_out import folds_of, left_over, shrinkage_of
-from ..diagnosis.observed import Point
-from ..diagnosis.problem import Problem
+from ..diagnosis.inference.discrepancy import USUAL_LEVEL
+from ..diagnosis.inference.observed import Point
+from ..diagnosis.judgement.held_out import folds_of, left_over, shrinkage_of
+from ..diagnosis.model.changes import Variant, catalogue_variants
+from ..diagnosis.problem.assemble import build_problem
+from ..diagnosis.problem.problem import Problem
 from ..generator.effects import AppliedEffect
-from ..generator.twin import Twin
+from ..generator.line.twin import Twin
 
 _NAME = "as found"
 

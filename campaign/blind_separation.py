@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..diagnosis.curves import node_weights
+from ..diagnosis.model.curves import node_weights
 from .blind_statistics import CurveKey, SessionStatistics
 
 _GRID = 61  # strengths of a competitor, evenly in the logarithm

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from ..diagnosis.problem import Problem
+    from ..diagnosis.problem.problem import Problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

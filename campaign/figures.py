@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
-from ..diagnosis.answer import plot_gap_rows
-from ..diagnosis.explanation import axis_text
+from ..diagnosis.judgement.answer import plot_gap_rows
+from ..diagnosis.report.explanation import axis_text
 from ..errors import RaytwinError
-from ..generator.twin import Twin
+from ..generator.line.twin import Twin
 from ..pod.repeats import fit_pod
 from .demo_gap import WithheldFrame
 

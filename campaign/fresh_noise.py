@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..generator.fresh import FreshSource
+from ..generator.datasets.fresh import FreshSource
 
 Arrays = tuple[NDArray[np.float32], NDArray[np.float32]]
 

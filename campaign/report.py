@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..generator.twin import Twin
-from ..generator.twin_io import read_twin
+from ..generator.line.twin import Twin
+from ..generator.twins.twin_io import read_twin
 from ..reports import write_page
 from .demo import read_hits
 from .demo_gap import WithheldFrame, answer_text, withheld_frames, withheld_rows, withheld_text

@@ -18,8 +18,8 @@ import numpy as np
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from ..generator.describe import read_description
-from ..generator.twin import Twin
+from ..generator.line.twin import Twin
+from ..generator.scenes.describe import read_description
 
 if TYPE_CHECKING:
     from ..segmentation import Recipe
@@ -39,7 +39,7 @@ def make_starter_line(plan: Mapping[str, Any], number: int, folder: Path) -> Pat
     """The twin file of line `number`, calibrated from flats that the virtual lab measures; made if it is not there."""
     from ..acquisition.acquisition_io import open_acquisition
     from ..calibration.calibrate import calibrate_twin
-    from ..generator.twin_io import write_twin
+    from ..generator.twins.twin_io import write_twin
     from ..lab.protocols import run_protocol
 
     path = folder / f"line_{number}.h5"
@@ -72,7 +72,7 @@ def make_starter_block(plan: Mapping[str, Any], number: int, twin: Twin, folder:
     Raises:
         InputError: a plan whose settings the line cannot reach, or whose objects find no room.
     """
-    from ..generator.generate_described import generate_from_description
+    from ..generator.datasets.generate_described import generate_from_description
 
     path = folder / f"block_{number:04d}.h5"
     if path.exists():
@@ -111,7 +111,7 @@ def make_starter_images(
 ) -> None:
     """All blocks of a plan in one dataset file."""
     from ..acquisition.dataset_io import concatenate_datasets, read_dataset
-    from ..generator.twin_io import read_twin
+    from ..generator.twins.twin_io import read_twin
 
     folder.mkdir(parents=True, exist_ok=True)
     twins = [read_twin(make_starter_line(plan, number, folder)) for number in range(len(plan["lines"]["pixel_mm"]))]
@@ -125,7 +125,7 @@ def make_starter_images(
 
 def _settings(ranges: Mapping[str, Any], twin: Twin, rng: np.random.Generator) -> tuple[Setting, Setting]:
     """A pair of settings whose flats lie within the detector's range."""
-    from ..generator.predict import full_scale, predict_flatfield
+    from ..generator.predictions.predict import full_scale, predict_flatfield
 
     for _ in range(_TRIES):
         material = str(rng.choice(list(ranges["filter_mm"])))

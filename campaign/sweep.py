@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import FitError, InputError, RaytwinError
 from ..files import only_one, whole_file
-from ..generator.twin_io import read_twin
+from ..generator.twins.twin_io import read_twin
 from ..observers import write_efficiency
 from ._plain import digest, plain, read_object
 from .decision import Change, Verdict, decide, judge_row

@@ -157,7 +157,7 @@ class CurveOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slabs:
-    """What contrast-to-noise is predicted for: product and foreign object as slabs, see `generator.contrast`."""
+    """What contrast-to-noise is predicted for: product and foreign object as slabs, see `generator.predictions.contrast`."""
 
     product: Filter
     foreign_object: Filter
@@ -528,7 +528,7 @@ def _number(
 
 
 def _twin_file(words: _Words, folder: Path) -> Path:
-    from ..generator.shipped import shipped_calibration, shipped_calibrations
+    from ..generator.twins.shipped import shipped_calibration, shipped_calibrations
 
     name = words.text("twin", None)
     place = folder / name

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import FitError, InputError
-from ..generator.twin_io import read_twin
+from ..generator.twins.twin_io import read_twin
 from .sweep_choice import paces, takes_part
 from .sweep_file import Campaign, Pair, Screening
 from .sweep_settings import Outlook, open_references

@@ -23,14 +23,14 @@ from ..acquisition.setting import Setting, text_from_filters
 from ..errors import InputError
 from ..generator.effects import AppliedEffect
 from ..generator.effects.motion_blur import MOTION_BLUR, STATED_MS
-from ..generator.line_limits import frames_per_s
-from ..generator.predict import Prediction, predict_flatfield
-from ..generator.twin import Twin
+from ..generator.line.line_limits import frames_per_s
+from ..generator.line.twin import Twin
+from ..generator.predictions.predict import Prediction, predict_flatfield
 from .sweep_file import Campaign, Limits, Pair, Requirement, Timing, text_of_pair
 
 if TYPE_CHECKING:
-    from ..generator.contrast import SlabContrasts
-    from ..generator.describe import Description
+    from ..generator.predictions.contrast import SlabContrasts
+    from ..generator.scenes.describe import Description
 
 _STRICTER = ("maximum_kV", "maximum_current_mA", "maximum_power_w")
 
@@ -92,7 +92,7 @@ class Scout:
             if path is None:
                 continue
             if campaign.described:
-                from ..generator.describe import read_description
+                from ..generator.scenes.describe import read_description
 
                 self._descriptions.append(read_description(path))
             else:
@@ -127,8 +127,8 @@ class Scout:
 
     def _try_images(self, pair: Pair) -> tuple[str, ...]:
         """Whether images can be made at all; the noise of one reference of each kind is weighed."""
-        from ..generator.generate import ReferenceImages
-        from ..generator.generate_described import DescribedScenes
+        from ..generator.datasets.generate import ReferenceImages
+        from ..generator.datasets.generate_described import DescribedScenes
 
         twin, told = twin_at(self.twin, pair)
         found: list[str] = list(told)
@@ -152,7 +152,7 @@ class Scout:
         return tuple(found)
 
     def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float]:
-        from ..generator.contrast import SlabContrasts
+        from ..generator.predictions.contrast import SlabContrasts
 
         slabs = self.campaign.slabs
         if slabs is None:
@@ -345,7 +345,7 @@ def _missed(requirement: Requirement | None, known: Mapping[str, Any]) -> str:
 
 def _check_distance(instrument: Instrument, pair: Pair, dataset: Dataset, fallback: Pair | None) -> None:
     """Refuse a distance that references which state none (the instrument's, then) were not taken at."""
-    from ..generator.generate import reference_settings
+    from ..generator.datasets.generate import reference_settings
 
     own = instrument.source_detector_mm
     rows = {row.setting: row for row in dataset.rows}

@@ -33,8 +33,8 @@ from .sweep_settings import open_references, start_pair, twin_at
 from .trial import curve_of_table, detect_on_file, thresholds_from_images, train_on_file, write_split
 
 if TYPE_CHECKING:
-    from ..generator.generate import GenerationSummary
-    from ..generator.twin import Twin
+    from ..generator.datasets.generate import GenerationSummary
+    from ..generator.line.twin import Twin
     from ..segmentation import Recipe
 
 Task = dict[str, Any]
@@ -75,7 +75,7 @@ def _content(path: Path) -> str:
     """Hash of a reference file; of a description with the maps and meshes that it names."""
     if path.suffix.lower() != ".toml":
         return sha256_of_file(path)
-    from ..generator.describe import read_description
+    from ..generator.scenes.describe import read_description
 
     described = read_description(path)
     files = sorted({file for kind in (*described.products, *described.foreign_objects) for file in kind.files})
@@ -289,7 +289,7 @@ def run_task(task: Task, *, tell: Tell = lambda line: None) -> None:
 
 def _run_start(task: Task, tell: Tell) -> None:
     """A network that learnt from the least noisy images, then from noisier ones (those teach a new network nothing)."""
-    from ..generator.twin_io import read_twin
+    from ..generator.twins.twin_io import read_twin
     from ..segmentation import recipe_for_fine_tuning
 
     folder = Path(task["folder"])
@@ -411,7 +411,7 @@ def _of_other_size(curve: Mapping[str, Any]) -> dict[str, Any]:
 
 def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
     """Hit table of a setting; what was told on the way."""
-    from ..generator.twin_io import read_twin
+    from ..generator.twins.twin_io import read_twin
     from ..segmentation import recipe_for_fine_tuning
 
     training, trying, seeds = task["training"], task["trying"], task["seeds"]
@@ -476,8 +476,8 @@ def _generate(
     whole = path.with_name(f"{path.stem}_drawn.h5")
     summary: GenerationSummary
     if source.suffix.lower() == ".toml":
-        from ..generator.describe import read_description
-        from ..generator.generate_described import generate_from_description
+        from ..generator.datasets.generate_described import generate_from_description
+        from ..generator.scenes.describe import read_description
 
         summary = generate_from_description(
             twin,
@@ -491,7 +491,7 @@ def _generate(
         )
         write_split(whole, path, part)
     else:
-        from ..generator.generate import generate_dataset
+        from ..generator.datasets.generate import generate_dataset
 
         fallback = task["reference_setting"]
         with read_dataset(source) as reference:
@@ -536,7 +536,7 @@ def _look_of(known: set[str]) -> Callable[[str], str]:
 
 def _references_own(task: Task) -> Pair:
     """Settings that the references were taken at; those of the first one."""
-    from ..generator.generate import reference_settings
+    from ..generator.datasets.generate import reference_settings
 
     fallback = task["reference_setting"]
     with read_dataset(task["learn"]) as dataset:

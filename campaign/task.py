@@ -39,8 +39,8 @@ from ._plain import plain
 from .trial import curve_of_table, detect_on_file, scene_of, thresholds_from_images, train_on_file, write_split
 
 if TYPE_CHECKING:
-    from ..generator.known_scenes import KnownScene
-    from ..generator.twin import Twin
+    from ..generator.datasets.known_scenes import KnownScene
+    from ..generator.line.twin import Twin
 
 Tell = Callable[[str], None]
 
@@ -250,7 +250,7 @@ def check_task(brought: TaskInput) -> None:
 
 def _claim(directory: Path, before: "Twin", after: "Twin", brought: TaskInput, plan: TaskPlan) -> None:
     """Make the folder that of this task, or refuse one of another."""
-    from ..generator.twin_io import write_twin
+    from ..generator.twins.twin_io import write_twin
 
     for name, twin in (("before", before), ("after", after)):
         with whole_file(directory / f"{name}.new.h5") as temporary:
@@ -414,7 +414,7 @@ class _KnownSource:
     text = "path lengths of the measured products"
 
     def __init__(self, path: Path, measured: _Measured, twin: "Twin", plan: TaskPlan, *, own: bool) -> None:
-        from ..generator.known_scenes import KnownScene, KnownScenes
+        from ..generator.datasets.known_scenes import KnownScene, KnownScenes
 
         self.plan, self.low, self.high = plan, measured.low, measured.high
         with read_dataset(measured.path) as dataset:
@@ -485,7 +485,7 @@ class _KnownSource:
     def _write(
         self, twin: "Twin", path: Path, splits: Sequence[str], low: Setting, high: Setting, draws: int
     ) -> tuple[str, ...]:
-        from ..generator.known_scenes import KnownScenes, generate_known_scenes
+        from ..generator.datasets.known_scenes import KnownScenes, generate_known_scenes
 
         if path.exists():
             return tuple(KnownScenes(twin, low=low, high=high, product_material=self.material).warnings)
@@ -512,7 +512,7 @@ class _DescribedSource:
     """Products drawn from a description."""
 
     def __init__(self, path: Path, measured: _Measured, plan: TaskPlan) -> None:
-        from ..generator.describe import read_description
+        from ..generator.scenes.describe import read_description
 
         self.description = read_description(path)
         self.plan, self.low, self.high = plan, measured.low, measured.high
@@ -535,7 +535,7 @@ class _DescribedSource:
     def _write(
         self, twin: "Twin", path: Path, part: str, low: Setting, high: Setting, images: int, place: int
     ) -> tuple[str, ...]:
-        from ..generator.generate_described import generate_from_description
+        from ..generator.datasets.generate_described import generate_from_description
 
         if path.exists():
             return ()
@@ -575,7 +575,7 @@ class _ReferenceSource:
         return path
 
     def _write(self, twin: "Twin", path: Path, part: str, place: int) -> tuple[str, ...]:
-        from ..generator.generate import generate_dataset
+        from ..generator.datasets.generate import generate_dataset
 
         if path.exists():
             return ()

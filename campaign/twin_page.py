@@ -7,9 +7,9 @@ import numpy as np
 
 from ..acquisition.setting import text_from_filters
 from ..calibration.validate import Validation, compared
-from ..generator.tube_twin import TubeTwin
-from ..generator.twin import Estimate, Level, Twin
-from ..generator.twin_answer import calibration_answer
+from ..generator.line.twin import Estimate, Level, Twin
+from ..generator.predictions.tube_twin import TubeTwin
+from ..generator.twins.twin_answer import calibration_answer
 from ..reports import Chart, Figure, KeyFigure, Line, Picture, Points, ResultPage, Rule, Section, SortedTable, Step
 from ..reports.chart import AFTER, BEFORE, MEASURED, QUIET, SERIES_COLOURS, SHAPES, Shape
 

@@ -4,13 +4,13 @@ from importlib import import_module
 from typing import Any
 
 _PLACES = {
-    "Diagnosis": "answer",
+    "Diagnosis": "judgement.answer",
     "diagnose": "diagnose_session",
-    "diagnosis_answer": "answer",
-    "build_problem": "assemble",
-    "summarise_series": "summaries",
-    "plan_session": "plan_session",
-    "weigh_hypotheses": "inference",
+    "diagnosis_answer": "judgement.answer",
+    "build_problem": "problem.assemble",
+    "summarise_series": "session.summaries",
+    "plan_session": "advice.plan_session",
+    "weigh_hypotheses": "inference.inference",
 }
 
 __all__ = [

@@ -7,16 +7,14 @@ import numpy as np
 
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
-from ..generator.twin import Twin
-from .answer import EXPLAINED, Diagnosis, in_pixels
-from .assemble import build_problem
-from .changes import catalogue_variants
-from .coarse import unseen_in_squares
-from .inference import UNKNOWN, Hypothesis, Priors
-from .judgement import judge
-from .preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
-from .problem import Problem
-from .readings import Suspect
+from ..generator.line.twin import Twin
+from .checks.preparation import calibrated_twin, mislabelled, prepare_session
+from .checks.readings import Suspect
+from .inference.inference import UNKNOWN, Hypothesis, Priors
+from .judgement.answer import EXPLAINED, Diagnosis, in_pixels
+from .judgement.judgement import judge
+from .problem.assemble import problem_of
+from .session.coarse import unseen_in_squares
 
 
 def diagnose(
@@ -68,27 +66,6 @@ def diagnose(
             progress("calibration with all pixels")
         twin = calibrated_twin(session.all_pixels, rng=rng)
     return in_pixels(result, twin=twin, factor=session.factor)
-
-
-def problem_of(
-    session: PreparedSession,
-    twin: Twin,
-    *,
-    without: Sequence[str] = (),
-    progress: Callable[[str], None] | None = None,
-) -> Problem:
-    """What inference is asked about a prepared session, with a twin and the catalogue less the effects `without`."""
-    return build_problem(
-        session.acquisition,
-        twin,
-        variants=catalogue_variants(without=without, side=session.factor),
-        calibrated_elsewhere=session.calibrated_elsewhere,
-        exposed=session.exposed,
-        ends_at_zero=session.ends_at_zero,
-        spectral_point=session.spectral_point,
-        side=session.factor,
-        progress=progress,
-    )
 
 
 def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:

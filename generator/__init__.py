@@ -8,23 +8,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .as_published import (
-        published_parameters,
-        sample_as_published,
+    from .datasets.generate import (
+        GenerationSummary,
+        PairTransfer,
+        generate_dataset,
     )
-    from .contrast import (
-        Contrast,
-        ContrastChannel,
-        UncalibratedLine,
-        compute_contrast_map,
-        predict_contrast,
-        published_delta_r,
+    from .datasets.generate_described import (
+        DescribedScenes,
+        generate_from_description,
     )
-    from .describe import (
-        Description,
-        Scene,
-        read_description,
-        sample_scene,
+    from .datasets.render import (
+        ExpectedImage,
+        Geometry,
+        render_expected,
     )
     from .effects import (
         EFFECTS,
@@ -32,62 +28,7 @@ if TYPE_CHECKING:
         Effect,
         Parameter,
     )
-    from .generate import (
-        GenerationSummary,
-        PairTransfer,
-        generate_dataset,
-    )
-    from .generate_described import (
-        DescribedScenes,
-        generate_from_description,
-    )
-    from .kernels import (
-        deposit_spread_from_photons,
-        draw_key,
-        gamma_step_DN,
-        sample_frames,
-        sample_quanta,
-    )
-    from .noise import (
-        digitise,
-        frame_sd_DN,
-        sample_correlated_quanta,
-        sample_frame_noise,
-    )
-    from .predict import (
-        Prediction,
-        Predictions,
-        predict_flatfield,
-        predict_flatfields,
-        slope_share,
-        spectral_model_of,
-    )
-    from .predict_many import (
-        Levels,
-        predict_levels,
-    )
-    from .predict_settings import asked_settings, predict_words
-    from .projection import (
-        project_polychromatic,
-    )
-    from .psf import (
-        PSF_MODELS,
-        Spread,
-        blur_variance_share,
-        noise_autocovariance,
-        noise_kernel_1d,
-        optical_kernel_1d,
-    )
-    from .registration import (
-        estimate_shift_px,
-        shift_image,
-    )
-    from .render import (
-        ExpectedImage,
-        Geometry,
-        render_expected,
-    )
-    from .series import (
+    from .frames.series import (
         ExpectedSeries,
         LineMemory,
         ModelCache,
@@ -98,26 +39,23 @@ if TYPE_CHECKING:
         session_conditions,
         with_conditions,
     )
-    from .shipped import (
-        shipped_calibration,
-        shipped_calibrations,
+    from .kernels.kernels import (
+        deposit_spread_from_photons,
+        draw_key,
+        gamma_step_DN,
+        sample_frames,
+        sample_quanta,
     )
-    from .spectral_signal import (
+    from .kernels.projection import (
+        project_polychromatic,
+    )
+    from .line.spectral_signal import (
         BeamSignal,
         OpenBeam,
         SpectralModel,
         gain_behind_object,
     )
-    from .topup import (
-        TopUp,
-        apply_top_up,
-        plan_top_up,
-    )
-    from .transfer import (
-        TransferredPair,
-        transfer_pair,
-    )
-    from .twin import (
+    from .line.twin import (
         BAD_PIXEL_CODES,
         DetectorMaps,
         Estimate,
@@ -129,112 +67,174 @@ if TYPE_CHECKING:
         estimate_from_sd,
         gaussian_spread,
     )
-    from .twin_answer import calibration_answer, tube_table, twin_table
-    from .twin_io import (
-        read_twin,
-        write_twin,
+    from .predictions.contrast import (
+        Contrast,
+        ContrastChannel,
+        UncalibratedLine,
+        compute_contrast_map,
+        predict_contrast,
+        published_delta_r,
     )
-    from .twin_plot import plot_levels
-    from .two_material import (
+    from .predictions.predict import (
+        Prediction,
+        Predictions,
+        predict_flatfield,
+        predict_flatfields,
+        slope_share,
+        spectral_model_of,
+    )
+    from .predictions.predict_many import (
+        Levels,
+        predict_levels,
+    )
+    from .predictions.predict_settings import asked_settings, predict_words
+    from .references.as_published import (
+        published_parameters,
+        sample_as_published,
+    )
+    from .references.topup import (
+        TopUp,
+        apply_top_up,
+        plan_top_up,
+    )
+    from .references.transfer import (
+        TransferredPair,
+        transfer_pair,
+    )
+    from .references.two_material import (
         TwoMaterialSolution,
         TwoMaterialTables,
         solve_two_materials,
         tabulate_two_materials,
     )
+    from .scenes.describe import (
+        Description,
+        Scene,
+        read_description,
+        sample_scene,
+    )
+    from .spread.noise import (
+        digitise,
+        frame_sd_DN,
+        sample_correlated_quanta,
+        sample_frame_noise,
+    )
+    from .spread.psf import (
+        PSF_MODELS,
+        Spread,
+        blur_variance_share,
+        noise_autocovariance,
+        noise_kernel_1d,
+        optical_kernel_1d,
+    )
+    from .spread.registration import (
+        estimate_shift_px,
+        shift_image,
+    )
+    from .twins.shipped import (
+        shipped_calibration,
+        shipped_calibrations,
+    )
+    from .twins.twin_answer import calibration_answer, tube_table, twin_table
+    from .twins.twin_io import (
+        read_twin,
+        write_twin,
+    )
+    from .twins.twin_plot import plot_levels
 
 _LAZY = {
     "AppliedEffect": "effects",
-    "BAD_PIXEL_CODES": "twin",
-    "BeamSignal": "spectral_signal",
-    "Contrast": "contrast",
-    "ContrastChannel": "contrast",
-    "DescribedScenes": "generate_described",
-    "Description": "describe",
-    "DetectorMaps": "twin",
+    "BAD_PIXEL_CODES": "line.twin",
+    "BeamSignal": "line.spectral_signal",
+    "Contrast": "predictions.contrast",
+    "ContrastChannel": "predictions.contrast",
+    "DescribedScenes": "datasets.generate_described",
+    "Description": "scenes.describe",
+    "DetectorMaps": "line.twin",
     "EFFECTS": "effects",
     "Effect": "effects",
-    "Estimate": "twin",
-    "ExpectedImage": "render",
-    "ExpectedSeries": "series",
-    "GenerationSummary": "generate",
-    "Geometry": "render",
-    "Level": "twin",
-    "Levels": "predict_many",
-    "LineMemory": "series",
-    "ModelCache": "series",
-    "NoiseModel": "twin",
-    "OpenBeam": "spectral_signal",
-    "PSF_MODELS": "psf",
-    "PairTransfer": "generate",
+    "Estimate": "line.twin",
+    "ExpectedImage": "datasets.render",
+    "ExpectedSeries": "frames.series",
+    "GenerationSummary": "datasets.generate",
+    "Geometry": "datasets.render",
+    "Level": "line.twin",
+    "Levels": "predictions.predict_many",
+    "LineMemory": "frames.series",
+    "ModelCache": "frames.series",
+    "NoiseModel": "line.twin",
+    "OpenBeam": "line.spectral_signal",
+    "PSF_MODELS": "spread.psf",
+    "PairTransfer": "datasets.generate",
     "Parameter": "effects",
-    "Prediction": "predict",
-    "Predictions": "predict",
-    "Scene": "describe",
-    "SeriesRequest": "series_request",
-    "SpectralModel": "spectral_signal",
-    "SpectralPosterior": "twin",
-    "TopUp": "topup",
-    "TransferredPair": "transfer",
-    "SpreadEstimate": "twin",
-    "Twin": "twin",
-    "gaussian_spread": "twin",
-    "TwoMaterialSolution": "two_material",
-    "TwoMaterialTables": "two_material",
-    "UncalibratedLine": "contrast",
-    "apply_top_up": "topup",
-    "beam_conditions": "series",
-    "Spread": "psf",
-    "blur_variance_share": "psf",
-    "compute_contrast_map": "contrast",
-    "deposit_spread_from_photons": "kernels",
-    "digitise": "noise",
-    "draw_key": "kernels",
-    "estimate_from_sd": "twin",
-    "estimate_shift_px": "registration",
-    "expected_series": "series",
-    "frame_sd_DN": "noise",
-    "gain_behind_object": "spectral_signal",
-    "gamma_step_DN": "kernels",
-    "generate_dataset": "generate",
-    "generate_from_description": "generate_described",
-    "noise_autocovariance": "psf",
-    "noise_kernel_1d": "psf",
-    "optical_kernel_1d": "psf",
-    "plan_top_up": "topup",
-    "predict_contrast": "contrast",
-    "predict_flatfield": "predict",
-    "predict_flatfields": "predict",
-    "predict_levels": "predict_many",
-    "project_polychromatic": "projection",
-    "published_delta_r": "contrast",
-    "published_parameters": "as_published",
-    "read_description": "describe",
-    "read_twin": "twin_io",
-    "render_expected": "render",
-    "sample_as_published": "as_published",
-    "sample_correlated_quanta": "noise",
-    "sample_frame_noise": "noise",
-    "sample_frames": "kernels",
-    "sample_quanta": "kernels",
-    "sample_scene": "describe",
-    "sample_series": "series",
-    "session_conditions": "series",
-    "shift_image": "registration",
-    "shipped_calibration": "shipped",
-    "shipped_calibrations": "shipped",
-    "slope_share": "predict",
-    "solve_two_materials": "two_material",
-    "spectral_model_of": "predict",
-    "tabulate_two_materials": "two_material",
-    "transfer_pair": "transfer",
-    "with_conditions": "series",
-    "write_twin": "twin_io",
-    "asked_settings": "predict_settings",
-    "calibration_answer": "twin_answer",
-    "plot_levels": "twin_plot",
-    "predict_words": "predict_settings",
-    "tube_table": "twin_answer",
-    "twin_table": "twin_answer",
+    "Prediction": "predictions.predict",
+    "Predictions": "predictions.predict",
+    "Scene": "scenes.describe",
+    "SeriesRequest": "line.series_request",
+    "SpectralModel": "line.spectral_signal",
+    "SpectralPosterior": "line.twin",
+    "TopUp": "references.topup",
+    "TransferredPair": "references.transfer",
+    "SpreadEstimate": "line.twin",
+    "Twin": "line.twin",
+    "gaussian_spread": "line.twin",
+    "TwoMaterialSolution": "references.two_material",
+    "TwoMaterialTables": "references.two_material",
+    "UncalibratedLine": "predictions.contrast",
+    "apply_top_up": "references.topup",
+    "beam_conditions": "frames.series",
+    "Spread": "spread.psf",
+    "blur_variance_share": "spread.psf",
+    "compute_contrast_map": "predictions.contrast",
+    "deposit_spread_from_photons": "kernels.kernels",
+    "digitise": "spread.noise",
+    "draw_key": "kernels.kernels",
+    "estimate_from_sd": "line.twin",
+    "estimate_shift_px": "spread.registration",
+    "expected_series": "frames.series",
+    "frame_sd_DN": "spread.noise",
+    "gain_behind_object": "line.spectral_signal",
+    "gamma_step_DN": "kernels.kernels",
+    "generate_dataset": "datasets.generate",
+    "generate_from_description": "datasets.generate_described",
+    "noise_autocovariance": "spread.psf",
+    "noise_kernel_1d": "spread.psf",
+    "optical_kernel_1d": "spread.psf",
+    "plan_top_up": "references.topup",
+    "predict_contrast": "predictions.contrast",
+    "predict_flatfield": "predictions.predict",
+    "predict_flatfields": "predictions.predict",
+    "predict_levels": "predictions.predict_many",
+    "project_polychromatic": "kernels.projection",
+    "published_delta_r": "predictions.contrast",
+    "published_parameters": "references.as_published",
+    "read_description": "scenes.describe",
+    "read_twin": "twins.twin_io",
+    "render_expected": "datasets.render",
+    "sample_as_published": "references.as_published",
+    "sample_correlated_quanta": "spread.noise",
+    "sample_frame_noise": "spread.noise",
+    "sample_frames": "kernels.kernels",
+    "sample_quanta": "kernels.kernels",
+    "sample_scene": "scenes.describe",
+    "sample_series": "frames.series",
+    "session_conditions": "frames.series",
+    "shift_image": "spread.registration",
+    "shipped_calibration": "twins.shipped",
+    "shipped_calibrations": "twins.shipped",
+    "slope_share": "predictions.predict",
+    "solve_two_materials": "references.two_material",
+    "spectral_model_of": "predictions.predict",
+    "tabulate_two_materials": "references.two_material",
+    "transfer_pair": "references.transfer",
+    "with_conditions": "frames.series",
+    "write_twin": "twins.twin_io",
+    "asked_settings": "predictions.predict_settings",
+    "calibration_answer": "twins.twin_answer",
+    "plot_levels": "twins.twin_plot",
+    "predict_words": "predictions.predict_settings",
+    "tube_table": "twins.twin_answer",
+    "twin_table": "twins.twin_answer",
 }
 
 __all__ = [

@@ -1,4 +1,17 @@
-"""Model observers: detectability, POD and a90 of foreign objects at any setting from the twin alone, without images or training."""
+"""Model observers: detectability, POD and a90 of foreign objects at any setting from the twin alone, without images or training.
+
+Files:
+    observe             setting to a90
+    detectors           detectability of linear observers
+    objects             foreign objects as signals
+    line_images         signals and noise of log images at many settings
+    frequencies         spatial frequencies of a patch
+    texture             power spectrum of a product's texture
+    reference_objects   objects and texture of reference images
+    search              threshold of a search
+    efficiency          an observer brought to networks; efficiency_io: its file
+    changes             what limits a setting
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

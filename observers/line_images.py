@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from ..generator.binning import refuse_binning
-from ..generator.line_limits import broken_limits
-from ..generator.predict import full_scale
-from ..generator.predict_many import Levels, predict_levels
-from ..generator.present_line import present_line
-from ..generator.psf import whole_spectrum
-from ..generator.spectral_signal import OpenBeam, SpectralModel
-from ..generator.twin import Twin
-from ..generator.twin_spectrum import spectral_model_of, white_gain_DN
+from ..generator.frames.present_line import present_line
+from ..generator.line.binning import refuse_binning
+from ..generator.line.line_limits import broken_limits
+from ..generator.line.spectral_signal import OpenBeam, SpectralModel
+from ..generator.line.twin import Twin
+from ..generator.line.twin_spectrum import spectral_model_of, white_gain_DN
+from ..generator.predictions.predict import full_scale
+from ..generator.predictions.predict_many import Levels, predict_levels
+from ..generator.spread.psf import whole_spectrum
 from ..materials import material_from_name, mu_per_mm
 from .frequencies import FrequencyBins
 from .objects import ForeignObjects, ReferenceObjects, spectra_of_masks

@@ -1,4 +1,16 @@
-"""Spectra of X-ray tubes and the response of detectors: from kV and filters to what is detected."""
+"""Spectra of X-ray tubes and the response of detectors: from kV and filters to what is detected.
+
+Files:
+    grid          the energy grid
+    tube          tube spectra, and between their kV
+    _packaged     spectra that come with the package; make_table writes them
+    _cache        spectra kept on disk
+    measured      measured spectra
+    spectrum      mean energy, kerma, half-value layers
+    detector      energy that a detector keeps of each photon
+    light_yield   light of a scintillator against energy
+    effective     effective attenuation
+"""
 
 from ._packaged import is_packaged
 from .detector import DEFAULT_SCINTILLATOR, Response, detector_response, k_escape_fractions

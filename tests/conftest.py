@@ -61,9 +61,8 @@ def series_line():
 
     from raytwin.acquisition.instrument import Instrument
     from raytwin.acquisition.setting import filters_from_text
-    from raytwin.generator.psf import blur_variance_share
-    from raytwin.generator.spectral_signal import SpectralModel
-    from raytwin.generator.twin import (
+    from raytwin.generator.line.spectral_signal import SpectralModel
+    from raytwin.generator.line.twin import (
         DetectorMaps,
         Level,
         NoiseModel,
@@ -72,6 +71,7 @@ def series_line():
         estimate_from_sd,
         gaussian_spread,
     )
+    from raytwin.generator.spread.psf import blur_variance_share
 
     shape, sigma_px, white = (40, 40), 0.5, 0.01
     copper = filters_from_text("Cu:0.05")
@@ -162,10 +162,8 @@ def make_model_twin():
     from raytwin.acquisition import Setting
     from raytwin.acquisition.instrument import Instrument
     from raytwin.acquisition.setting import filters_from_text
-    from raytwin.generator.predict import predict_flatfield
-    from raytwin.generator.psf import blur_variance_share
-    from raytwin.generator.spectral_signal import SpectralModel
-    from raytwin.generator.twin import (
+    from raytwin.generator.line.spectral_signal import SpectralModel
+    from raytwin.generator.line.twin import (
         DetectorMaps,
         Level,
         NoiseModel,
@@ -174,6 +172,8 @@ def make_model_twin():
         estimate_from_sd,
         gaussian_spread,
     )
+    from raytwin.generator.predictions.predict import predict_flatfield
+    from raytwin.generator.spread.psf import blur_variance_share
 
     copper, scintillator = filters_from_text("Cu:0.05"), filters_from_text("CsI:0.5")
     sigma_px, white, read_DN = 0.5, 0.01, 12.0
@@ -257,9 +257,9 @@ def make_sweep_line(make_model_twin):
     from raytwin.acquisition import read_dataset
     from raytwin.acquisition.dataset_io import write_selected
     from raytwin.acquisition.setting import setting_from_text
-    from raytwin.generator.describe import read_description
-    from raytwin.generator.generate_described import generate_from_description
-    from raytwin.generator.twin_io import write_twin
+    from raytwin.generator.datasets.generate_described import generate_from_description
+    from raytwin.generator.scenes.describe import read_description
+    from raytwin.generator.twins.twin_io import write_twin
 
     products = """
 [[product]]

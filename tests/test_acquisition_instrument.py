@@ -6,7 +6,7 @@ import pytest
 from raytwin.acquisition import write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.twins.twin_io import write_twin
 
 STATED = {"pixel_mm": 0.4, "bits": 14, "anode": "W", "counting": False}
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 import raytwin as rt
 from raytwin.cli import main
-from raytwin.generator.twin import Twin
+from raytwin.generator.line.twin import Twin
 from raytwin.results import LINES, same_value
 
 ROOT = Path(__file__).parents[1]

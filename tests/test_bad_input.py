@@ -16,7 +16,7 @@ import pytest
 from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.cli import main
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.twins.twin_io import write_twin
 
 SHAPE = (24, 28)
 EXPOSURE_MS = 20.0

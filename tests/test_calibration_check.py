@@ -15,7 +15,7 @@ from raytwin.calibration.check import check_acquisition
 from raytwin.calibration.findings import Finding, FindingCode
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.twins.twin_io import write_twin
 
 FOLDER = Path(__file__).parents[1] / "validation"
 

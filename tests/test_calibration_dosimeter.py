@@ -20,10 +20,10 @@ from raytwin.calibration.transmission_table import read_transmission_table
 from raytwin.calibration.tube import calibrate_tube, predict_ratio
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel
-from raytwin.generator.tube_twin import TubeTwin, predict_effective_mu, predict_spectrum, predict_tube
-from raytwin.generator.twin import Level, estimate_from_sd
-from raytwin.generator.twin_io import read_any_twin, read_twin, write_twin
+from raytwin.generator.line.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel
+from raytwin.generator.line.twin import Level, estimate_from_sd
+from raytwin.generator.predictions.tube_twin import TubeTwin, predict_effective_mu, predict_spectrum, predict_tube
+from raytwin.generator.twins.twin_io import read_any_twin, read_twin, write_twin
 from raytwin.lab.tube import beam
 from raytwin.materials import mass_energy_absorption_cm2_g, material_from_name
 from raytwin.spectra import air_kerma_uGy_per_mAs, tube_spectrum

@@ -11,9 +11,9 @@ from raytwin.acquisition.setting import filters_from_text
 from raytwin.calibration.flat_levels import median_variance
 from raytwin.calibration.priors import SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import _sd_of_mixture, fit_spectrum
-from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.twin import Estimate, Level, NoiseModel, estimate_from_sd, gaussian_spread
-from raytwin.generator.twin_spectrum import slope_over_gain
+from raytwin.generator.line.twin import Estimate, Level, NoiseModel, estimate_from_sd, gaussian_spread
+from raytwin.generator.line.twin_spectrum import slope_over_gain
+from raytwin.generator.spread.psf import blur_variance_share
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 4.0])

@@ -13,7 +13,7 @@ from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.cli import main
 from raytwin.files import sha256_of_file
-from raytwin.generator.predict import predict_flatfield
+from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.protocols import run_protocol
 
 

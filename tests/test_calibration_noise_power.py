@@ -15,8 +15,8 @@ from raytwin.calibration.noise_power import (
     usable,
 )
 from raytwin.errors import InputError
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread
 
 SHAPE = (96, 120)
 SPREAD = Spread(sigma_px=0.5)

@@ -10,9 +10,9 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.calibration.calibrate import bad_pixel_counts, calibrate_twin, calibration_answer
 from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.errors import InputError
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread, blur_variance_share
-from raytwin.generator.twin import BAD_PIXEL_CODES
+from raytwin.generator.line.twin import BAD_PIXEL_CODES
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread, blur_variance_share
 
 SHAPE = (40, 40)
 GAIN, SIGMA, READ_DN, DARK_DN = 9.0, 0.55, 11.0, 1200.0

@@ -11,8 +11,8 @@ from scipy.stats import norm, truncnorm
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter
 from raytwin.calibration.spectral_fit import fit_spectrum, priors_for
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.twin import Estimate, Level
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.line.twin import Estimate, Level
 
 COPPER = (Filter(material="Cu", thickness_mm=0.05),)
 DECLARED_CSI = (Filter(material="CsI", thickness_mm=0.5),)

@@ -9,11 +9,11 @@ from raytwin.acquisition import Setting, open_acquisition, write_acquisition
 from raytwin.acquisition.instrument import Instrument
 from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.calibration.repeated_frames import most_read_variance
-from raytwin.diagnosis.preparation import calibrated_twin
-from raytwin.diagnosis.session import only_own_noise, read_session
+from raytwin.diagnosis.checks.preparation import calibrated_twin
+from raytwin.diagnosis.session.session import only_own_noise, read_session
 from raytwin.errors import FitError, InputError
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread, blur_variance_share
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread, blur_variance_share
 
 SHAPE = (64, 64)
 GAIN, SIGMA, READ_DN, DARK_DN, AVERAGED = 9.0, 0.55, 11.0, 1200.0, 16

@@ -14,8 +14,8 @@ from raytwin.calibration.noise_power import compute_noise_power
 from raytwin.calibration.photon_transfer import compute_photon_transfer
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.twin import BAD_PIXEL_CODES
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.line.twin import BAD_PIXEL_CODES
+from raytwin.generator.twins.twin_io import read_twin
 
 SHAPE = (36, 40)
 GAIN, READ_DN = 9.0, 11.0

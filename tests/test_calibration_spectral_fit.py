@@ -23,8 +23,8 @@ from raytwin.calibration.spectral_fit import (
     priors_for,
 )
 from raytwin.errors import FitError, InputError
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.twin import Estimate, Level, estimate_from_sd
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.line.twin import Estimate, Level, estimate_from_sd
 from raytwin.materials import transmission
 from raytwin.spectra import Spectrum, detector_response, energy_grid_keV, tube_spectrum
 

@@ -7,8 +7,8 @@ from scipy.ndimage import correlate1d
 from raytwin.calibration.noise_power import compute_noise_power
 from raytwin.calibration.spread_fit import fit_spread
 from raytwin.errors import FitError
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread
 
 SHAPE = (96, 96)
 GOOD = np.ones(SHAPE, bool)

@@ -20,9 +20,9 @@ from raytwin.calibration.wedges import (
 )
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.predict import spectral_model_of
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.predictions.predict import spectral_model_of
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 from raytwin.materials import optical_depth
 
 SHAPE = (40, 60)

@@ -25,7 +25,7 @@ from raytwin.errors import InputError
 from raytwin.explore.seen_size import Eye, read_networks_observer
 from raytwin.explore.state import first_state
 from raytwin.files import sha256_of_file
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.twins.twin_io import read_twin
 from raytwin.observers import observe_settings
 
 CAMPAIGN = """

@@ -25,10 +25,10 @@ from raytwin.campaign.sweep_settings import Outlook, keep_best, labels_of, motio
 from raytwin.campaign.sweep_trial import seed_of
 from raytwin.errors import InputError, MissingDependencyError, RaytwinError
 from raytwin.files import only_one
+from raytwin.generator.datasets.generate import generate_dataset
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.generate import generate_dataset
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 
 BEAM = "filter=Cu:0.05"
 LONG = (

@@ -12,12 +12,12 @@ from raytwin.acquisition.pairs import PairCorrector, object_pairs
 from raytwin.campaign import task as task_module
 from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
 from raytwin.cli import main
-from raytwin.diagnosis.explanation import task_text
-from raytwin.diagnosis.figures import task_charts
+from raytwin.diagnosis.report.explanation import task_text
+from raytwin.diagnosis.report.figures import task_charts
 from raytwin.errors import InputError
+from raytwin.generator.datasets.known_scenes import KnownScenes
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.known_scenes import KnownScenes
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.twins.twin_io import read_twin
 
 LINE = ["--seed", "31", "--size", "64"]
 

@@ -1,12 +1,18 @@
 """`raytwin diagnose` from a session file to its answer: one planted fault, one null case, bad input."""
 
 import json
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.acquisition.acquisition_io import write_acquisition
 from raytwin.cli import main
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +57,7 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     assert found["gap"]["after"] < 0.7 * found["gap"]["before"]
     assert {place["axis"] for place in found["where"]} >= {"noise"}
     assert sum(item["probability"] for item in found["hypotheses"]) == pytest.approx(1.0, abs=1e-6)
-    from raytwin.generator.twin_io import read_twin
+    from raytwin.generator.twins.twin_io import read_twin
 
     assert "excess_noise" in [effect.id for effect in read_twin(sessions / "noisy" / "twin.h5").effects]
     page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")
@@ -142,3 +148,39 @@ def test_only_darks_whose_noise_was_cut_off_are_one_line(tmp_path, capsys):
     assert "numbers are 0" in lines[0]
     assert "expected series with light and noise" in lines[0]
     assert not (tmp_path / "out").exists()
+
+
+def stations(title):
+    """(file, function) of a walk of ARCHITECTURE.md, in order."""
+    part = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").partition(title)[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| \d+ \| `([\w/]+\.py)` \| `([\w.]+)` \|", part, re.MULTILINE)
+    assert len(rows) == 10
+    return [(str(ROOT / file), name.rpartition(".")[2]) for file, name in rows]
+
+
+def passed(wanted, run):
+    """The functions wanted, in the order in which a run first leaves them."""
+    found = []
+
+    def watch(frame, event, _):
+        place = (frame.f_code.co_filename, frame.f_code.co_name)
+        if event == "return" and place in wanted and place not in found:
+            found.append(place)
+
+    before = sys.getprofile()
+    sys.setprofile(watch)
+    try:
+        run()
+    finally:
+        sys.setprofile(before)
+    return found
+
+
+def test_frames_take_the_walks_of_the_architecture_page(sessions):
+    session, twin = str(sessions / "null.h5"), str(sessions / "walked.h5")
+    walk = stations("## From a frame to `predict`'s number")
+    assert passed(walk[:7], lambda: rt.calibrate(session, seed=0).save(twin)) == walk[:7]
+    setting = "kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1"
+    assert passed(walk[7:], lambda: rt.predict(twin, setting)) == walk[7:]
+    walk = stations("## From a frame to a named cause")
+    assert passed(walk, lambda: rt.diagnose(session, twin=twin, seed=0)) == walk

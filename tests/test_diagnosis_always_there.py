@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis import changes as scales
-from raytwin.diagnosis.calibrated_maps import CalibratedMaps
-from raytwin.diagnosis.defects import new_outliers
 from raytwin.diagnosis.diagnose_session import diagnose
-from raytwin.diagnosis.line_noise import usual_line_noise
-from raytwin.diagnosis.nuisance_columns import _shapes
-from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, summarise_series
+from raytwin.diagnosis.model import changes as scales
+from raytwin.diagnosis.model.calibrated_maps import CalibratedMaps
+from raytwin.diagnosis.model.defects import new_outliers
+from raytwin.diagnosis.problem.line_noise import usual_line_noise
+from raytwin.diagnosis.problem.nuisance_columns import _shapes
+from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, summarise_series
 from raytwin.lab.protocols import run_protocol
 
 SHAPE = (64, 96)

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.coarser import means_of_squares
 from raytwin.cli import main
-from raytwin.diagnosis import coarse
-from raytwin.diagnosis.changes import variants_of
-from raytwin.diagnosis.coarse import LARGEST_PIXELS, LEAST_SIDE, coarse_factor, parameters_in_pixels
-from raytwin.diagnosis.registration import render_variance
+from raytwin.diagnosis.model.changes import variants_of
+from raytwin.diagnosis.probes.registration import render_variance
+from raytwin.diagnosis.session import coarse
+from raytwin.diagnosis.session.coarse import LARGEST_PIXELS, LEAST_SIDE, coarse_factor, parameters_in_pixels
 from raytwin.generator.effects import EFFECTS
 
 
@@ -78,7 +78,7 @@ def test_the_far_end_of_a_blur_stays_open_over_as_many_of_the_panel_s_pixels():
 
 @pytest.mark.slow
 def test_a_large_panel_is_compared_in_squares_and_its_own_twin_improved(tmp_path, capsys, monkeypatch):
-    from raytwin.generator.twin_io import read_twin
+    from raytwin.generator.twins.twin_io import read_twin
 
     session = tmp_path / "session.h5"
     words = ["--protocol", "short", "--seed", "31", "--size", "96", "--frames", "12", "--products", "1"]

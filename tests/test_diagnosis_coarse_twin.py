@@ -12,11 +12,11 @@ from raytwin.acquisition import open_acquisition
 from raytwin.acquisition.coarser import coarser, means_of_squares
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.cli import main
-from raytwin.diagnosis import coarse
-from raytwin.diagnosis.coarse_twin import twin_in_squares
+from raytwin.diagnosis.session import coarse
+from raytwin.diagnosis.session.coarse_twin import twin_in_squares
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.series import SeriesRequest, expected_series
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.frames.series import SeriesRequest, expected_series
+from raytwin.generator.twins.twin_io import read_twin
 
 pytestmark = pytest.mark.slow
 

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from raytwin.diagnosis.answer import Cause, Place
-from raytwin.diagnosis.explanation import location_text, paragraph
-from raytwin.diagnosis.held_out import Gap
+from raytwin.diagnosis.judgement.answer import Cause, Place
+from raytwin.diagnosis.judgement.held_out import Gap
+from raytwin.diagnosis.report.explanation import location_text, paragraph
 
 
 def place(axis, series, z, *, statistic="mean frame", location=""):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from raytwin.diagnosis.calibrated_maps import CalibratedMaps
-from raytwin.diagnosis.defects import new_outliers
-from raytwin.diagnosis.fixed_pattern import count_outliers, lines_of, pattern_noise, pattern_statistics
-from raytwin.diagnosis.noise_correlation import correlation_sum
+from raytwin.diagnosis.model.calibrated_maps import CalibratedMaps
+from raytwin.diagnosis.model.defects import new_outliers
+from raytwin.diagnosis.probes.fixed_pattern import count_outliers, lines_of, pattern_noise, pattern_statistics
+from raytwin.diagnosis.probes.noise_correlation import correlation_sum
 
 SHAPE = (96, 128)
 ALL = np.ones(SHAPE, dtype=bool)

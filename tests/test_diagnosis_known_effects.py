@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from raytwin.cli import main
-from raytwin.diagnosis.changes import Variant
-from raytwin.diagnosis.curve_fits import fit_effects
-from raytwin.diagnosis.curves import Curve
-from raytwin.diagnosis.discrepancy import FARTHEST_LEVEL, LEVELS
-from raytwin.diagnosis.forward_model import ForwardModel
-from raytwin.diagnosis.inference import Hypothesis, weigh_hypotheses
-from raytwin.diagnosis.judgement import Verdict, _of_another_strength
-from raytwin.diagnosis.known_effects import lasting, with_found
-from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.observed import Observed, Point
-from raytwin.diagnosis.problem import Problem
+from raytwin.diagnosis.inference.inference.curve_fits import fit_effects
+from raytwin.diagnosis.inference.inference.discrepancy import FARTHEST_LEVEL, LEVELS
+from raytwin.diagnosis.inference.inference.inference import Hypothesis, weigh_hypotheses
+from raytwin.diagnosis.inference.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.inference.observed import Observed, Point
+from raytwin.diagnosis.judgement.judgement.judgement import Verdict, _of_another_strength
+from raytwin.diagnosis.model.changes import Variant
+from raytwin.diagnosis.model.curves import Curve
+from raytwin.diagnosis.model.forward_model import ForwardModel
+from raytwin.diagnosis.problem.problem.known_effects import lasting, with_found
+from raytwin.diagnosis.problem.problem.problem import Problem
 from raytwin.generator.effects import AppliedEffect
 
 PROBES = 400

@@ -7,11 +7,17 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.assemble import build_problem
-from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.advice.next_series import (
+    FRAMES,
+    _separation,
+    best_measurement,
+    measurements_lacking,
+    proposal_text,
+)
+from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.diagnose_session import diagnose
-from raytwin.diagnosis.next_series import FRAMES, _separation, best_measurement, measurements_lacking, proposal_text
-from raytwin.diagnosis.preparation import prepare_session
+from raytwin.diagnosis.model.changes import catalogue_variants
+from raytwin.diagnosis.problem.assemble import build_problem
 
 ALL = ("afterglow", "discs", "edges", "timed edges", "slabs", "wedge", "filter", "exposures", "turned")
 STRENGTHS = {"focal_spot": 0.6, "mtf_tail": 5.0, "image_lag": 0.3, "dark_drift": 3.0}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.diagnosis.output_course import OutputCourse, rms_about_mean
-from raytwin.generator.series import SeriesRequest
+from raytwin.diagnosis.problem.output_course import OutputCourse, rms_about_mean
+from raytwin.generator.frames.series import SeriesRequest
 
 READOUT_MS = 10.0
 

@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
-from raytwin.diagnosis.changes import catalogue_variants
-from raytwin.diagnosis.curve_fits import fit_effects
-from raytwin.diagnosis.curves import Curve, node_weights
-from raytwin.diagnosis.inference import weigh_hypotheses
-from raytwin.diagnosis.judgement import _threshold
-from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.observed import Observed
-from raytwin.diagnosis.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
-from raytwin.diagnosis.problem import Problem
-from raytwin.diagnosis.refine import refine
-from raytwin.diagnosis.seen import Blocks
-from raytwin.diagnosis.series_block import jitter_of
+from raytwin.diagnosis.advice.plan import Repeat, best_repeat, distinguishability, repeat_text, table_text
+from raytwin.diagnosis.inference.curve_fits import fit_effects
+from raytwin.diagnosis.inference.inference import weigh_hypotheses
+from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.observed import Observed
+from raytwin.diagnosis.inference.refine import refine
+from raytwin.diagnosis.inference.seen import Blocks
+from raytwin.diagnosis.judgement.judgement import _threshold
+from raytwin.diagnosis.model.changes import catalogue_variants
+from raytwin.diagnosis.model.curves import Curve, node_weights
+from raytwin.diagnosis.problem.problem import Problem
+from raytwin.diagnosis.problem.series_block import jitter_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects._light_spread import spread_transfer
 from raytwin.generator.effects.misregistration import parts_px
-from raytwin.generator.series import SeriesRequest, expected_series
+from raytwin.generator.frames.series import SeriesRequest, expected_series
 
 PROBES = 60
 

@@ -9,11 +9,11 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.label_suspects import LEAST_EVIDENCE
-from raytwin.diagnosis.map_suspects import _inherent_mm_Al, _scaled
-from raytwin.diagnosis.plausibility import check_plausibility
-from raytwin.diagnosis.readings import _without_common
-from raytwin.diagnosis.session import calibrating_names
+from raytwin.diagnosis.checks.label_suspects import LEAST_EVIDENCE
+from raytwin.diagnosis.checks.map_suspects import _inherent_mm_Al, _scaled
+from raytwin.diagnosis.checks.plausibility import check_plausibility
+from raytwin.diagnosis.checks.readings import _without_common
+from raytwin.diagnosis.session.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
 FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"

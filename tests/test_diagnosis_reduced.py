@@ -11,21 +11,21 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
-from raytwin.diagnosis.assemble import build_problem
-from raytwin.diagnosis.changes import catalogue_variants
+from raytwin.diagnosis.checks.plausibility import check_plausibility
+from raytwin.diagnosis.checks.preparation import prepare_session
+from raytwin.diagnosis.checks.readings import Suspect
 from raytwin.diagnosis.diagnose_session import _clears
-from raytwin.diagnosis.nuisances import Nuisances
-from raytwin.diagnosis.observed import Observed
-from raytwin.diagnosis.origin import made_of
-from raytwin.diagnosis.plausibility import check_plausibility
-from raytwin.diagnosis.preparation import prepare_session
-from raytwin.diagnosis.readings import Suspect
-from raytwin.diagnosis.session import measured_levels, read_session
-from raytwin.diagnosis.unknown import beyond
-from raytwin.diagnosis.whitening import Whitening
+from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.observed import Observed
+from raytwin.diagnosis.inference.unknown import beyond
+from raytwin.diagnosis.inference.whitening import Whitening
+from raytwin.diagnosis.model.changes import catalogue_variants
+from raytwin.diagnosis.problem.assemble import build_problem
+from raytwin.diagnosis.session.origin import made_of
+from raytwin.diagnosis.session.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS
-from raytwin.generator.series import session_conditions
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.frames.series import session_conditions
+from raytwin.generator.twins.twin_io import read_twin
 
 FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"
 

@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.calibration.priors import PRIORS
-from raytwin.diagnosis import changes as scales
-from raytwin.diagnosis.calibrated_maps import calibrated_maps
-from raytwin.diagnosis.changes import catalogue_variants, departures_found
-from raytwin.diagnosis.even_maps import compact, full_size
-from raytwin.diagnosis.forward_model import Change, ForwardModel, strength_rows
-from raytwin.diagnosis.nuisance_columns import local_nuisances
-from raytwin.diagnosis.placing import inside
-from raytwin.diagnosis.registration import Placement
-from raytwin.diagnosis.series_probes import variance_of_what_came
+from raytwin.diagnosis.model import changes as scales
+from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
+from raytwin.diagnosis.model.changes import catalogue_variants, departures_found
+from raytwin.diagnosis.model.forward_model import Change, ForwardModel, strength_rows
+from raytwin.diagnosis.model.placing import inside
+from raytwin.diagnosis.probes.registration import Placement
+from raytwin.diagnosis.problem.nuisance_columns import local_nuisances
+from raytwin.diagnosis.problem.series_probes import variance_of_what_came
+from raytwin.diagnosis.session.even_maps import compact, full_size
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px
-from raytwin.generator.series import SeriesRequest
+from raytwin.generator.frames.series import SeriesRequest
 
 SHAPE = (12, 16)
 GOOD = np.ones(SHAPE, dtype=bool)
@@ -302,9 +302,9 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),
         of_scalars=lambda change: np.zeros(4),
     )
-    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns._of_edges", lambda *_: {})
-    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns._of_scene", lambda *_, **__: {})
-    monkeypatch.setattr("raytwin.diagnosis.nuisance_columns.gradient", lambda image: (image, image))
+    monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_edges", lambda *_: {})
+    monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_scene", lambda *_, **__: {})
+    monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns.gradient", lambda image: (image, image))
 
     def columns(beams_differ):
         return local_nuisances(probes, signal, {"Al": (thinner, {})}, sharp=False, beams_differ=beams_differ)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis import strengths
+from raytwin.diagnosis.judgement import strengths
 
 SHAPE, FRAMES, SIGNAL_DN = (24, 24), 20, 5000.0
 OUTPUT = 0.006 * np.sin(0.05 * np.arange(8 * FRAMES))

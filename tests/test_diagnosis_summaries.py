@@ -8,16 +8,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from raytwin.diagnosis.defects import memory_of
-from raytwin.diagnosis.fixed_pattern import Pattern
-from raytwin.diagnosis.frame_scalars import _log_variance_of_steps, measured_scalars
-from raytwin.diagnosis.lost_bits import rounded_kurtosis
-from raytwin.diagnosis.map_probes import MapProjection, Template
-from raytwin.diagnosis.moving_picture import MovingPicture
-from raytwin.diagnosis.placing import _smeared
-from raytwin.diagnosis.registration import Placement, register, register_drawn, resample
-from raytwin.diagnosis.scalar_context import Areas, ScalarContext
-from raytwin.diagnosis.summaries import BLOCK_PX, LAGS, _codes, summarise_series
+from raytwin.diagnosis.model.defects import memory_of
+from raytwin.diagnosis.model.placing import _smeared
+from raytwin.diagnosis.probes.fixed_pattern import Pattern
+from raytwin.diagnosis.probes.frame_scalars import _log_variance_of_steps, measured_scalars
+from raytwin.diagnosis.probes.lost_bits import rounded_kurtosis
+from raytwin.diagnosis.probes.map_probes import MapProjection, Template
+from raytwin.diagnosis.probes.moving_picture import MovingPicture
+from raytwin.diagnosis.probes.registration import Placement, register, register_drawn, resample
+from raytwin.diagnosis.probes.scalar_context import Areas, ScalarContext
+from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, summarise_series
 from raytwin.errors import InputError
 
 SHAPE = (48, 64)

@@ -177,3 +177,40 @@ def test_examples_are_valid_by_the_schemas_and_mistyped_words_are_not():
             jsonschema.validate(tomllib.loads(text), schema)
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(tomllib.loads(wrong[name]), schema)
+
+
+ARCHITECTURE = ROOT / "ARCHITECTURE.md"
+
+
+def names_with_files(page):
+    """(file, name) of the page's pairs: a file in backticks, then a name of it, in the next cell or after a comma."""
+    return re.findall(r"`([\w/]+\.py)`(?: \| |,\s+)`([A-Za-z_][\w.]*)`", page.read_text(encoding="utf-8"))
+
+
+def names_of(path):
+    """Functions, classes, their methods and the constants of a file."""
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{item.name}" for item in node.body if isinstance(item, ast.FunctionDef)}
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return found
+
+
+def test_functions_and_folders_of_the_architecture_page_exist():
+    pairs = names_with_files(ARCHITECTURE)
+    assert len(pairs) > 25
+    for file, name in pairs:
+        assert name in names_of(ROOT / file), f"{file} has no {name}"
+    for folder in re.findall(r"`([\w/]+/)`", ARCHITECTURE.read_text(encoding="utf-8")):
+        assert (ROOT / folder).is_dir(), folder
+
+
+def test_a_function_that_is_gone_from_the_architecture_page_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("| 1 | `pod/links.py` | `fit_links` | x |\nsee `pod/links.py`, `LINKS`\n")
+    assert names_with_files(page) == [("pod/links.py", "fit_links"), ("pod/links.py", "LINKS")]
+    assert "LINKS" in names_of(ROOT / "pod" / "links.py") and "fit_links" not in names_of(ROOT / "pod" / "links.py")

@@ -25,9 +25,9 @@ import numpy as np
 from raytwin import diagnose
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.generate import ChannelModel
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.series import SeriesRequest, expected_series
+from raytwin.generator.datasets.generate import ChannelModel
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.frames.series import SeriesRequest, expected_series
 
 few = {"worn_screen", "heel", "gain_map_error", "nonlinearity", "kv_error"}  # all take three times as long
 found = diagnose(sys.argv[1], without=sorted(set(EFFECTS) - few), seed=1)

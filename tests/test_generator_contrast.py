@@ -15,17 +15,17 @@ from raytwin.acquisition import setting_from_text
 from raytwin.acquisition.setting import Filter, filter_from_text
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator import contrast as contrast_module
 from raytwin.generator import write_twin
-from raytwin.generator.contrast import (
+from raytwin.generator.predictions import contrast as contrast_module
+from raytwin.generator.predictions.contrast import (
     UncalibratedLine,
     compute_contrast_map,
     disc_and_ring,
     predict_contrast,
     published_delta_r,
 )
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread
 from raytwin.materials import material_from_name, mu_per_mm
 
 LOW = setting_from_text("kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05")

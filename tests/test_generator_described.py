@@ -15,15 +15,15 @@ from raytwin.acquisition import Setting, read_dataset
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.cli import main
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator.describe import read_description, read_thickness_map, sample_individual, sample_scene
-from raytwin.generator.generate_described import DescribedScenes, generate_from_description
-from raytwin.generator.kinds import KINDS
-from raytwin.generator.predict import spectral_model_of
-from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.render import Geometry, geometry_of, render_expected
-from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.twin import estimate_from_sd, gaussian_spread
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.datasets.generate_described import DescribedScenes, generate_from_description
+from raytwin.generator.datasets.render import Geometry, geometry_of, render_expected
+from raytwin.generator.line.spectral_signal import OpenBeam
+from raytwin.generator.line.twin import estimate_from_sd, gaussian_spread
+from raytwin.generator.predictions.predict import spectral_model_of
+from raytwin.generator.scenes.describe import read_description, read_thickness_map, sample_individual, sample_scene
+from raytwin.generator.scenes.kinds import KINDS
+from raytwin.generator.spread.psf import blur_variance_share
+from raytwin.generator.twins.twin_io import write_twin
 
 SHAPE = (64, 80)
 SIGMA, WHITE, READ = 0.5, 0.01, 12.0
@@ -80,7 +80,7 @@ def exact_transmission(twin, setting, lengths):
 
 
 def channels_of(twin):
-    from raytwin.generator.generate import ChannelModel
+    from raytwin.generator.datasets.generate import ChannelModel
 
     return [ChannelModel(twin, one, "chicken_breast").channel() for one in (LOW, HIGH)]
 
@@ -374,7 +374,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, twin):
 
 
 def test_a_scene_rendered_with_few_sub_pixels_is_the_one_rendered_with_all(tmp_path, twin):
-    from raytwin.generator.render import render_scene
+    from raytwin.generator.datasets.render import render_scene
 
     text = PRODUCT + ROD + WIRE + "[images]\nwith_foreign_object = 1\nobjects = [2, 2]\n"
     description = described(tmp_path, text)

@@ -10,18 +10,14 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
 from raytwin.errors import InputError
-from raytwin.generator._distortion import displacement_px, distorted
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter, effect_of, in_order
 from raytwin.generator.effects._light_spread import spread_transfer
 from raytwin.generator.effects.effect import Grid, Shows, Variation
 from raytwin.generator.effects.focal_spot import _transfer_of_spot
 from raytwin.generator.effects.k_fluorescence import line_energy_keV
 from raytwin.generator.effects.misregistration import angles_of, parts_px
-from raytwin.generator.line_state import STAGES
-from raytwin.generator.predict import spectral_model_of
-from raytwin.generator.psf import blur_variance_share
-from raytwin.generator.rounding import rounded_variance, variance_before_rounding
-from raytwin.generator.series import (
+from raytwin.generator.frames._distortion import displacement_px, distorted
+from raytwin.generator.frames.series import (
     LineMemory,
     ModelCache,
     SeriesRequest,
@@ -32,7 +28,11 @@ from raytwin.generator.series import (
     session_conditions,
     with_conditions,
 )
-from raytwin.generator.spectral_signal import OpenBeam
+from raytwin.generator.line.line_state import STAGES
+from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding
+from raytwin.generator.line.spectral_signal import OpenBeam
+from raytwin.generator.predictions.predict import spectral_model_of
+from raytwin.generator.spread.psf import blur_variance_share
 
 SHAPE = (40, 40)
 MEASURED = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"

@@ -13,10 +13,10 @@ from raytwin.acquisition.setting import filters_from_text
 from raytwin.campaign.fresh_noise import EpochSampler, FreshNoiseDataset
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.describe import read_description
-from raytwin.generator.fresh import FreshReferences, FreshScenes
-from raytwin.generator.generate import generate_dataset
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.datasets.fresh import FreshReferences, FreshScenes
+from raytwin.generator.datasets.generate import generate_dataset
+from raytwin.generator.scenes.describe import read_description
+from raytwin.generator.twins.twin_io import write_twin
 from raytwin.segmentation import RECIPES
 from raytwin.segmentation.examples import examples_from_dataset
 

@@ -9,14 +9,14 @@ import pytest
 from raytwin.acquisition.dataset_io import DatasetRow, read_dataset, write_dataset
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.cli import main
-from raytwin.generator.describe import read_description
+from raytwin.generator.datasets.fresh import FreshReferences
+from raytwin.generator.datasets.generate import ChannelModel, ReferenceImages, generate_dataset
+from raytwin.generator.datasets.generate_described import DescribedScenes
+from raytwin.generator.datasets.render import render_expected
 from raytwin.generator.effects import EFFECTS, AppliedEffect, effect_of
-from raytwin.generator.fresh import FreshReferences
-from raytwin.generator.generate import ChannelModel, ReferenceImages, generate_dataset
-from raytwin.generator.generate_described import DescribedScenes
-from raytwin.generator.render import render_expected
-from raytwin.generator.series import SeriesRequest, expected_series, sample_series
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.scenes.describe import read_description
+from raytwin.generator.twins.twin_io import write_twin
 
 NOT_IN_IMAGES = {name: effect.images.left_out for name, effect in EFFECTS.items() if effect.images.left_out}
 COPPER = "exposure_ms=20,filter=Cu:0.05"
@@ -53,8 +53,8 @@ def channel(twin, effects, setting=HIGH):
 
 def fine_moments(twin, setting, thickness_mm):
     """Signal and variance over the open beam on three rays a pixel, and thickness maps of the pixels' middles."""
-    from raytwin.generator.predict import spectral_model_of
-    from raytwin.generator.spectral_signal import OpenBeam
+    from raytwin.generator.line.spectral_signal import OpenBeam
+    from raytwin.generator.predictions.predict import spectral_model_of
 
     model = spectral_model_of(twin)
     weights = model.moment_weights(twin.spectral.best, OpenBeam(kV=setting.kV, filters=setting.filters))[:2]
@@ -230,7 +230,7 @@ def references(series_line, tmp_path_factory):
     with write_dataset(path, shape=SHAPE, provenance={}) as writer:
         for number, height in enumerate((8.0, 15.0)):
             thickness = hill(height)
-            from raytwin.generator.render import geometry_of
+            from raytwin.generator.datasets.render import geometry_of
 
             geometry = geometry_of(series_line, settings=(LOW, HIGH))
             images = render_expected(

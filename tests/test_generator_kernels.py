@@ -17,9 +17,9 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from raytwin.errors import InputError
-from raytwin.generator.kernels import draw_key, gamma_step_DN, sample_frames, sample_quanta
-from raytwin.generator.projection import project_polychromatic
-from raytwin.generator.psf import noise_autocovariance, noise_kernel_1d, optical_kernel_1d
+from raytwin.generator.kernels.kernels import draw_key, gamma_step_DN, sample_frames, sample_quanta
+from raytwin.generator.kernels.projection import project_polychromatic
+from raytwin.generator.spread.psf import noise_autocovariance, noise_kernel_1d, optical_kernel_1d
 
 LEVELS = (0.1, 1.0, 5.0, 19.9, 20.1, 100.0, 1e3, 1e5)
 STANDARD_ERRORS = 4.0
@@ -225,7 +225,7 @@ def test_a_frame_has_the_same_bytes_however_the_stack_is_cut():
 def test_a_frame_has_the_same_bytes_whatever_the_number_of_threads():
     code = (
         "import hashlib, numpy as np\n"
-        "from raytwin.generator.kernels import sample_frames\n"
+        "from raytwin.generator.kernels.kernels import sample_frames\n"
         "signal = np.linspace(0, 400, 60 * 75, dtype=np.float32).reshape(60, 75)\n"
         "frame = sample_frames(signal, gain_DN=1.2, key=7, kernel_1d=[.2, .6, .2], read_noise_DN=1, deposit_spread=.1)\n"
         "print(hashlib.sha256(frame.tobytes()).hexdigest())\n"

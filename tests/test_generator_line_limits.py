@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition import Filter, Instrument, Setting, filters_from_text, setting_from_text
 from raytwin.errors import InputError
-from raytwin.generator.binning import binned_pixel
-from raytwin.generator.contrast import predict_contrast
-from raytwin.generator.dual_layer import predict_back_layer
-from raytwin.generator.line_limits import (
+from raytwin.generator.line.binning import binned_pixel
+from raytwin.generator.line.line_limits import (
     check_count_rate,
     check_limits,
     frames_per_s,
@@ -23,10 +21,12 @@ from raytwin.generator.line_limits import (
     permitted_focal_power_W,
     shortest_interval_ms,
 )
-from raytwin.generator.predict import binned_over_single, predict_flatfield, spectral_model_of
-from raytwin.generator.psf import Spread, blur_variance_share, sampled_gaussian_1d
-from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.generator.line.spectral_signal import OpenBeam
+from raytwin.generator.predictions.contrast import predict_contrast
+from raytwin.generator.predictions.dual_layer import predict_back_layer
+from raytwin.generator.predictions.predict import binned_over_single, predict_flatfield, spectral_model_of
+from raytwin.generator.spread.psf import Spread, blur_variance_share, sampled_gaussian_1d
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 from raytwin.materials import transmission
 from raytwin.spectra import detector_response
 

@@ -11,9 +11,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator.describe import read_description, sample_individual, sample_scene
-from raytwin.generator.mesh import Mesh, read_mesh
-from raytwin.generator.shapes import Box, Ellipsoid, Rays, path_lengths_mm, sample_rotation
+from raytwin.generator.scenes.describe import read_description, sample_individual, sample_scene
+from raytwin.generator.scenes.mesh import Mesh, read_mesh
+from raytwin.generator.scenes.shapes import Box, Ellipsoid, Rays, path_lengths_mm, sample_rotation
 
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-0.5, 0.5) for z in (-2.0, 2.0)])
 FACES = [

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import skew
 
 from raytwin.errors import InputError
-from raytwin.generator.noise import digitise, frame_sd_DN, sample_correlated_quanta, sample_frame_noise
-from raytwin.generator.psf import Spread, noise_autocovariance
+from raytwin.generator.spread.noise import digitise, frame_sd_DN, sample_correlated_quanta, sample_frame_noise
+from raytwin.generator.spread.psf import Spread, noise_autocovariance
 
 SIGMA = 0.6
 WHITE = 0.01
@@ -46,7 +46,7 @@ def test_noise_has_the_covariance_of_quanta_spread_and_electronics(lag):
 
 
 def test_skewness_is_that_of_quanta_through_the_spread():
-    from raytwin.generator.psf import noise_kernel_1d
+    from raytwin.generator.spread.psf import noise_kernel_1d
 
     signal, gain = 100.0, 20.0
     counts = noise_frames(150, signal=signal, gain_DN=gain, read_variance_DN2=0.0, white_fraction=0.0)

@@ -9,8 +9,8 @@ import pytest
 
 from raytwin.acquisition.setting import Setting, filters_from_text
 from raytwin.errors import InputError
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.predict_many import predict_levels
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.predictions.predict_many import predict_levels
 
 _PLACE = importlib.util.spec_from_file_location("twin_by_hand", Path(__file__).with_name("test_generator_twin.py"))
 _BY_HAND = importlib.util.module_from_spec(_PLACE)

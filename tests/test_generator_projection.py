@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from raytwin.errors import InputError
-from raytwin.generator._scene import _distinct
-from raytwin.generator.projection import project_polychromatic
+from raytwin.generator.frames._scene import _distinct
+from raytwin.generator.kernels.projection import project_polychromatic
 
 TOLERANCE = 1e-4  # relative; what the docstring promises
 ENERGIES_KEV = np.linspace(10.0, 90.0, 101)

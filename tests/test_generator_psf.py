@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from raytwin.errors import InputError
-from raytwin.generator.psf import (
+from raytwin.generator.spread.psf import (
     PSF_MODELS,
     blur_variance_share,
     convolve_separable,

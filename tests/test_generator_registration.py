@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from raytwin.errors import FitError, InputError
-from raytwin.generator.registration import estimate_shift_px, shift_image
+from raytwin.generator.spread.registration import estimate_shift_px, shift_image
 
 
 def structure(seed=0, shape=(80, 96)):

@@ -11,17 +11,17 @@ from scipy import ndimage
 
 from raytwin.acquisition.setting import filters_from_text, setting_from_text
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator._fine_picture import cell_coverage, find_borders, sampled_picture, transform_of_cells
-from raytwin.generator._spread import noise_pattern
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.line_state import LineState
-from raytwin.generator.predict import predict_flatfield, spectral_model_of
-from raytwin.generator.psf import Spread, noise_autocovariance_1d
-from raytwin.generator.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
-from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.twin import gaussian_spread
-from raytwin.generator.twin_io import read_twin, write_twin
-from raytwin.generator.twin_spectrum import slope_over_gain, white_gain_DN
+from raytwin.generator.frames._spread import noise_pattern
+from raytwin.generator.frames.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
+from raytwin.generator.line.line_state import LineState
+from raytwin.generator.line.spectral_signal import OpenBeam
+from raytwin.generator.line.twin import gaussian_spread
+from raytwin.generator.line.twin_spectrum import slope_over_gain, white_gain_DN
+from raytwin.generator.predictions.predict import predict_flatfield, spectral_model_of
+from raytwin.generator.spread._fine_picture import cell_coverage, find_borders, sampled_picture, transform_of_cells
+from raytwin.generator.spread.psf import Spread, noise_autocovariance_1d
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 
 SHAPE = (40, 40)
 MEASURED = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"

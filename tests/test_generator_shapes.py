@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from raytwin.errors import InputError
-from raytwin.generator.shapes import (
+from raytwin.generator.scenes.shapes import (
     Box,
     Capsule,
     Cone,

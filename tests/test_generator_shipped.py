@@ -7,9 +7,9 @@ import pytest
 from raytwin.acquisition import Setting, filters_from_text
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.shipped import FOLDER, shipped_calibration, shipped_calibrations
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.twins.shipped import FOLDER, shipped_calibration, shipped_calibrations
+from raytwin.generator.twins.twin_io import read_twin
 
 
 def test_what_is_shipped_is_small_listed_and_described():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.errors import InputError
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name, gain_behind_object
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel, attenuation_scale_name, gain_behind_object
 from raytwin.spectra import (
     air_kerma_uGy_per_mAs,
     detector_response,

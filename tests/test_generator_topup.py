@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition import Setting, setting_from_text
 from raytwin.errors import InputError
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.psf import Spread, noise_autocovariance, noise_coupling, noise_kernel_1d
-from raytwin.generator.topup import apply_top_up, plan_top_up
+from raytwin.generator.references.topup import apply_top_up, plan_top_up
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread, noise_autocovariance, noise_coupling, noise_kernel_1d
 
 SIGMA, WHITE, GAIN, READ = 0.55, 0.01, 9.0, 80.0
 OPTICS = {"white_fraction": WHITE, "spread": Spread(sigma_px=SIGMA)}

@@ -14,12 +14,12 @@ from raytwin.acquisition import Setting, read_dataset
 from raytwin.acquisition.dataset_io import DatasetRow, write_dataset
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.errors import InputError
-from raytwin.generator.generate import ChannelModel, PairTransfer, generate_dataset
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.predict import predict_flatfield, spectral_model_of
-from raytwin.generator.psf import Spread, blur_variance_share, noise_autocovariance
-from raytwin.generator.spectral_signal import OpenBeam
-from raytwin.generator.transfer import nearest_covariance
+from raytwin.generator.datasets.generate import ChannelModel, PairTransfer, generate_dataset
+from raytwin.generator.line.spectral_signal import OpenBeam
+from raytwin.generator.predictions.predict import predict_flatfield, spectral_model_of
+from raytwin.generator.references.transfer import nearest_covariance
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread, blur_variance_share, noise_autocovariance
 
 SHAPE = (36, 40)
 SIGMA, WHITE, READ = 0.5, 0.01, 12.0
@@ -163,7 +163,7 @@ def test_the_transferred_skewness_is_the_target_s(twin):
 
 def third_share():
     """sum h^3 of the noise kernel of two dimensions."""
-    from raytwin.generator.psf import noise_kernel_1d
+    from raytwin.generator.spread.psf import noise_kernel_1d
 
     return float(np.sum(noise_kernel_1d("aperture", SIGMA) ** 3) ** 2)
 
@@ -346,7 +346,7 @@ def test_bad_pixels_are_in_the_counts_and_repaired_in_the_log_images(tmp_path, t
 
 
 def test_a_stated_misregistration_is_taken_off(tmp_path, twin):
-    from raytwin.generator.registration import shift_image
+    from raytwin.generator.spread.registration import shift_image
 
     path = reference_file(tmp_path / "r.h5", twin, images=1)
     shifted = tmp_path / "s.h5"
@@ -367,7 +367,7 @@ def test_a_stated_misregistration_is_taken_off(tmp_path, twin):
 
 
 def pair_moved(images):
-    from raytwin.generator.registration import shift_image
+    from raytwin.generator.spread.registration import shift_image
 
     return np.stack([images[0], shift_image(images[1], (-1.0, 2.0))])
 

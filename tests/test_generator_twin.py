@@ -12,13 +12,9 @@ from raytwin.acquisition.dataset_io import DatasetRow, write_dataset
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator.as_published import published_parameters, sample_as_published
-from raytwin.generator.generate import ChannelModel, generate_dataset
-from raytwin.generator.noise import sample_frame_noise
-from raytwin.generator.predict import predict_flatfield, predict_flatfields, slope_share, spectral_model_of
-from raytwin.generator.psf import Spread, blur_variance_share, sampled_gaussian_1d
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.twin import (
+from raytwin.generator.datasets.generate import ChannelModel, generate_dataset
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.line.twin import (
     DetectorMaps,
     Estimate,
     Level,
@@ -28,7 +24,11 @@ from raytwin.generator.twin import (
     estimate_from_sd,
     gaussian_spread,
 )
-from raytwin.generator.twin_io import read_twin, write_twin
+from raytwin.generator.predictions.predict import predict_flatfield, predict_flatfields, slope_share, spectral_model_of
+from raytwin.generator.references.as_published import published_parameters, sample_as_published
+from raytwin.generator.spread.noise import sample_frame_noise
+from raytwin.generator.spread.psf import Spread, blur_variance_share, sampled_gaussian_1d
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 
 SHAPE = (36, 40)
 COPPER = filters_from_text("Cu:0.05")

@@ -12,11 +12,11 @@ from raytwin.calibration.validate import validate_twin
 from raytwin.cli import main
 from raytwin.files import sha256_of_file
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.predict_many import predict_levels
-from raytwin.generator.present_line import present_line
-from raytwin.generator.series import SeriesRequest, expected_series, sample_series
-from raytwin.generator.twin_io import write_twin
+from raytwin.generator.frames.present_line import present_line
+from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.predictions.predict import predict_flatfield
+from raytwin.generator.predictions.predict_many import predict_levels
+from raytwin.generator.twins.twin_io import write_twin
 
 MEASURED = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
 UNMEASURED = setting_from_text("kv=60,power_w=45,exposure_ms=50,filter=Cu:0.1")

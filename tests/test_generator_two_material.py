@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.errors import InputError
-from raytwin.generator.spectral_signal import OpenBeam, SpectralModel
-from raytwin.generator.two_material import (
+from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
+from raytwin.generator.references.two_material import (
     look_up_two_materials,
     solve_two_materials,
     tabulate_two_materials,

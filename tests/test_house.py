@@ -145,6 +145,8 @@ def imports_among(files):
             if isinstance(node, ast.ImportFrom) and node.level:
                 base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
                 places = [base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)]
+                if node.module:
+                    places.append(base / "__init__.py")
                 found.update(known[place.resolve()] for place in places if place.resolve() in known)
     return graph
 
@@ -184,17 +186,74 @@ def test_the_check_of_rings_sees_a_planted_one(tmp_path):
     assert ring_in(graph) == []
 
 
-# the map of bad pixels bears the name of an effect; so do words of answers and options that are about this map
-NAME_THE_MAP = (
-    "calibration/calibrate.py",
-    "generator/export.py",
-    "generator/generate.py",
-    "generator/generate_described.py",
-    "generator/twin_answer.py",
-    "generator/twin_io.py",
-    "src/raytwin/api/images.py",
-    "src/raytwin/commands/calibrate.py",
-)
+def imports_among_packages(graph, room):
+    """The graph of a room's files with each folder below the room as one node; a file of the room itself stays one."""
+    node = {path: path if path.parent == room else path.parent for path in graph if path.is_relative_to(room)}
+    packages = {name: set() for name in node.values()}
+    for path, name in node.items():
+        packages[name].update(node[target] for target in graph[path] if target in node)
+        packages[name].discard(name)
+    return packages
+
+
+@pytest.mark.parametrize("room", sorted({Path(folder).parts[0] for folder in subpackages_on_disk().values()}))
+def test_no_packages_of_a_room_import_each_other_in_a_ring(room):
+    """Names that the room itself offers (`from .. import write_twin`, looked up when called) belong to no package."""
+    graph = imports_among_packages(imports_among([path for _, path in python_files()]), ROOT / room)
+    ring = ring_in(graph)
+    assert not ring, " imports ".join(path.relative_to(ROOT).as_posix() for path in ring)
+
+
+def test_the_check_of_rings_between_packages_sees_a_planted_one(tmp_path):
+    texts = {
+        "a/x": "from ..b.y import f\n",
+        "a/z": "",
+        "b/y": "",
+        "b/w": "def f():\n    from ..a import z\n",
+        "top": "",
+    }
+    files = [tmp_path / f"{name}.py" for name in texts]
+    for path, text in zip(files, texts.values(), strict=True):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    graph = imports_among(files)
+    assert ring_in(graph) == []  # no ring of files, but one of packages
+    assert [path.name for path in ring_in(imports_among_packages(graph, tmp_path))] == ["a", "b", "a"]
+    files[3].write_text("from ..top import f\n")
+    assert ring_in(imports_among_packages(imports_among(files), tmp_path)) == []
+    # what a package offers itself is imported from it as well
+    files.append(tmp_path / "a" / "__init__.py")
+    files[-1].write_text("")
+    files[3].write_text("from ..a import f\n")
+    assert [path.name for path in ring_in(imports_among_packages(imports_among(files), tmp_path))] == ["a", "b", "a"]
+
+
+@pytest.mark.parametrize("room", ["generator", "diagnosis"])
+def test_packages_import_in_the_order_of_the_architecture_page(room):
+    page = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    rows = re.findall(rf"^\| (`{room}/\w.*?) \|", page.partition("## From a frame")[0], re.MULTILINE)
+    order = [ROOT / folder for row in rows for folder in re.findall(r"`([\w/]+)/`", row)]
+    graph = imports_among_packages(imports_among([path for _, path in python_files()]), ROOT / room)
+    assert {path for path in graph if path.is_dir()} == set(order)
+    for number, package in enumerate(order):
+        above = {path for path in graph[package] if path.is_dir()} - set(order[:number])
+        assert not above, f"{package.name} imports {above}"
+
+
+def test_docstrings_of_packages_name_their_files():
+    """Effects apart, whose files stand in a dict."""
+    folders = [ROOT / folder for folder in subpackages_on_disk().values() if folder != "generator/effects"]
+    folders += [ROOT / room for room in ("acquisition", "calibration", "campaign", "observers", "spectra")]
+    for folder in folders:
+        told = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
+        files = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+        assert files <= set(re.findall(r"\w+", told)), folder
+        listed = re.findall(r"^ {4}(\w+)", told, re.MULTILINE)
+        assert listed and set(listed) <= files, folder
+
+
+# the map of the pixels that calibration found bad bears the name of an effect; this file names the map, for all others
+NAMES_THE_MAP = ("generator/line/twin.py", "bad_pixels")
 
 
 def strings_of(path):
@@ -222,12 +281,11 @@ def test_no_code_but_the_catalogue_and_the_lab_names_an_effect():
 
     files = [path for _, path in python_files() if path.relative_to(ROOT).parts[0] != "lab"]
     files = [path for path in files if path.parent != ROOT / "generator" / "effects"]
+    file, name = NAMES_THE_MAP
     named = names_of_effects(files, set(OURS))
-    maps = {ROOT / path for path in NAME_THE_MAP}
-    assert all(any(place.startswith(str(path)) for place in named) for path in maps), (
-        "a file that names the map no more"
-    )
-    wrong = [place for place in named if not (place.endswith(" bad_pixels") and Path(place.split(":")[0]) in maps)]
+    of_the_map = [place for place in named if place.startswith(f"{ROOT / file}:") and place.endswith(f" {name}")]
+    assert len(of_the_map) == 1
+    wrong = sorted(set(named) - set(of_the_map))
     assert not wrong, "ask the effect's declaration (generator/effects/effect.py):\n" + "\n".join(wrong)
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import Filter, setting_from_text
 from raytwin.errors import FileFormatError, InputError
-from raytwin.generator.contrast import SlabContrasts
-from raytwin.generator.psf import whole_spectrum
+from raytwin.generator.predictions.contrast import SlabContrasts
+from raytwin.generator.spread.psf import whole_spectrum
 from raytwin.observers import (
     DETECTORS,
     LineImages,

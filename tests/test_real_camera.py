@@ -8,7 +8,7 @@ import pytest
 
 import raytwin as rt
 from raytwin.acquisition import write_acquisition
-from raytwin.generator.twin_answer import calibration_answer
+from raytwin.generator.twins.twin_answer import calibration_answer
 
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is not installed (extra `fits`)")
 PACKAGE = find_spec("msfc_ccd")

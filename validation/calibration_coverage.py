@@ -29,7 +29,7 @@ from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.errors import InputError, RaytwinError
-from raytwin.generator.predict import predict_flatfield
+from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.families import FAMILIES
 from raytwin.lab.protocols import run_protocol, truth_path
 from raytwin.lab.unkindness import NONE

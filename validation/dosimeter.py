@@ -34,8 +34,8 @@ from raytwin.acquisition.setting import Filter, Setting, filters_from_text, text
 from raytwin.calibration.output_table import OutputTable, read_output_table
 from raytwin.calibration.transmission_table import read_transmission_table
 from raytwin.calibration.tube import calibrate_tube, predict_ratio
-from raytwin.generator.tube_twin import TubeTwin, predict_spectrum, predict_tube
-from raytwin.generator.twin_answer import equivalent_filtration
+from raytwin.generator.predictions.tube_twin import TubeTwin, predict_spectrum, predict_tube
+from raytwin.generator.twins.twin_answer import equivalent_filtration
 from raytwin.lab.attenuation import mu_per_mm
 from raytwin.lab.tube import beam
 from raytwin.materials import mass_energy_absorption_cm2_g, material_from_name

@@ -28,9 +28,9 @@ from tqdm import tqdm
 
 from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.diagnosis.session import read_session
+from raytwin.diagnosis.session.session import read_session
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.series import (
+from raytwin.generator.frames.series import (
     ExpectedSeries,
     ModelCache,
     SeriesRequest,
@@ -38,7 +38,7 @@ from raytwin.generator.series import (
     session_conditions,
     with_conditions,
 )
-from raytwin.generator.twin import Estimate, Twin
+from raytwin.generator.line.twin import Estimate, Twin
 from raytwin.lab import EffectRequest, run_protocol
 
 BLOCK = 8

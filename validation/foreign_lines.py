@@ -46,9 +46,9 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
 from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, SHARES_CORRELATION, TABLE_SHARE
 from raytwin.calibration.spectral_fit import fit_spectrum, geometry_factor, model_for, priors_for
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
-from raytwin.generator.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
+from raytwin.generator.line.spectral_signal import OTHER_TABLES, OpenBeam, SpectralModel
+from raytwin.generator.line.twin import DetectorMaps, Level, NoiseModel, Twin, estimate_from_sd, gaussian_spread
+from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.spectra import air_kerma_uGy_per_mAs, energy_grid_keV, tube_fluence_interpolated
 from raytwin.spectra.spectrum import Spectrum

@@ -28,9 +28,9 @@ from raytwin.acquisition.dataset_io import DatasetRow, read_dataset, write_datas
 from raytwin.acquisition.pairs import flat_corrected_log, replace_bad_pixels
 from raytwin.acquisition.setting import Setting
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.generator.generate import RECIPES, generate_dataset
-from raytwin.generator.psf import noise_autocovariance
-from raytwin.generator.twin import Twin
+from raytwin.generator.datasets.generate import RECIPES, generate_dataset
+from raytwin.generator.line.twin import Twin
+from raytwin.generator.spread.psf import noise_autocovariance
 from raytwin.lab.bench import Bench, render
 from raytwin.lab.protocols import CORRECTION_FRAMES, make_plan, run_protocol, system_of_seed
 from raytwin.lab.unkindness import NONE

@@ -42,9 +42,15 @@ from raytwin.acquisition import open_acquisition
 from raytwin.acquisition.pairs import flat_corrected_log, replace_bad_pixels
 from raytwin.acquisition.setting import Filter, Setting
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.generator.generate import ChannelModel, detector_noise
-from raytwin.generator.render import ExpectedImage, geometry_of, images_of_moments, render_expected, sample_expected
-from raytwin.generator.twin import Twin
+from raytwin.generator.datasets.generate import ChannelModel, detector_noise
+from raytwin.generator.datasets.render import (
+    ExpectedImage,
+    geometry_of,
+    images_of_moments,
+    render_expected,
+    sample_expected,
+)
+from raytwin.generator.line.twin import Twin
 from raytwin.lab.bench import Bench, RenderedScene, render
 from raytwin.lab.chain import margin_px
 from raytwin.lab.phantoms import Edge

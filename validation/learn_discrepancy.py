@@ -22,14 +22,14 @@ import numpy as np
 import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
-from raytwin.diagnosis.curve_fits import CurveFit
-from raytwin.diagnosis.diagnose_session import problem_of
-from raytwin.diagnosis.discrepancy import LEVELS
-from raytwin.diagnosis.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
-from raytwin.diagnosis.judgement import Weighed, verdict_of, weigh_problem
-from raytwin.diagnosis.observed import Observed
-from raytwin.diagnosis.preparation import prepare_session
-from raytwin.diagnosis.unknown import LOG_DENSITY, beyond
+from raytwin.diagnosis.checks.preparation import prepare_session
+from raytwin.diagnosis.inference.inference.curve_fits import CurveFit
+from raytwin.diagnosis.inference.inference.discrepancy import LEVELS
+from raytwin.diagnosis.inference.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
+from raytwin.diagnosis.inference.inference.observed import Observed
+from raytwin.diagnosis.inference.inference.unknown import LOG_DENSITY, beyond
+from raytwin.diagnosis.judgement.judgement.judgement import Weighed, verdict_of, weigh_problem
+from raytwin.diagnosis.problem.assemble import problem_of
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
@@ -132,7 +132,7 @@ def of_logarithm(ratios: list[float], counts: list[float]) -> tuple[list[float],
 
 
 def learn(paths: list[Path]) -> None:
-    """Print the table of `diagnosis/discrepancy.toml`, and the scores of the sessions that it comes from."""
+    """Print the table of `diagnosis/inference/discrepancy.toml`, and the scores of the sessions that it comes from."""
     rows = [row for path in paths for row in json.loads(path.read_text())]
     kind = frequencies([row["kind"] for row in rows if "kind" in row], about_nothing)
     another = frequencies([row["another"] for row in rows if "another" in row], of_logarithm)

@@ -22,8 +22,8 @@ from raytwin.campaign.sweep_settings import twin_at
 from raytwin.campaign.trial import curve_of_table, detect_on_file, thresholds_from_images, write_split
 from raytwin.cli import main as raytwin
 from raytwin.files import whole_file
-from raytwin.generator.generate import generate_dataset
-from raytwin.generator.twin_io import read_twin
+from raytwin.generator.datasets.generate import generate_dataset
+from raytwin.generator.twins.twin_io import read_twin
 from raytwin.observers import DETECTORS, LineImages, MeasuredSize, Observer, fit_efficiency, objects_of_references
 from raytwin.observers.efficiency import predicted_sizes
 

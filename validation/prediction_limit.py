@@ -56,8 +56,8 @@ from raytwin.calibration.priors import (
     SHARES_CORRELATION,
     TABLE_SHARE,
 )
-from raytwin.generator.predict import predict_flatfield
-from raytwin.generator.twin import Twin
+from raytwin.generator.line.twin import Twin
+from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.attenuation import composition, mu_per_mm
 from raytwin.lab.bench import Bench
 from raytwin.lab.families import sample_system

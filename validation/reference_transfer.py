@@ -32,7 +32,7 @@ from raytwin.acquisition.contrast import delta_r, dilations_for_pixel
 from raytwin.acquisition.pairs import flat_corrected_log, replace_bad_pixels
 from raytwin.acquisition.setting import Filter, Setting
 from raytwin.calibration.calibrate import calibrate_twin
-from raytwin.generator.generate import PairTransfer
+from raytwin.generator.datasets.generate import PairTransfer
 from raytwin.lab.bench import Bench, render
 from raytwin.lab.objects import BONE_MATERIAL, pixel_means
 from raytwin.lab.protocols import CORRECTION_FRAMES, make_plan, run_protocol, system_of_seed

@@ -85,8 +85,8 @@ def sidecar() -> Schema:
 
 def description() -> Schema:
     """Products and foreign objects as shapes."""
-    from raytwin.generator.describe import _COMMON_WORDS, _IMAGE_WORDS, _LINE_WORDS, ORIENTATIONS, WHERE
-    from raytwin.generator.kinds import KINDS
+    from raytwin.generator.scenes.describe import _COMMON_WORDS, _IMAGE_WORDS, _LINE_WORDS, ORIENTATIONS, WHERE
+    from raytwin.generator.scenes.kinds import KINDS
 
     parameters = sorted({word for kind in KINDS.values() for word in kind.parameters})
     item = dict.fromkeys((*_COMMON_WORDS, *parameters), RANGE)

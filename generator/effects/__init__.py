@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 
 from ...errors import InputError
-from ..applied_effect import AppliedEffect
-from ..line_state import STAGES
+from ..line.applied_effect import AppliedEffect
+from ..line.line_state import STAGES
 from .bad_pixels import BAD_PIXELS
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..line_state import FloatArray
+from ..line.line_state import FloatArray
 from .effect import Parameter
 
 

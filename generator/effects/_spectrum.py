@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from ...errors import InputError
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 
 
 def shifted_parameter(state: LineState, context: LineContext, name: str, amount: float, effect: str) -> LineState:

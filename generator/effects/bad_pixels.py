@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 from .effect import Effect, Grid, InImages, Parameter, Shows
 
 _CERTIFIED = ("wedge", "edge", "disc")  # test objects whose composition is not in question unless they are named

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import FloatArray, LineContext, LineState
+from ..line.line_state import FloatArray, LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Shows, Variation
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 from ...errors import InputError
-from ..line_state import STAGES, Change
-from ..series_request import KINDS
-from ..twin import Twin
+from ..line.line_state import STAGES, Change
+from ..line.series_request import KINDS
+from ..line.twin import Twin
 
 EVERY_SERIES = KINDS
 LIT_SERIES = ("flat", "object")

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LineContext, LineState
-from ..twin import Twin
-from ..twin_numbers import with_gain
+from ..line.line_state import LineContext, LineState
+from ..line.twin import Twin
+from ..line.twin_numbers import with_gain
 from .effect import LIT_SERIES, Effect, Parameter, Shows
 
 

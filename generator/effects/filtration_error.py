@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 
-from ..line_state import LineContext, LineState
-from ..twin import Twin
-from ..twin_numbers import moved, with_spectrum
+from ..line.line_state import LineContext, LineState
+from ..line.twin import Twin
+from ..line.twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import FloatArray, LineContext, LineState, needed
+from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, InImages, Parameter, Shows
 
 _SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))

@@ -6,7 +6,7 @@ y = x (1 + eta), eta fixed from frame to frame
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import FixedPattern, LineContext, LineState
+from ..line.line_state import FixedPattern, LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, Variation
 
 

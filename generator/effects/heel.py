@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import InputError
-from ..line_state import FloatArray, LineContext, LineState
-from ..spectral_signal import OpenBeam
+from ..line.line_state import FloatArray, LineContext, LineState
+from ..line.spectral_signal import OpenBeam
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows, Variation
 
 

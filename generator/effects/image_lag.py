@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LagLaw, LineContext, LineState
+from ..line.line_state import LagLaw, LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Grid, InImages, Parameter, Reading, Shows
 
 _STEPS = (-1.5, -0.5, 0.5, 1.5)

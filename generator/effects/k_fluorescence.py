@@ -20,7 +20,7 @@ from ...materials import (
     atomic_number_from_symbol,
     material_from_name,
 )
-from ..line_state import FloatArray, LineContext, LineState, needed
+from ..line.line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
 

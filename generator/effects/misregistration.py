@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 from .effect import Displacement, Effect, Grid, InImages, Parameter, Placement, Reading, Shows
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import FloatArray, LineContext, LineState
+from ..line.line_state import FloatArray, LineContext, LineState
 from .effect import Effect, Grid, Parameter, Shows
 
 STATED_MS = 50.0  # the strength is the path in this time

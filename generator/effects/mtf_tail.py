@@ -6,7 +6,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import FloatArray, LineContext, LineState
+from ..line.line_state import FloatArray, LineContext, LineState
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, AlwaysALittle, Effect, Grid, Parameter, Shows
 

@@ -6,7 +6,7 @@ y = x (1 - s x / x_half), x_half half of the highest level: s is the departure f
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Grid, Parameter, Shows
 
 

@@ -32,9 +32,9 @@ from ...materials import (
     material_from_name,
     scattering_per_sr,
 )
-from .._fine_picture import find_borders
-from ..line_state import FloatArray, LineContext, LineState, needed
-from ..spectral_signal import mean_signal_energy_keV
+from ..line.line_state import FloatArray, LineContext, LineState, needed
+from ..line.spectral_signal import mean_signal_energy_keV
+from ..spread._fine_picture import find_borders
 from .effect import Effect, Grid, Parameter, Shows
 
 _HALF_PRODUCT_MM = 10.0

@@ -7,7 +7,7 @@ correlation exp(-|dt| / tau)
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line_state import LineContext, LineState
+from ..line.line_state import LineContext, LineState
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
 

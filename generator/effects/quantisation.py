@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import LineContext, LineState
-from ..rounding import variance_before_rounding
+from ..line.line_state import LineContext, LineState
+from ..line.rounding import variance_before_rounding
 from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, Variation
 
 

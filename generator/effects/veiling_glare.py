@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line_state import FloatArray, LineContext, LineState, needed
+from ..line.line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from ..acquisition import Dataset
     from ..acquisition.acquisition_io import AcquisitionFile
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.tube_twin import TubeTwin
 
 PathLike = str | os.PathLike[str]
 
@@ -29,7 +29,7 @@ def twin_path(text: PathLike) -> Path:
     path = Path(text)
     if path.suffix or len(path.parts) != 1 or path.exists():
         return path
-    from ..generator.shipped import shipped_calibration, shipped_calibrations
+    from ..generator.twins.shipped import shipped_calibration, shipped_calibrations
 
     return shipped_calibration(str(text)) if str(text) in shipped_calibrations() else path
 
@@ -40,7 +40,7 @@ def as_twin(twin: "Twin | PathLike") -> "Twin":
     Raises:
         InputError, FileFormatError: no such file or another kind of file.
     """
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
 
     if isinstance(twin, Twin):
         return twin
@@ -48,7 +48,7 @@ def as_twin(twin: "Twin | PathLike") -> "Twin":
         raise InputError(
             "twin", received=type(twin).__name__, expected="a twin, a path or a shipped calibration's name"
         )
-    from ..generator.twin_io import read_twin
+    from ..generator.twins.twin_io import read_twin
 
     return read_twin(twin_path(twin))
 
@@ -59,8 +59,8 @@ def as_any_twin(twin: "Twin | TubeTwin | PathLike") -> "Twin | TubeTwin":
     Raises:
         InputError, FileFormatError: no such file or another kind of file.
     """
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin_io import read_any_twin
+    from ..generator.predictions.tube_twin import TubeTwin
+    from ..generator.twins.twin_io import read_any_twin
 
     if isinstance(twin, TubeTwin):
         return twin
@@ -70,8 +70,8 @@ def as_any_twin(twin: "Twin | TubeTwin | PathLike") -> "Twin | TubeTwin":
 def twin_sha256(twin: "Twin | PathLike") -> str:
     """SHA-256 of a twin's file; of a twin in memory, of the file that it would be saved as."""
     from ..files import sha256_of_file
-    from ..generator.twin import Twin
-    from ..generator.twin_io import write_twin
+    from ..generator.line.twin import Twin
+    from ..generator.twins.twin_io import write_twin
 
     if not isinstance(twin, Twin):
         return sha256_of_file(twin_path(twin))

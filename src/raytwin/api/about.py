@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from ..acquisition.acquisition_io import AcquisitionFile
     from ..acquisition.dataset_io import Dataset
     from ..acquisition.setting import Setting
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.tube_twin import TubeTwin
 
 _EXTRAS = {
     "segmentation": ("torch", "segmentation_models_pytorch"),
@@ -122,7 +122,7 @@ def info(twin: "Twin | TubeTwin | PathLike | None" = None) -> "Info | Twin | Tub
     if twin is not None:
         return as_any_twin(twin)
     from .. import __version__
-    from ..generator.shipped import shipped_calibrations
+    from ..generator.twins.shipped import shipped_calibrations
     from ..spectra._cache import cache_folder
 
     folder = cache_folder()
@@ -249,7 +249,7 @@ def export(
             telling.begin("frames", sum(series.n_frames for series in opened.series))
             files, warnings = export_acquisition(opened, folder, to=to, progress=lambda done, _: telling.reach(done))
             return Exported(to=to, folder=folder, files=files, warnings=warnings)
-    from ..generator.export import export_twin
+    from ..generator.twins.export import export_twin
 
     with written_folder(folder):
         files, warnings = export_twin(as_twin(opened), folder, to=to, settings=settings)

@@ -15,9 +15,9 @@ from ._progress import Progress, Telling
 if TYPE_CHECKING:
     import pandas
 
-    from ..generator.contrast import Contrast, UncalibratedLine
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.contrast import Contrast, UncalibratedLine
+    from ..generator.predictions.tube_twin import TubeTwin
     from ..materials import Material
     from ..spectra import Response, Spectrum
 
@@ -505,7 +505,7 @@ def _alone(*stated: Any) -> None:
 def _spectrum_of_twin(
     twin: "Twin | TubeTwin | PathLike", *, kV: float | None, layers: tuple[Filter, ...]
 ) -> BeamSpectrum:
-    from ..generator.tube_twin import predict_spectrum
+    from ..generator.predictions.tube_twin import predict_spectrum
     from ..spectra import fluence_per_cm2_mAs, half_value_layer_mm
 
     if kV is None:
@@ -541,7 +541,7 @@ def _mu_of_twin(
     cover: tuple[Filter, ...],
     counting: bool,
 ) -> Attenuation:
-    from ..generator.tube_twin import TubeTwin, predict_effective_mu
+    from ..generator.predictions.tube_twin import TubeTwin, predict_effective_mu
     from ..spectra import DEFAULT_SCINTILLATOR, detector_response, energy_grid_keV
 
     if kV is None:
@@ -742,8 +742,8 @@ def contrast(
         >>> found.contrast.cnr_object > 0
         True
     """
-    from ..generator.contrast import compute_contrast_map, predict_contrast
-    from ..generator.predict_settings import as_filters, as_setting
+    from ..generator.predictions.contrast import compute_contrast_map, predict_contrast
+    from ..generator.predictions.predict_settings import as_filters, as_setting
 
     pair = (as_setting(low), as_setting(high))
     slabs = tuple(_one_layer(name, value) for name, value in (("product", product), ("object", foreign_object)))
@@ -797,7 +797,7 @@ def _one_layer(name: str, value: str | Filter) -> Filter:
 
 def _line_of(twin: "Twin | TubeTwin | PathLike | None", line: dict[str, Any]) -> "Twin | UncalibratedLine":
     """A calibrated line, a calibrated tube with a stated detector, or a line as stated."""
-    from ..generator.tube_twin import TubeTwin
+    from ..generator.predictions.tube_twin import TubeTwin
 
     if twin is None:
         return _stated_line(line)
@@ -815,8 +815,8 @@ def _line_of(twin: "Twin | TubeTwin | PathLike | None", line: dict[str, Any]) ->
 
 
 def _stated_line(line: dict[str, Any]) -> "UncalibratedLine":
-    from ..generator.contrast import UncalibratedLine
-    from ..generator.predict_settings import as_filters
+    from ..generator.predictions.contrast import UncalibratedLine
+    from ..generator.predictions.predict_settings import as_filters
 
     names = [field.name for field in fields(UncalibratedLine)]
     unknown = [name for name in line if name not in names]

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from ..acquisition import Dataset, Setting
     from ..acquisition.acquisition_io import AcquisitionFile
     from ..acquisition.dataset_io import DatasetRow
-    from ..generator.describe import Description
-    from ..generator.generate import GenerationSummary
-    from ..generator.twin import Twin
+    from ..generator.datasets.generate import GenerationSummary
+    from ..generator.line.twin import Twin
+    from ..generator.scenes.describe import Description
     from ..segmentation import Detection, EpochResult, NetworkResult, Rate, Recipe, Segmenter
 
     Pairs: TypeAlias = "Dataset | PathLike | GeneratedPairs"
@@ -348,7 +348,7 @@ def generate(
     """
     from ..acquisition.dataset_io import read_dataset as open_dataset
     from ..acquisition.tiff_folder import write_tiff_folder
-    from ..generator.predict_settings import as_setting
+    from ..generator.predictions.predict_settings import as_setting
     from ..materials import material_from_name
 
     known, targets = as_twin(twin), (as_setting(low), as_setting(high))
@@ -367,7 +367,6 @@ def generate(
         "high": targets[1],
         "images": n,
         "seed": whole_seed(seed),
-        "bad_pixels": bad_pixels,
         "with_counts": counts,
         "twin_sha256": twin_sha256(twin),
     }
@@ -376,7 +375,7 @@ def generate(
         telling.begin("generating", n)
         description = _description_of(reference)
         if description is not None:
-            from ..generator.generate_described import generate_from_description
+            from ..generator.datasets.generate_described import generate_from_description
 
             for name, given in about_references.items():
                 if given:
@@ -385,9 +384,11 @@ def generate(
                         received="a description as REFERENCE",
                         expected="reference images: the option is about those",
                     )
-            summary = generate_from_description(known, description, path, progress=telling.reach, **common)
+            summary = generate_from_description(
+                known, description, path, bad_pixels=bad_pixels, progress=telling.reach, **common
+            )
         else:
-            from ..generator.generate import generate_dataset
+            from ..generator.datasets.generate import generate_dataset
 
             fallback = None
             if reference_low is not None and reference_high is not None:
@@ -400,6 +401,7 @@ def generate(
                     recipe=recipe,
                     product_material=product_material,
                     foreign_material=foreign_material,
+                    bad_pixels=bad_pixels,
                     registration_px=registration_px,
                     split=split,
                     reference_setting=fallback,
@@ -433,7 +435,7 @@ def generate(
 
 
 def _description_of(reference: Any) -> "Description | None":
-    from ..generator.describe import Description, read_description
+    from ..generator.scenes.describe import Description, read_description
 
     if isinstance(reference, Description):
         return reference
@@ -650,8 +652,8 @@ def _fresh(
     warnings: list[str],
 ) -> "tuple[Callable[[int, int], NDArray[np.float32]], dict[str, Any]]":
     """What makes the images of an epoch, and what decides them."""
-    from ..generator.fresh import FreshReferences
-    from ..generator.predict_settings import as_setting
+    from ..generator.datasets.fresh import FreshReferences
+    from ..generator.predictions.predict_settings import as_setting
 
     pair = (as_setting(low), as_setting(high))
     source = FreshReferences(as_twin(twin), references.path, low=pair[0], high=pair[1], seed=seed)

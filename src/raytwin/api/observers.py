@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas
 
     from ..acquisition import Dataset
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
     from ..observers import Efficiency, ForeignObjects, LineImages, ProductTexture
 
 _UNITS = {"contrast": "", "size_mm": "mm"}
@@ -382,7 +382,7 @@ def objects_of_file(
 
 
 def _pairs(settings: Any) -> list[tuple[Setting, Setting]]:
-    from ..generator.predict_settings import as_setting
+    from ..generator.predictions.predict_settings import as_setting
 
     given = list(settings)
     if len(given) == 2 and all(isinstance(one, str | Setting) for one in given):

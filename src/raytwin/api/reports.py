@@ -12,9 +12,9 @@ from .images import GeneratedPairs
 if TYPE_CHECKING:
     from ..acquisition import Dataset
     from ..calibration.validate import Validation
-    from ..diagnosis.answer import Diagnosis
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
+    from ..diagnosis.judgement.answer import Diagnosis
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.tube_twin import TubeTwin
 
 _EXPECTED = "a twin, a validation, a POD curve, generated pairs, a dataset, a diagnosis, or the file of a twin, a dataset or hits"
 
@@ -47,10 +47,10 @@ def report(
     from ..reports import write_result_page
 
     path = checked_page(output)
-    from ..diagnosis.answer import Diagnosis
+    from ..diagnosis.judgement.answer import Diagnosis
 
     if isinstance(result, Diagnosis):
-        from ..diagnosis.report import write_report
+        from ..diagnosis.report.report import write_report
 
         return write_report(result, result.to_dict(), path, version=__version__, interactive=interactive)
     return write_result_page(path, _page_of(result), version=__version__, interactive=interactive)
@@ -72,8 +72,8 @@ def _page_of(result: Any) -> Any:
     from ..acquisition import dataset_io
     from ..acquisition._hdf5 import format_of_file
     from ..calibration.validate import Validation
-    from ..generator.tube_twin import TubeTwin
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.tube_twin import TubeTwin
 
     if isinstance(result, PodCurve):
         return _pod_page(result)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from ..acquisition.acquisition_io import AcquisitionFile
     from ..calibration.check import CheckResult
     from ..campaign.task import TaskInput, TaskPlan
-    from ..diagnosis.answer import Diagnosis
-    from ..diagnosis.plan_session import SessionPlan
-    from ..generator.twin import Twin
+    from ..diagnosis.advice.plan_session import SessionPlan
+    from ..diagnosis.judgement.answer import Diagnosis
+    from ..generator.line.twin import Twin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -222,8 +222,8 @@ def diagnose(
     """
     from .. import __version__
     from ..acquisition.sessions import continued_session
+    from ..diagnosis.advice.plan_session import plan_session
     from ..diagnosis.diagnose_session import diagnose as diagnose_session
-    from ..diagnosis.plan_session import plan_session
     from ..generator.effects import EFFECTS
 
     check_effects("without", without, tuple(EFFECTS))
@@ -278,7 +278,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 def _write(found: "Diagnosis", folder: Path) -> None:
     from .. import __version__
-    from ..diagnosis.report import write_report
+    from ..diagnosis.report.report import write_report
 
     answer = found.to_dict()
     write_report(found, answer, folder / "report.html", version=__version__)
@@ -288,7 +288,7 @@ def _write(found: "Diagnosis", folder: Path) -> None:
 def _task(task: Mapping[str, Any], *, seed: int, device: str) -> "tuple[TaskInput, TaskPlan]":
     """What a task asks for, checked before the diagnosis begins."""
     from ..campaign.task import TaskInput, TaskPlan, check_task
-    from ..generator.predict_settings import as_setting
+    from ..generator.predictions.predict_settings import as_setting
     from ..segmentation import choose_device
 
     words = {name: value for name, value in task.items() if value is not None}

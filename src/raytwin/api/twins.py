@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from ..calibration.output_table import OutputTable
     from ..calibration.transmission_table import TransmissionTable
     from ..calibration.validate import Validation
-    from ..generator.predict import Prediction, Predictions
-    from ..generator.tube_twin import TubePrediction, TubeTwin
-    from ..generator.twin import Twin
+    from ..generator.line.twin import Twin
+    from ..generator.predictions.predict import Prediction, Predictions
+    from ..generator.predictions.tube_twin import TubePrediction, TubeTwin
     from ..spectra import Spectrum
 
     Sessions = AcquisitionFile | PathLike | Sequence[AcquisitionFile | PathLike]

@@ -124,7 +124,7 @@ def _instrument(arguments: argparse.Namespace) -> "Instrument | None":
         InputError: an acquisition states its own tube.
     """
     from ..acquisition.instrument import Instrument
-    from ..generator.predict_settings import as_filters
+    from ..generator.predictions.predict_settings import as_filters
 
     options = {name: getattr(arguments, name) for name in ("anode", "angle", "inherent")}
     given = [f"--{name}" for name, value in options.items() if value is not None]
@@ -183,8 +183,11 @@ def _table_lines(evidence: dict[str, Any]) -> list[str]:
 
 
 def _text(result: dict[str, Any], path: Path) -> str:
+    from ..generator.line.twin import BAD_PIXEL_MAP
+
     lines = []
-    if result["bad_pixels"] is not None:
+    bad_pixels = result[BAD_PIXEL_MAP]
+    if bad_pixels is not None:
         lines = [
             f"dark                {_interval(result['dark_DN'], ' DN')}",
             f"read noise          {_interval(result['read_noise_DN'], ' DN')}",
@@ -194,10 +197,8 @@ def _text(result: dict[str, Any], path: Path) -> str:
         f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
         f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
     ]
-    if result["bad_pixels"] is not None:
-        lines.append(
-            f"bad pixels          {result['bad_pixels']['count']} ({result['bad_pixels']['share_percent']:.3g} %)"
-        )
+    if bad_pixels is not None:
+        lines.append(f"bad pixels          {bad_pixels['count']} ({bad_pixels['share_percent']:.3g} %)")
     lines += _table_lines(result["evidence"])
     for level in result["levels"]:
         voltage = "unknown kV" if level["kV"] is None else f"{level['kV']:g} kV"

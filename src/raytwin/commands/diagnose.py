@@ -92,9 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin diagnose`."""
     from ..api._progress import Bar
     from ..api.sessions import diagnose
-    from ..diagnosis.explanation import paragraph, task_text
-    from ..diagnosis.plan import table_text
-    from ..diagnosis.plan_session import SessionPlan
+    from ..diagnosis.advice.plan import table_text
+    from ..diagnosis.advice.plan_session import SessionPlan
+    from ..diagnosis.report.explanation import paragraph, task_text
 
     with Bar(only_on_terminal=True) as bar:
         found = diagnose(

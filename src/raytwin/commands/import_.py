@@ -162,7 +162,7 @@ def _import(arguments: argparse.Namespace) -> Any:
 
 
 def _bad_pixels(twin: str) -> Any:
-    from ..generator.twin_io import read_twin
+    from ..generator.twins.twin_io import read_twin
 
     return read_twin(twin).maps.bad_pixels > 0
 

@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _text(result: dict[str, Any]) -> str:
-    from ..generator.predict import UNITS
+    from ..generator.predictions.predict import UNITS
 
     lines = [result["setting"]]
     for name, unit in UNITS.items():

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..acquisition.setting import Filter, filters_from_text
 from ..errors import InputError, RaytwinError
-from ..generator.twin import Estimate
+from ..generator.line.twin import Estimate
 from ..materials import library_from_files, material_from_name
 from ..results import same_value
 from .seen_size import SeenSize

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from ..acquisition.pairs import flat_corrected_log
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from ..generator.contrast import disc_and_ring
-from ..generator.predict import Prediction
-from ..generator.psf import Spread
-from ..generator.render import Geometry, images_of_moments, moments_behind, sample_expected
-from ..generator.transfer import Channel, DetectorNoise
-from ..generator.twin import Twin
-from ..generator.twin_spectrum import secondary_gain_DN, slope_share
+from ..generator.datasets.render import Geometry, images_of_moments, moments_behind, sample_expected
+from ..generator.line.twin import Twin
+from ..generator.line.twin_spectrum import secondary_gain_DN, slope_share
+from ..generator.predictions.contrast import disc_and_ring
+from ..generator.predictions.predict import Prediction
+from ..generator.references.transfer import Channel, DetectorNoise
+from ..generator.spread.psf import Spread
 
 SMALLEST_PX, LARGEST_PX = 64, 128
 _FINE = 3  # sub-pixels a pixel along each axis

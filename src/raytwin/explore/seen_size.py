@@ -13,7 +13,7 @@ import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
 from ..errors import InputError
-from ..generator.twin import Estimate, Twin
+from ..generator.line.twin import Estimate, Twin
 from ..observers import (
     Efficiency,
     ForeignObjects,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from ..generator.twin import Twin
+from ..generator.line.twin import Twin
 from ..spectra import MAXIMUM_KV_OF_ANODE, MINIMUM_KV
 
 BEAMS = ("low", "high")

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from ..acquisition.setting import Setting
 from ..errors import InputError
-from ..generator.contrast import Contrast, ContrastChannel, SlabContrasts
-from ..generator.line_limits import broken_limits, check_count_rate, frames_per_s, strained_limits
-from ..generator.predict import Prediction, full_scale, predict_flatfield
-from ..generator.present_line import present_line
-from ..generator.render import refuse_without_spectrum
-from ..generator.spectral_signal import OpenBeam
-from ..generator.twin import Estimate, Twin
-from ..generator.twin_spectrum import spectral_model_of
+from ..generator.datasets.render import refuse_without_spectrum
+from ..generator.frames.present_line import present_line
+from ..generator.line.line_limits import broken_limits, check_count_rate, frames_per_s, strained_limits
+from ..generator.line.spectral_signal import OpenBeam
+from ..generator.line.twin import Estimate, Twin
+from ..generator.line.twin_spectrum import spectral_model_of
+from ..generator.predictions.contrast import Contrast, ContrastChannel, SlabContrasts
+from ..generator.predictions.predict import Prediction, full_scale, predict_flatfield
 from ..materials import transmission
 from .known_pod import KnownPod
 from .picture import ImagePair, draw_pair

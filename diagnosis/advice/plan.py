@@ -1,0 +1,218 @@
+"""Which effects a measurement set can tell apart, and which of its series should be taken again to break a tie.
+
+Only expectations, noise and nuisances are used, so the frames' contents do not matter: a session that was planned, or
+taken on another day, says as much.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ..inference.nuisances import Nuisances
+from ..inference.whitening import Whitening
+from ..model.curves import Curve
+from ..problem.problem import Problem
+
+_GRID = 41  # strengths of a competitor, evenly in the logarithm
+_FINE_GRID = 121  # strengths that are asked whether they are seen
+CLEAR = 5.0  # standard deviations
+_REPEATS = 4  # times as many frames
+_CANDIDATES = 4
+WORTH_IT = 3.0  # standard deviations between two explanations, from which a repeat settles the matter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Distinguishability:
+    """Separation of effects, standard deviations, nuisances and the other's strength and inner parameters refitted.
+
+    Fields: effects (effect,); since (effect,): the onset that each is taken with, its usual one where the session can show it;
+    strengths (effect,): at which each is taken, middle of its range, its inner parameters those that are seen neither best nor
+    worst; from_none (effect,); seen_from (effect,): least strength of the plausible range that lies CLEAR from none, inf: none;
+    between (effect, effect): of the row's effect from the column's at whatever strength and inner parameters come nearest.
+    """
+
+    effects: tuple[str, ...]
+    since: tuple[str, ...]
+    strengths: NDArray[np.float64]
+    from_none: NDArray[np.float64]
+    seen_from: NDArray[np.float64]
+    between: NDArray[np.float64]
+
+
+def distinguishability(problem: Problem) -> Distinguishability:
+    """How well the session of a problem tells the catalogue's effects apart."""
+    whitening = Whitening(problem.factors, problem.blocks)
+    curves = whitening.curves(problem.curves)
+    nodes = np.concatenate([curve.responses for curve in curves])
+    gram = Nuisances(whitening.factors).inner(nodes, nodes)
+    places: list[slice] = []
+    position = 0
+    for curve in curves:
+        places.append(slice(position, position + len(curve.responses)))
+        position += len(curve.responses)
+
+    def lengths(number: int, strengths: NDArray[np.float64]) -> NDArray[np.float64]:
+        weights, own = curves[number].weights(strengths), gram[places[number], places[number]]
+        return np.asarray(np.sqrt(np.maximum(np.einsum("si,ij,sj->s", weights, own, weights), 0.0)))
+
+    order = {effect: place for place, effect in enumerate(EFFECTS)}
+    effects = tuple(
+        sorted(dict.fromkeys(curve.effect for curve in curves), key=lambda name: order.get(name, len(order)))
+    )
+    taken = [_usual(effect, curves, lengths) for effect in effects]
+    strengths = np.array([_middle(curves[number]) for number in taken])
+    from_none, seen_from = np.zeros(len(effects)), np.full(len(effects), np.inf)
+    between = np.zeros((len(effects), len(effects)))
+    for row, (number, strength) in enumerate(zip(taken, strengths, strict=True)):
+        own, mine = curves[number], places[number]
+        from_none[row] = lengths(number, np.array([strength]))[0]
+        grid = np.geomspace(own.low, own.high, _FINE_GRID)
+        clear = np.nonzero(lengths(number, grid) >= CLEAR)[0]
+        if clear.size:
+            seen_from[row] = grid[clear[0]]
+        weights = own.weights(np.array([strength]))[0]
+        nearest = np.full(len(effects), from_none[row] ** 2)
+        for curve, place in zip(curves, places, strict=True):
+            column = effects.index(curve.effect)
+            others = curve.weights(np.geomspace(curve.low / 3.0, 1.5 * curve.high, _GRID))
+            distance = (
+                from_none[row] ** 2
+                - 2.0 * others @ (gram[place, mine] @ weights)
+                + np.einsum("si,ij,sj->s", others, gram[place, place], others)
+            )
+            nearest[column] = min(nearest[column], float(distance.min()))
+        between[row] = np.sqrt(np.maximum(nearest, 0.0))
+        between[row, row] = 0.0
+    return Distinguishability(
+        effects=effects,
+        since=tuple(curves[number].since for number in taken),
+        strengths=strengths,
+        from_none=from_none,
+        seen_from=seen_from,
+        between=between,
+    )
+
+
+def _middle(curve: Curve) -> float:
+    """Middle of the plausible range."""
+    return math.sqrt(curve.low * curve.high)
+
+
+def _usual(
+    effect: str, curves: Sequence[Curve], lengths: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+) -> int:
+    """Number of the curve that stands for an effect: of its usual onset, if there is one, and of those the middle one in length.
+
+    lengths: of a curve (number) at strengths (strength,), standard deviations.
+    """
+    own = [number for number, curve in enumerate(curves) if curve.effect == effect]
+    onset = EFFECTS[effect].usual_onset
+    usual = [number for number in own if curves[number].since == onset] or own
+    ranked = sorted(usual, key=lambda number: float(lengths(number, np.array([_middle(curves[number])]))[0]))
+    return ranked[(len(ranked) - 1) // 2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repeat:
+    """A series to take again with more frames: its name, how many times as many, separation of a tie now and then."""
+
+    series: str
+    times: int
+    separation: float
+    separation_then: float
+
+
+def repeat_text(
+    repeat: Repeat, first: Sequence[str], second: Sequence[str], *, other: tuple[str, float] | None = None
+) -> str:
+    """What to measure to tell two explanations (effects) apart: the repeat, or, where that is not worth it, what isolates them.
+
+    other: the best measurement that the session lacks, in words, and the separation with it, which is not worth it either: what
+    the calibration has not seen before a change cannot be made up for after it.
+    """
+    names = " and ".join(first) + " from " + " and ".join(second)
+    if repeat.separation_then >= WORTH_IT:
+        return (
+            f"take {repeat.series} again with {repeat.times} times as many frames, which would tell {names} by"
+            f" {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+        )
+    isolating = "; ".join(
+        f"{effect} by {EFFECTS[effect].isolated_by}"
+        for effect in (*first, *second)
+        if effect in EFFECTS and (effect in first) != (effect in second)
+    )
+    too_little = (
+        f"no series of this session will do: {repeat.times} times as many frames of the best one, {repeat.series}, tell"
+        f" {names} by {repeat.separation_then:.1f} standard deviations instead of {repeat.separation:.1f}"
+    )
+    if other is None:
+        return f"{too_little}. Measure what isolates them: {isolating}"
+    return (
+        f"{too_little}; nor will {other[0]} ({other[1]:.1f}). A change is told by what was measured before it as well: have among"
+        f" the calibrating series, too, what isolates them: {isolating}"
+    )
+
+
+def best_repeat(
+    problem: Problem, first: Mapping[str, tuple[Curve, float]], second: Mapping[str, tuple[Curve, float]]
+) -> Repeat | None:
+    """The series whose repetition would separate two explanations most; None where they are alike everywhere.
+
+    Args:
+        problem: of the session.
+        first, second: effect -> (curve of the problem, strength) of either explanation.
+    """
+
+    def response(explanation: Mapping[str, tuple[Curve, float]]) -> NDArray[np.float64]:
+        return sum(
+            (curve.response(strength) for curve, strength in explanation.values()), np.zeros(len(problem.residual))
+        )
+
+    apart = response(first) - response(second)
+    whitening = Whitening(problem.factors, problem.blocks)
+    moved = whitening.apply(apart[None, :])[0]
+    shared = Nuisances(whitening.factors)
+    weight = shared.solve(moved) * moved
+    now = float(np.sqrt(max(float(weight.sum()), 0.0)))
+    if not now > 0:
+        return None
+    by_series = np.bincount(problem.series_of, weights=weight, minlength=len(problem.views))
+    found: list[Repeat] = []
+    for number in np.argsort(-by_series)[:_CANDIDATES]:
+        # more frames leave less counting noise, and all that is no noise as it was
+        shrunk = np.where(problem.series_of == number, 1.0 - (1.0 - 1.0 / _REPEATS) * problem.noise**2, 1.0)
+        root = np.sqrt(shrunk)
+        again = Whitening(problem.factors / root[:, None], problem.blocks)
+        there = again.apply((apart / root)[None, :])
+        length = float(Nuisances(again.factors).inner(there, there)[0, 0])
+        found.append(
+            Repeat(
+                series=problem.views[int(number)].session.name,
+                times=_REPEATS,
+                separation=now,
+                separation_then=float(np.sqrt(max(length, 0.0))),
+            )
+        )
+    return max(found, key=lambda item: item.separation_then)
+
+
+def table_text(found: Distinguishability) -> str:
+    """The matrix as text, one row an effect: onset, detection, and the effects from which it is not clearly apart."""
+    title = f"not told apart there (separation below {CLEAR:g})"
+    lines = [f"{'effect':<19}{'since':<12}{'seen from':>10}{'strength':>10} {'unit':<5}{'from none':>11}   {title}"]
+    for row, effect in enumerate(found.effects):
+        unit = EFFECTS[effect].strength.unit if effect in EFFECTS else ""
+        least = f"{found.seen_from[row]:.3g}" if np.isfinite(found.seen_from[row]) else "-"
+        near = [
+            f"{other} {found.between[row, column]:.1f}"
+            for column, other in enumerate(found.effects)
+            if column != row and found.between[row, column] < CLEAR
+        ]
+        said = "not seen at this strength" if found.from_none[row] < CLEAR else ", ".join(near) or "-"
+        known = f"{least:>10}{found.strengths[row]:>10.3g} {unit:<5}{found.from_none[row]:>11.1f}"
+        lines.append(f"{effect:<19}{found.since[row]:<12}{known}   {said}")
+    return "\n".join(lines)

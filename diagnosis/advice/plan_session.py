@@ -1,0 +1,114 @@
+"""What a session could tell, whatever its frames show: which effects it distinguishes, and from which strength on."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...acquisition.acquisition_io import AcquisitionFile
+from ...generator.effects import EFFECTS
+from ...generator.line.twin import Twin
+from ...results import Result, Table, axes_or_new, frame, plain
+from ..checks.preparation import mislabelled, prepare_session
+from ..problem.assemble import problem_of
+from ..session.coarse import unseen_in_squares
+from .plan import Distinguishability, distinguishability
+
+if TYPE_CHECKING:
+    import pandas
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class SessionPlan(Result):
+    """Which effects a session distinguishes.
+
+    Fields: distinguishability; cannot_be_judged (effect -> reason).
+    """
+
+    distinguishability: Distinguishability
+    cannot_be_judged: Mapping[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `raytwin diagnose --plan --json` prints."""
+        found = self.distinguishability
+        answer: dict[str, Any] = plain(
+            {
+                "effects": found.effects,
+                "since": found.since,
+                "units": [EFFECTS[effect].strength.unit for effect in found.effects],
+                "strengths": found.strengths,
+                "from_none": found.from_none,
+                "seen_from": found.seen_from,
+                "between": found.between,
+                "cannot_be_judged": self.cannot_be_judged,
+            }
+        )
+        return answer
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row an effect: since, unit, strength taken, separation from none, strength from which it is seen."""
+        answer = self.to_dict()
+        columns = {
+            "effect": "effects",
+            "since": "since",
+            "unit": "units",
+            "strength": "strengths",
+            "from_none": "from_none",
+            "seen_from": "seen_from",
+        }
+        count = len(answer["effects"])
+        return frame([{name: answer[key][row] for name, key in columns.items()} for row in range(count)])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Separation of every effect (row) from every other one (column), standard deviations; returns the axes."""
+        found = self.distinguishability
+        axes = axes_or_new(ax, size_inches=(8.0, 7.0))
+        image = axes.imshow(np.log10(np.maximum(found.between, 0.1)), cmap="viridis")
+        axes.figure.colorbar(image, ax=axes, label="log10 of the separation (standard deviations)")
+        places = list(range(len(found.effects)))
+        axes.set_xticks(places, found.effects, rotation=90, fontsize=7)
+        axes.set_yticks(places, found.effects, fontsize=7)
+        return axes
+
+    def _table(self) -> Table:
+        answer = self.to_dict()
+        rows = tuple(
+            (effect, since, "no strength" if seen is None else f"{seen:.3g} {unit}".strip())
+            for effect, since, seen, unit in zip(
+                answer["effects"], answer["since"], answer["seen_from"], answer["units"], strict=True
+            )
+        )
+        notes = tuple(f"{effect} cannot be judged: {reason}" for effect, reason in self.cannot_be_judged.items())
+        title = f"{len(rows)} effects that these series can show"
+        return Table(title=title, header=("effect", "since", "seen from"), rows=rows, notes=notes)
+
+
+def plan_session(
+    acquisition: AcquisitionFile,
+    *,
+    twin: Twin | None = None,
+    rng: np.random.Generator,
+    without: Sequence[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> SessionPlan:
+    """The distinguishability matrix of a session's series.
+
+    Args:
+        acquisition, twin, rng, without, progress: as `diagnose`.
+
+    Raises:
+        InputError: nothing in the session can be judged, or its labels contradict the frames.
+    """
+    session = prepare_session(acquisition, twin=twin, rng=rng)
+    suspects = tuple(item for item in session.suspects if not item.or_effects)
+    if suspects:
+        raise mislabelled(acquisition, suspects)
+    unseen = unseen_in_squares() if session.factor > 1 else {}
+    problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+    found = distinguishability(problem)
+    shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
+    return SessionPlan(
+        distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
+        cannot_be_judged={**problem.missing_effects, **unseen},
+    )

@@ -1,0 +1,201 @@
+"""Do the series of a session show what their labels say? Asked before effects compete.
+
+A kV, filter or exposure that belongs to another series (`label_suspects`), a dark that is a flat (`beam_suspects`), a thickness map
+of another object (`map_suspects`): no effect of the forward model is meant to explain these, and the nearest one would be named
+instead.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.acquisition_io import AcquisitionFile, Series
+from ...acquisition.log_images import holds_shares
+from ...errors import InputError
+from .beam_suspects import flats_without_beam, lit_darks, shadows_in_flats
+from .label_model import LabelModel, spectral_model_of
+from .label_suspects import relabelled
+from .map_suspects import wrong_maps
+from .readings import (
+    FRAMES_READ,
+    FloatArray,
+    Reading,
+    Suspect,
+    good_pixels,
+    is_top,
+    mean_of,
+    measure,
+    reading_of,
+    refuse_fractions,
+    relative_gain,
+    share_at_the_top,
+    silent_darks,
+)
+
+_PIXELS = 96  # a side that are looked at
+_SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
+_RELEASED_LATER, _REMEMBERED = (
+    0.02,
+    3,
+)  # of the exposures before, which an image lag may leave in the last frames of a lit series; so many of them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plausibility:
+    """What was found.
+
+    Fields: suspects, strongest first; unusable: series without any signal or noise, or saturated -> why; saturated: names of
+    those that were lit too much.
+    """
+
+    suspects: tuple[Suspect, ...]
+    unusable: Mapping[str, str]
+    saturated: frozenset[str] = frozenset()
+
+
+def check_plausibility(
+    acquisition: AcquisitionFile,
+    *,
+    calibrating: frozenset[str],
+    dark_DN: Callable[[float | None], NDArray[np.floating]] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Plausibility:
+    """Series of a session that do not show what their labels say.
+
+    Args:
+        acquisition: open file.
+        calibrating: names of the series that calibrate; effects may have set in after them.
+        dark_DN: exposure_ms -> dark frame (row, column) of a twin, for sessions without darks.
+        progress: called with the name of the stage.
+
+    Raises:
+        InputError: frames that cannot be read, or that are fractions of something and no detector numbers.
+    """
+    (progress or (lambda stage: None))("labels")
+    shapes = {item.shape for item in acquisition.series}
+    if len(shapes) > 1:
+        return Plausibility(suspects=(), unusable={})
+    stride = max(1, math.ceil(min(shapes.pop()) / _PIXELS))
+    found = _read(acquisition, calibrating, stride)
+    darks = [item for item in found.readings if item.series.kind == "dark"]
+    lit = [item for item in found.readings if item.series.kind in ("flat", "object")]
+    refuse_fractions(lit)
+    good = good_pixels(found.readings)
+    suspects = lit_darks(darks, lit, good)
+    known = _Darks(readings=_less(darks, suspects), twins_DN=dark_DN, good=good, stride=stride)
+    dim, judged = flats_without_beam(_measured(lit, known), good)
+    _flatten(judged, good)
+    shadowed = shadows_in_flats(judged, good)
+    judged = _less(judged, shadowed)
+    try:
+        model = spectral_model_of(acquisition, judged)
+    except InputError:
+        model = None  # a voltage or material that the spectral model does not reach: said where it belongs
+    maps = LabelModel(acquisition, model, stride, good)
+    misfits = wrong_maps(judged, maps)
+    suspects = [*suspects, *dim, *shadowed, *misfits, *relabelled(_less(judged, misfits), maps)]
+    return Plausibility(
+        suspects=tuple(sorted(suspects, key=lambda item: -item.evidence)),
+        unusable=found.unusable,
+        saturated=frozenset(found.saturated),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Read:
+    """Readings in order of time; what cannot be used -> why; names of what was lit too much."""
+
+    readings: list[Reading]
+    unusable: dict[str, str]
+    saturated: set[str]
+
+
+def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int) -> _Read:
+    """The series at every `stride`th pixel, less those whose frames say nothing."""
+    readings: list[Reading] = []
+    unusable: dict[str, str] = {}
+    saturated: set[str] = set()
+    blank: dict[str, tuple[Reading, float]] = {}  # and the one number that all their pixels have
+    for item in acquisition.series:
+        if "log" in item.corrected or holds_shares(item):
+            continue
+        # the last ones: the first may hold what the exposure before has left
+        first = max(0, item.n_frames - FRAMES_READ)
+        frames = np.asarray(item.read_frames(first, item.n_frames)[:, ::stride, ::stride], dtype=np.float64)
+        found = reading_of(item, frames, acquisition, since=item.name not in calibrating)
+        full = 0.0 if item.kind in ("dark", "afterglow") else share_at_the_top(frames)
+        if float(np.ptp(frames)) == 0.0:
+            blank[item.name] = found, float(frames.flat[0])
+        elif full > _SATURATED:
+            unusable[item.name] = f"saturated: {100 * full:.2g} % of the pixels stand at {frames.max():.0f} DN"
+            saturated.add(item.name)
+        else:
+            readings.append(found)
+    silent = silent_darks(acquisition, calibrating, blank)
+    for name, (found, value_DN) in blank.items():
+        top = is_top(value_DN, acquisition.instrument.bits)
+        if name in silent and not top:
+            readings.append(found)
+            continue
+        unusable[name] = f"every pixel of every frame is {value_DN:g} DN"
+        if top and found.series.kind in ("flat", "object"):
+            saturated.add(name)
+    readings.sort(key=lambda item: item.series.index)
+    return _Read(readings=readings, unusable=unusable, saturated=saturated)
+
+
+def _less(readings: Sequence[Reading], suspects: Sequence[Suspect]) -> list[Reading]:
+    """Readings that no suspect names."""
+    blamed = {name for suspect in suspects for name in suspect.series}
+    return [item for item in readings if item.name not in blamed]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Darks:
+    """Dark frames of the session, or those of a twin where it has none (as in `check_plausibility`), at every `stride`th pixel."""
+
+    readings: list[Reading]
+    twins_DN: Callable[[float | None], NDArray[np.floating]] | None
+    good: NDArray[np.bool_]
+    stride: int
+
+    @property
+    def noise_DN2(self) -> float:
+        """Variance of the quietest."""
+        images = [item.variance_DN2 for item in self.readings if item.variance_DN2 is not None]
+        return min((mean_of(image, self.good) for image in images), default=0.0)
+
+    def of(self, item: Series) -> FloatArray | None:
+        """Dark frame (row, column) nearest to a series' exposure time, DN; None: nothing is known."""
+        if "offset" in item.corrected:
+            return np.zeros(self.good.shape)
+        if self.readings:
+            off = [abs((dark.series.exposure_ms or 0.0) - (item.exposure_ms or 0.0)) for dark in self.readings]
+            nearest = min(off) * 1.001 + 1e-9
+            same = [dark.mean_DN for dark, far in zip(self.readings, off, strict=True) if far <= nearest]
+            return np.asarray(np.median(np.stack(same), axis=0), dtype=np.float64)
+        if self.twins_DN is not None:
+            found = np.asarray(self.twins_DN(item.exposure_ms), dtype=np.float64)[:: self.stride, :: self.stride]
+            return found if found.shape == self.good.shape else None
+        return None
+
+
+def _measured(lit: Sequence[Reading], darks: _Darks) -> list[Reading]:
+    """Lit series that a dark can be taken off, with level, noise and picture, and what lag may have released in them."""
+    noise_DN2 = darks.noise_DN2
+    judged = [item for item in lit if measure(item, darks.of(item.series), noise_DN2, darks.good)]
+    for reading in judged:
+        before = [one.level_DN for one in judged if one.series.index < reading.series.index][-_REMEMBERED:]
+        reading.released = _RELEASED_LATER * max(before, default=0.0) / max(reading.level_DN, 1e-9)
+    return judged
+
+
+def _flatten(judged: Sequence[Reading], good: NDArray[np.bool_]) -> None:
+    """Divide pictures by the shape of the flats, where that has not been done."""
+    relative = relative_gain([item for item in judged if item.series.kind == "flat"], good)
+    for reading in judged:
+        if reading.picture is not None and "gain" not in reading.series.corrected:
+            reading.picture = reading.picture / relative

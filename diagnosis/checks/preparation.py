@@ -1,0 +1,268 @@
+"""What happens to a session before its gap is looked for: series that cannot be used, labels in doubt, the twin."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.acquisition_io import AcquisitionFile, Series
+from ...acquisition.coarser import coarser
+from ...acquisition.cut_off import share_of_zeros, without_cut_off_darks
+from ...calibration.calibrate import calibrate_twin
+from ...calibration.repeated_frames import beam_of
+from ...errors import FitError, InputError, RaytwinError
+from ...generator.line.twin import Twin
+from ..session.coarse import LEAST_SIDE, coarse_factor
+from ..session.coarse_twin import twin_in_squares
+from ..session.origin import made_of
+from ..session.session import calibrating_names
+from .plausibility import check_plausibility
+from .readings import Suspect
+
+_OF_THIS_SESSION = (
+    "the twin was calibrated from series of this session: the first of each kind and setting, or those whose role says so, count"
+    " as its calibration, and the others are compared with it"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PreparedSession:
+    """A session ready for its diagnosis.
+
+    Fields: acquisition (less the series that cannot be used); exposed (of these, saturated series: what they left in the panel is
+    known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
+    wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at); factor (pixels along
+    each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels);
+    ends_at_zero (names of lit series whose numbers go down to 0 and not below); spectral_point (parameter,): where the twin's
+    spectral nuisances are taken as linear (None: at its best parameters).
+    """
+
+    acquisition: AcquisitionFile
+    exposed: tuple[Series, ...]
+    twin: Twin
+    calibrated_elsewhere: bool
+    suspects: tuple[Suspect, ...]
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+    factor: int
+    all_pixels: AcquisitionFile
+    ends_at_zero: frozenset[str]
+    spectral_point: NDArray[np.float64] | None
+
+
+def calibrated_twin(
+    acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
+) -> Twin:
+    """The twin from the series that calibrate (see diagnosis.session); single-frame flats have their noise from the rest."""
+    names = calibrating_names(acquisition.series)
+    part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
+    rest = tuple(item for item in acquisition.series if item.name not in names)
+    return calibrate_twin(part, rng=rng, progress=progress, repeated=rest)
+
+
+def prepare_session(
+    acquisition: AcquisitionFile,
+    *,
+    twin: Twin | None,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None = None,
+) -> PreparedSession:
+    """Check a session's labels, take out what cannot be used, and calibrate its twin where none was given.
+
+    Frames of more than LARGEST_PIXELS become means of squares of pixels, and a given twin that of such squares.
+
+    Raises:
+        InputError: nothing can be calibrated or compared; the message says what is missing and what would do.
+    """
+    tell = progress or (lambda stage: None)
+    all_pixels, left_out = _of_one_shape(acquisition, twin)
+    all_pixels, cut_off = without_cut_off_darks(all_pixels)
+    left_out += cut_off
+    if not all_pixels.series:
+        raise _nothing_left(acquisition, left_out)
+    factor = coarse_factor(all_pixels.series[0].shape)
+    twin = None if twin is None else twin_in_squares(twin, factor)
+    acquisition = coarser(all_pixels, factor)
+    names = calibrating_names(acquisition.series)
+    found = check_plausibility(
+        acquisition,
+        calibrating=names,
+        dark_DN=None if twin is None else twin.maps.dark_at,
+        progress=progress,
+    )
+    left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
+    kept = tuple(item for item in acquisition.series if item.name not in found.unusable)
+    if not kept:
+        raise _nothing_left(acquisition, left_out)
+    exposed = tuple(item for item in acquisition.series if item.name in found.saturated)
+    acquisition = replace(acquisition, series=kept)
+    elsewhere = twin is not None and not made_of(twin, kept)
+    notes = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
+    suspects = found.suspects
+    if twin is None:
+        tell("calibration")
+        try:
+            twin = calibrated_twin(acquisition, rng=rng, progress=progress)
+        except (InputError, FitError) as error:
+            raise _not_calibrated(acquisition, suspects, left_out, error) from error
+        suspects = suspects or _without_spectrum(acquisition, twin)
+    return PreparedSession(
+        acquisition=acquisition,
+        exposed=exposed,
+        twin=twin,
+        calibrated_elsewhere=elsewhere,
+        suspects=suspects,
+        left_out=tuple(left_out),
+        notes=notes,
+        factor=factor,
+        ends_at_zero=frozenset(
+            item.name for item in all_pixels.series if item.kind in ("flat", "object") and share_of_zeros(item) > 0.0
+        ),
+        spectral_point=_spectral_point(acquisition, twin, rng=rng, progress=progress),
+        all_pixels=replace(
+            all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
+        ),
+    )
+
+
+def _spectral_point(
+    acquisition: AcquisitionFile,
+    twin: Twin,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None,
+) -> NDArray[np.float64] | None:
+    """The twin's spectral parameters (parameter,) as the session's flats show them, each beam's later ones; None: it knows all beams.
+
+    A calibration from few beams leaves the spectrum wide, and what other beams show lies far along its nuisances: straight lines
+    from the calibrated point do not reach it, and an effect of the beam was named that made up for that.
+    """
+    calibrating = calibrating_names(acquisition.series)
+    flats = [
+        item
+        for item in acquisition.of_kind("flat")
+        if item.setting is not None and not item.corrected & {"log", "gain"} and item.panel_rotation_deg % 360.0 == 0.0
+    ]
+    if twin.spectral is None or all(item.setting is None or twin.level_at(item.setting) for item in flats):
+        return None
+    later = {beam_of(item) for item in flats if item.name not in calibrating}
+    chosen = {item.name for item in flats if item.name not in calibrating or beam_of(item) not in later}
+    chosen |= {item.name for item in acquisition.of_kind("dark")}
+    series = tuple(
+        replace(item, role="calibration" if item.name in chosen else "evaluation") for item in acquisition.series
+    )
+    try:
+        found = calibrated_twin(replace(acquisition, series=series), rng=rng, progress=progress).spectral
+    except (InputError, FitError):
+        return None  # then the calibrated point has to do
+    if found is None:
+        return None
+    values = dict(zip(found.names, map(float, found.best), strict=True))
+    best = zip(twin.spectral.names, map(float, twin.spectral.best), strict=True)
+    return np.array([values.get(name, value) for name, value in best])
+
+
+def mislabelled(acquisition: AcquisitionFile, suspects: tuple[Suspect, ...]) -> InputError:
+    """The error for a session that cannot be worked with because of its labels."""
+    return InputError(
+        f"acquisition {acquisition.path}",
+        received="; ".join(item.text for item in suspects),
+        expected="labels that the frames agree with",
+        remedy="correct the labels of these series, or leave them out",
+    )
+
+
+def _without_spectrum(acquisition: AcquisitionFile, twin: Twin) -> tuple[Suspect, ...]:
+    """Flats that state kV and tube load, and yet fit no spectrum."""
+    names = calibrating_names(acquisition.series)
+    stated = [
+        item.name
+        for item in acquisition.of_kind("flat")
+        if item.name in names and item.setting is not None and item.setting.tube_load_mAs is not None
+    ]
+    if twin.spectral is not None or not stated:
+        return ()
+    reason = next((line for line in twin.warnings if line.startswith("no spectral part")), "no spectral part")
+    return (
+        Suspect(
+            series=tuple(stated),
+            text=f"levels and noise of the flats fit no tube and scintillator at the kV, filters and load they state ({reason})",
+            evidence=0.0,
+        ),
+    )
+
+
+def _of_one_shape(acquisition: AcquisitionFile, twin: Twin | None) -> tuple[AcquisitionFile, list[str]]:
+    """The series whose frames have the twin's shape, or the commonest one; and which were left out."""
+    if not acquisition.series:
+        raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
+    counted = Counter(item.shape for item in acquisition.series)
+    shape = counted.most_common(1)[0][0] if twin is None else twin.maps.shape
+    if shape not in counted:
+        rows, columns = counted.most_common(1)[0][0]
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"frames of {rows} x {columns}",
+            expected=f"the twin's detector of {shape[0]} x {shape[1]}",
+            remedy="diagnose sessions of the detector that the twin was calibrated from, or leave --twin out",
+        )
+    other = None if twin is None else twin.instrument.unlike(acquisition.instrument)
+    if other is not None:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=other[0],
+            expected=f"the twin's: {other[1]}",
+            remedy="diagnose sessions of the line that the twin was calibrated from, or leave --twin out",
+        )
+    if min(shape) < LEAST_SIDE:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received=f"frames of {shape[0]} x {shape[1]}",
+            expected=f"at least {LEAST_SIDE} rows and columns",
+            remedy="put the lines of a line detector together to pictures",
+        )
+    left_out = [
+        f"{item.name}: frames of {item.shape[0]} x {item.shape[1]}, not {shape[0]} x {shape[1]}"
+        for item in acquisition.series
+        if item.shape != shape
+    ]
+    kept = tuple(item for item in acquisition.series if item.shape == shape)
+    return replace(acquisition, series=kept), left_out
+
+
+def _nothing_left(acquisition: AcquisitionFile, left_out: Sequence[str]) -> InputError:
+    return InputError(
+        f"acquisition {acquisition.path}", received="; ".join(left_out), expected="series with light and noise"
+    )
+
+
+def _not_calibrated(
+    acquisition: AcquisitionFile, suspects: tuple[Suspect, ...], left_out: Sequence[str], error: RaytwinError
+) -> InputError:
+    """Why a session cannot calibrate its own twin, and what could be said with one from elsewhere."""
+    if suspects:
+        return mislabelled(acquisition, suspects)
+    counted = Counter(item.kind for item in acquisition.series)
+    several = sum(item.n_frames > 1 for item in acquisition.series)
+    have = ", ".join(f"{number} {kind}" for kind, number in counted.items())
+    remedy = (
+        f"or give --twin, calibrated from another session of this line: with it this session ({have} series,"
+        f" {several} of them of two frames or more) can be compared as far as it goes"
+    )
+    others = f" and {len(left_out) - 1} more" if len(left_out) > 1 else ""
+    without = f" (not used: {left_out[0]}{others})" if left_out else ""
+    if isinstance(error, InputError):
+        return InputError(
+            error.argument,
+            received=f"{error.received}{without}",
+            expected=error.expected,
+            remedy=f"{error.remedy}; {remedy}" if error.remedy else remedy,
+        )
+    return InputError(
+        f"acquisition {acquisition.path}",
+        received=f"{error}{without}",
+        expected="flats and darks that calibrate a twin",
+        remedy=remedy,
+    )

@@ -1,0 +1,17 @@
+"""Statistics of probes, whatever they mean: nuisances, discrepancy, evidence of one effect, two or an unknown one.
+
+Files:
+    inference         all hypotheses with their probabilities
+    observed          residual and covariance, alone or together with an effect
+    curve_fits        evidence and strength of one effect
+    pairs             two effects at once
+    unknown           what no catalogue entry explains
+    discrepancy       how far laws of a kind depart from ours (`discrepancy.toml`)
+    nuisances         factor model of the nuisances, integrated out
+    local_nuisances   the same where most touch one series
+    whitening         nuisances of single series taken out first
+    refine            inner parameters fitted: the loop
+    refine_tasks      which effects are fitted, in which order
+    search            one fit: slopes and steps
+    seen              which residual and series a fit asks
+"""

@@ -1,0 +1,242 @@
+"""Evidence of one effect with its inner parameters fixed, its strength integrated out."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from ..model.curves import Curve
+from .discrepancy import LEAST_MOVED, LEVELS, Levels
+from .observed import Observed, Point
+
+_ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
+_VARIANTS = 3  # of an effect that are fitted with all levels, at least
+_CLOSE = math.log(100.0)  # of log evidence: what is less likely than that changes a mean by less than one per cent
+_WEAK = 0.3  # of the best strength
+IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
+_REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurveFit:
+    """One curve against a residual.
+
+    Fields: curve; by_level (level,): log evidence over none with the law off by each level; log_evidence: the same, averaged over the
+    levels' frequencies; level: the likeliest; strengths and log_likelihood (node,) over none at that level.
+    """
+
+    curve: Curve
+    by_level: NDArray[np.float64]
+    log_evidence: float
+    level: float
+    strengths: NDArray[np.float64]
+    log_likelihood: NDArray[np.float64]
+
+    @property
+    def best(self) -> float:
+        """Strength of the highest likelihood."""
+        return float(self.strengths[int(np.argmax(self.log_likelihood))])
+
+    @property
+    def point(self) -> Point:
+        """Where the likelihood is highest."""
+        return Point(curve=self.curve, strength=self.best, level=self.level)
+
+    def at_level(self, level: float) -> Point:
+        """Where the likelihood is highest, the law off by another level."""
+        return Point(curve=self.curve, strength=self.best, level=level)
+
+    def averaged(self, frequencies: Sequence[float]) -> float:
+        """Log evidence over none with levels of these frequencies."""
+        return _over_levels(self.by_level, frequencies)
+
+
+def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) -> float:
+    return float(logsumexp(by_level, b=np.asarray(frequencies[: len(by_level)])))
+
+
+def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exact: bool = False) -> CurveFit:
+    """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
+
+    What an effect does by chance grows with its strength; at each level the covariance is that of the law at its best strength, found
+    in rounds.
+
+    Args:
+        observed: what is weighed.
+        curve: in its units.
+        levels: of discrepancy.
+        exact: the law is taken as exact, and nothing about it as random: a first look, at a fraction of the cost.
+    """
+    coarse = curve.log_strengths()
+    sharp = _Terms(observed, curve)
+    strengths, value = sharp.closed_in(coarse)
+    first = log_integral(strengths, value, curve.low, curve.high)
+    found = [(first, strengths, value)]
+    if not exact:
+        start = float(strengths[int(np.argmax(value))])
+        found = [_at_level(observed, curve, start, level, sharp) or found[0] for level in levels.levels]
+    by_level = np.array([item[0] for item in found])
+    frequencies = (1.0,) if exact else levels.of_kind
+    with np.errstate(divide="ignore"):
+        likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
+    return CurveFit(
+        curve=curve,
+        by_level=by_level,
+        log_evidence=_over_levels(by_level, frequencies),
+        level=0.0 if exact else levels.levels[likeliest],
+        strengths=found[likeliest][1],
+        log_likelihood=found[likeliest][2],
+    )
+
+
+def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
+    """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
+    alone = observed.standing(curve.effect)
+    fit = fit_curve(alone, alone.scaled(curve), exact=exact)
+    more = observed.over_none(curve.effect)
+    return replace(fit, curve=curve, by_level=fit.by_level + more, log_evidence=fit.log_evidence + more)
+
+
+def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
+    """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
+    found = [fit_effect(observed, curve, exact=True) for curve in curves]
+    ranked: dict[str, list[int]] = {}
+    for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
+        ranked.setdefault(curves[number].effect, []).append(number)
+    for numbers in ranked.values():
+        least = found[numbers[0]].log_evidence - _CLOSE
+        close = max(_VARIANTS, sum(found[number].log_evidence > least for number in numbers))
+        for number in numbers[:close]:
+            found[number] = fit_effect(observed, curves[number])
+        for number in numbers[close:]:
+            # of the others no more is counted than an exact law's part, as often as laws are exact
+            exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])
+            found[number] = replace(found[number], log_evidence=exact)
+    return found
+
+
+class _Terms:
+    """Log likelihood over none of a curve at any strength: r ~ N(m(s), C + s^2 S S^T), S what it does by chance, C all else.
+
+    With S^T C^-1 S = V D V^T and c = V^T S^T C^-1 (r - m) it is that of N(m, C) and
+    1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
+    """
+
+    def __init__(self, observed: Observed, curve: Curve) -> None:
+        self._curve = curve
+        nodes, chance = len(curve.responses), _chance_of(curve)
+        moved = np.concatenate([curve.responses, observed.residual[None, :], chance])
+        inner = observed.nuisances.inner(moved, moved)
+        self._linear, self._gram = inner[:nodes, nodes], inner[:nodes, :nodes]
+        self._values, vectors = np.linalg.eigh(inner[nodes + 1 :, nodes + 1 :])
+        self._values = np.maximum(self._values, 0.0)
+        self._of_nodes, self._of_residual = inner[:nodes, nodes + 1 :] @ vectors, inner[nodes, nodes + 1 :] @ vectors
+
+    def at(self, strengths: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Log likelihood over none, and squared length of the response, at strengths."""
+        weights = self._curve.weights(strengths)
+        quadratic = np.einsum("si,ij,sj->s", weights, self._gram, weights)
+        value = weights @ self._linear - 0.5 * quadratic
+        if len(self._values):
+            grown = np.multiply.outer(strengths**2, self._values)
+            taken = strengths[:, None] ** 2 / (1.0 + grown)
+            response = weights @ self._of_nodes
+            value += 0.5 * np.sum(taken * (self._of_residual - response) ** 2 - np.log1p(grown), axis=1)
+            quadratic = quadratic - np.sum(taken * response**2, axis=1)
+        return value, np.maximum(quadratic, 0.0)
+
+    def closed_in(self, coarse: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Strengths and their log likelihood: a peak sharper than the nodes lie apart is closed in on."""
+        strengths = coarse
+        value, quadratic = self.at(strengths)
+        for reach in _REACHES:
+            at = int(np.argmax(value))
+            width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
+            strengths = _refined(coarse, float(strengths[at]), width)
+            value, quadratic = self.at(strengths)
+        return strengths, value
+
+
+def _at_level(
+    observed: Observed, curve: Curve, start: float, level: float, sharp: _Terms
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None:
+    """Log evidence, strengths and log likelihood over none with the law off by a level; None: that moves nothing."""
+    best, none = start, observed.log_likelihood
+    coarse = curve.log_strengths()
+    found = None
+    for _ in range(_ROUNDS):
+        wide = observed.widened(curve, best, level, chance=False)
+        if wide is None:
+            break
+        strengths, value = _Terms(wide, curve.over(wide.units / observed.units)).closed_in(coarse)
+        value = value + wide.log_likelihood - none
+        # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
+        weak = strengths < _WEAK * best
+        value = np.where(weak, sharp.at(strengths)[0], value)
+        found = log_integral(strengths, value, curve.low, curve.high), strengths, value
+        before, best = best, float(strengths[int(np.argmax(value))])
+        if abs(math.log(best / before)) < _SETTLED:
+            break
+    return found
+
+
+def _chance_of(curve: Curve) -> NDArray[np.float64]:
+    """What a curve does by chance a unit of strength (factor, probe); what moves nothing that shows is left out."""
+    if curve.spread is None:
+        return np.zeros((0, curve.responses.shape[1]))
+    shows = np.max(np.abs(curve.spread), axis=0, initial=0.0) * curve.reach[1] >= LEAST_MOVED
+    return np.asarray(curve.spread[:, shows].T)
+
+
+def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
+    """Nodes with a finer set about `best`, 6 relative widths to each side."""
+    span = np.linspace(-6.0, 6.0, 49) * min(max(width, 1e-6), 0.5)
+    near = best * np.exp(span)
+    return np.unique(np.concatenate([strengths, near[(near >= strengths[0]) & (near <= strengths[-1])]]))
+
+
+def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64], low: float, high: float) -> float:
+    """log of the mean likelihood under a prior that is even in the logarithm of the strength.
+
+    Most of it from low to high, IMPLAUSIBLE beyond: a line may be better, or worse, than the catalogue takes for plausible.
+    """
+    x = np.log(strengths)
+    inside = (strengths >= 0.999999 * low) & (strengths <= 1.000001 * high)
+    widths = np.diff(x)
+    plausible = inside[:-1] & inside[1:]
+    top = float(log_likelihood.max())
+    areas = 0.5 * (np.exp(log_likelihood[:-1] - top) + np.exp(log_likelihood[1:] - top)) * widths
+    total = 0.0
+    for part, share in ((plausible, 1.0 - IMPLAUSIBLE), (~plausible, IMPLAUSIBLE)):
+        total += share * float(areas[part].sum()) / max(float(widths[part].sum()), 1e-12)
+    return top + math.log(max(total, 1e-300))
+
+
+def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
+    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence."""
+    top = max(fit.log_evidence for fit in fits)
+    likely = [fit for fit in fits if fit.log_evidence > top - 12.0]
+    nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
+    total = np.full(len(nodes), -np.inf)
+    for fit in likely:
+        value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood, left=-np.inf, right=-np.inf)
+        total = np.logaddexp(total, value)
+    return interval_under(nodes, total)
+
+
+def interval_under(strengths: NDArray[np.float64], log_likelihood: NDArray[np.float64]) -> tuple[float, float, float]:
+    x = np.log(strengths)
+    density = np.exp(log_likelihood - log_likelihood.max())
+    cumulated = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(x))])
+    low, middle, high = np.interp([0.025, 0.5, 0.975], cumulated / cumulated[-1], x)
+    return math.exp(middle), math.exp(low), math.exp(high)
+
+
+def log_mean_exp(values: NDArray[np.float64], axis: int | tuple[int, ...] | None = None) -> Any:
+    top = np.max(values, axis=axis, keepdims=True)
+    mean = np.log(np.mean(np.exp(values - top), axis=axis, keepdims=True)) + top
+    return mean.item() if axis is None else np.squeeze(mean, axis=axis)

@@ -1,0 +1,206 @@
+"""Model discrepancy: how far laws of an effect's kind depart from ours, and what effects do by chance.
+
+At a level k a law is off by a random factor of relative size k in each group of probes, by half of that in each probe of its own,
+and by a share of that in probes of a place where it acts but foretells less. What it leaves may look like another effect, a share of
+k times as large as what it does. Levels are no choice for a session: evidence is averaged over them, with the frequencies that laws
+of many shapes have shown (`discrepancy.toml`). The shares below are choices: no script has fitted them.
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass, replace
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from ..model.curves import Curve
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Levels:
+    """Levels of discrepancy and how often they occur.
+
+    Fields: levels (level,), relative; of_kind (level,): their frequencies where the effect is of the kind that a law describes;
+    of_another: where it is not, and the law is the one of the catalogue that resembles it most; rest_of_kind, rest_of_another: how
+    often such a law leaves a rest in some families of probes beyond that; rest_sd_of_kind: of the length of a rest over that of what
+    the laws do, as a Gaussian about 0; rest_of_another_log: mean and standard deviation of the logarithm of that, a Gaussian.
+    """
+
+    levels: tuple[float, ...]
+    of_kind: tuple[float, ...]
+    of_another: tuple[float, ...]
+    rest_of_kind: float = 0.0
+    rest_of_another: float = 0.0
+    rest_sd_of_kind: float = 0.5
+    rest_of_another_log: tuple[float, float] = (0.0, 1.0)
+
+    def up_to(self, level: float) -> "Levels":
+        """Those up to a level, with frequencies as they are."""
+        kept = sum(one <= level for one in self.levels)
+        return replace(self, levels=self.levels[:kept], of_kind=self.of_kind[:kept], of_another=self.of_another[:kept])
+
+
+def log_frequency(level: float, *, another: bool = False) -> float:
+    """Log of how often laws of an effect's kind (or of `another` kind) are off by a level."""
+    frequencies = LEVELS.of_another if another else LEVELS.of_kind
+    return math.log(frequencies[int(np.argmin(np.abs(np.array(LEVELS.levels) - level)))])
+
+
+def _learnt() -> Levels:
+    """As `validation/learn_discrepancy.py` left them."""
+    table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
+    levels, kind, another = (tuple(map(float, table[key])) for key in ("levels", "of_kind", "of_another"))
+    return Levels(
+        levels=levels,
+        of_kind=kind,
+        of_another=another,
+        rest_of_kind=float(table["rest_of_kind"]),
+        rest_of_another=float(table["rest_of_another"]),
+        rest_sd_of_kind=float(table["rest_sd_of_kind"]),
+        rest_of_another_log=(float(table["rest_of_another_log"][0]), float(table["rest_of_another_log"][1])),
+    )
+
+
+LEVELS = _learnt()
+# of a level: what a law leaves in the shape of another effect, over what it does
+LEAK_SHARE = 0.5
+# beyond it a law does not carry the probes: what is off by more than half of itself explains anything
+FARTHEST_LEVEL = 0.4
+USUAL_LEVEL = 0.1  # of refinement, of laws that a twin has, and of what is fitted on half of a session
+USUAL = Levels(levels=(USUAL_LEVEL,), of_kind=(1.0,), of_another=(1.0,))
+PROBE_SHARE = 0.5  # of a level that is each probe's own
+ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
+EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
+LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
+_LEAST_RATIO = 1e-3  # of a rest over what laws do: shorter ones do not show
+LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
+_TIMES_SEEN = (
+    1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
+)
+
+
+def credible(response: NDArray[np.float64], seen: NDArray[np.float64], places: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The part of a response (probe,) that its law's inaccuracy is a share of: in each place no more than `_TIMES_SEEN` what is seen.
+
+    A law that predicts thousands of standard deviations where nothing is seen is wrong by all of them, not off by a share.
+    """
+    predicted = np.bincount(places, weights=response**2)
+    found = np.bincount(places, weights=np.maximum(seen**2, 1.0))
+    share = np.sqrt(np.minimum(1.0, _TIMES_SEEN**2 * found / np.maximum(predicted, 1e-12)))
+    return np.asarray(response * share[places])
+
+
+@dataclass(frozen=True, slots=True)
+class LawFactors:
+    """What is random about effects at their strengths.
+
+    Fields: of_laws (factor, probe): a row for each group of probes and effect, what the law is off by there; spread (probe, factor):
+    what the effects do by chance.
+    """
+
+    of_laws: csc_array
+    spread: NDArray[np.float64]
+
+    def __bool__(self) -> bool:
+        return bool(self.of_laws.shape[0] or self.spread.shape[1])
+
+    def full(self) -> NDArray[np.float64]:
+        """All of them (probe, factor)."""
+        return np.concatenate([self.of_laws.toarray().T, self.spread], axis=1)
+
+
+def law_factors(
+    curve: Curve,
+    strength: float,
+    response: NDArray[np.float64],
+    groups: NDArray[np.intp],
+    level: float,
+    *,
+    chance: bool = True,
+) -> LawFactors:
+    """What is random about an effect at a strength: its law's inaccuracy, and, with `chance`, its own spread."""
+    if curve.exact is not None:
+        response = np.where(curve.exact, 0.0, response)
+    spread = curve.spread if chance else None
+    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < LEAST_MOVED:
+        spread = np.zeros((len(response), 0))
+    moves = float(np.max(np.abs(response), initial=0.0)) * level >= LEAST_MOVED
+    return LawFactors(group_factors(response, groups, level if moves else 0.0), spread * strength)
+
+
+def group_factors(response: NDArray[np.float64], groups: NDArray[np.intp], sd: float) -> csc_array:
+    """A row (factor, probe) a group: the response there times `sd`; groups in which it would move nothing are left out."""
+    power = np.bincount(groups, weights=response**2)
+    kept = sd**2 * power > LEAST_FACTOR
+    inside = kept[groups]
+    places = (np.cumsum(kept) - 1)[groups[inside]]
+    starts = np.concatenate([[0], np.cumsum(inside)])
+    return csc_array((sd * response[inside], places, starts), shape=(int(np.count_nonzero(kept)), len(response)))
+
+
+def own_variance(
+    curve: Curve, strength: float, effective: NDArray[np.float64], places: NDArray[np.intp], level: float
+) -> NDArray[np.float64]:
+    """Variance (probe,) that an effect gives each probe by itself: by its law's discrepancy, and by chance."""
+    share: float | NDArray[np.float64] = PROBE_SHARE * level
+    if curve.exact is not None:
+        share = np.where(curve.exact, EXACT_LAW_ERROR, share)
+    own = (share * effective) ** 2
+    if level:
+        of_place = np.bincount(places, weights=effective**2) / np.maximum(np.bincount(places), 1)
+        own = own + (ELSEWHERE_SHARE * level) ** 2 * of_place[places]
+    return np.asarray(own if curve.jitter is None else own + strength**2 * curve.jitter)
+
+
+def law_terms(
+    curve: Curve, strength: float, groups: NDArray[np.intp], places: NDArray[np.intp], level: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a law that is off by so much adds: factors (probe, factor) and each probe's own variance (probe,)."""
+    response = curve.response(strength)
+    factors = law_factors(curve, strength, response, groups, level).full()
+    return factors, own_variance(curve, strength, response, places, level)
+
+
+def log_rest(ratio: float, *, another: bool = False) -> float:
+    """Log density, in the logarithm of it, of how many times as long a rest is as what the laws beside it do.
+
+    another: the laws are only like what is there.
+    """
+    ratio = max(ratio, _LEAST_RATIO)
+    if another:
+        middle, sd = LEVELS.rest_of_another_log
+        return -0.5 * ((math.log(ratio) - middle) / sd) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sd)
+    share = ratio / LEVELS.rest_sd_of_kind
+    return math.log(share) + 0.5 * math.log(2.0 / math.pi) - 0.5 * share**2
+
+
+def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:
+    """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
+
+    Even from `least`, below which it does not show, to LEAK_SHARE times the level, and falling as a Gaussian beyond; nothing where a
+    law of this level leaves nothing that shows.
+    """
+    most = LEAK_SHARE * level
+    if most <= least:
+        return np.zeros_like(ratio)
+    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / most) ** 2)) / _leak_width(most, least))
+
+
+def leak_below(ratio: float, level: float, least: float) -> float:
+    """Probability that it is less, or does not show at all."""
+    most = LEAK_SHARE * level
+    if most <= least:
+        return 1.0
+    if ratio <= least:
+        return 0.0
+    inside = np.geomspace(least, ratio, 200)
+    return float(np.trapezoid(leak_density(inside, level, least), np.log(inside)))
+
+
+def _leak_width(most: float, least: float) -> float:
+    """Integral of exp(-(x / most)^2 / 2) over the logarithm of x from `least` on: E1((least / most)^2 / 2) / 2."""
+    from scipy.special import exp1
+
+    return float(0.5 * exp1(0.5 * (least / most) ** 2))

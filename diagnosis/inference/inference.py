@@ -1,0 +1,269 @@
+"""Which hypothesis explains a vector of probes: none, one effect, two, or something that is not in the catalogue.
+
+Probes are residuals r (probe,) against the twin, in units of their own standard deviations. Nuisance parameters are
+integrated out exactly (they are linear with Gaussian priors): r ~ N(m, C), C = I + F F^T, F (probe, factor) the
+responses to the nuisances times their prior standard deviations.
+
+    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.standing`); now and then one family of
+              probes is off by a little (`unknown.Chance`)
+    effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
+              any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
+    pair      m = m_e(s) + m_f(t), each law off by a level of its own
+    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, as far off as
+              effects of other kinds are from the law that resembles them most
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.curves import Curve
+from .curve_fits import CurveFit, interval_of, log_mean_exp
+from .discrepancy import LEVELS, log_frequency, log_rest
+from .observed import Observed, Point
+from .pairs import Single, left_by_the_stronger, left_in_place, log_prior, weigh_pairs
+from .unknown import LOG_DENSITY, Beyond, beyond
+
+UNKNOWN = "unknown_effect"
+_WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
+_PAIRS_FROM = 6  # effects, the likeliest, that are the first of a pair
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hypothesis:
+    """One explanation and how probable it is.
+
+    Fields: effects (ids; empty for none; `("unknown_effect",)` for an effect outside the catalogue); probability; log_evidence;
+    strengths per effect: best value and 95 % interval (value, low, high); variants per effect; levels: of discrepancy, per effect;
+    location: probe group of an unknown effect; rest: the one in which laws leave most, empty where they leave nothing.
+    """
+
+    effects: tuple[str, ...]
+    probability: float
+    log_evidence: float
+    strengths: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    variants: Mapping[str, Curve] = field(default_factory=dict)
+    levels: Mapping[str, float] = field(default_factory=dict)
+    location: str = ""
+    rest: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Priors:
+    """Prior probabilities of the kinds of hypothesis, shared evenly within each kind; they need not sum to 1."""
+
+    none: float = 0.35
+    single: float = 0.40
+    pair: float = 0.10
+    unknown: float = 0.15
+
+
+def weigh_hypotheses(
+    seen: Sequence[tuple[Observed, Sequence[CurveFit]]],
+    *,
+    parts: NDArray[np.intp],
+    part_names: Sequence[str],
+    priors: Priors | None = None,
+    of_catalogue: int = 0,
+    rests: bool = True,
+) -> tuple[Hypothesis, ...]:
+    """All hypotheses, most probable first; their probabilities sum to 1.
+
+    An effect that the twin has is weighed like any other: a hypothesis that holds it has it at any strength, all others as strong as
+    the twin.
+
+    Args:
+        seen: standardised probes less the twin's with what may vary, and the fits of each effect's curves to it; several curves of
+            one effect are variants with equal prior. Several of these for several levels by which laws of the twin's own effects may
+            be off, over which the evidence is averaged.
+        parts, part_names: families of probes (probe,) in which an unknown effect may show.
+        priors: of the kinds of hypothesis.
+        of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
+        rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
+    """
+    weighed: list[tuple[Hypothesis, float]] = []
+    for observed, fits in seen:
+        # one zero for all, and how often laws are off by so much
+        zero = observed.standing().log_likelihood - seen[0][0].standing().log_likelihood
+        zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
+        found = _weighed(observed, fits, parts, part_names, priors or Priors(), of_catalogue, rests)
+        weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
+    return _by_effects(weighed)
+
+
+def _weighed(
+    observed: Observed,
+    fits: Sequence[CurveFit],
+    parts: NDArray[np.intp],
+    part_names: Sequence[str],
+    priors: Priors,
+    of_catalogue: int,
+    rests: bool,
+) -> list[tuple[Hypothesis, float]]:
+    """All hypotheses with their log evidence over none, and the logarithms of their priors."""
+    singles = _singles(fits)
+    count = max(len(singles), of_catalogue, 1)
+    ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
+    looked_at = _WITH_REST if rests else 0
+    beside = _Rests(observed, parts, part_names)
+    none = beside.none
+    nothing = beside.no_effect(rests)
+    weighed = [(nothing, math.log(priors.none))]
+    of_given = _left_by_given(observed, singles)
+    if of_given is not None:
+        weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
+    of_single = math.log(priors.single / count)
+    alike, whole = [], {}
+    for effect in ranked:
+        single = singles[effect]
+        found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
+        found = replace(found, strengths={effect: interval_of(single.fits)})
+        if effect in ranked[:looked_at]:
+            found = beside.of_kind(found, [single.best])
+            alike.append(beside.of_another(single))
+        weighed.append((found, of_single))
+        whole[effect] = found
+    leaks: dict[str, Hypothesis] = {}
+    of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
+    for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
+        found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
+        if number < looked_at:
+            found = beside.of_kind(found, list(pair.fits.values()))
+        weighed.append((found, of_pair))
+        # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
+        strong, leaves = left_by_the_stronger(observed, pair)
+        if any(observed.has(effect) for effect in pair.effects if effect != strong):
+            continue
+        alone = replace(whole[strong], log_evidence=found.log_evidence + leaves, rest=found.rest)
+        if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
+            leaks[strong] = alone
+    weighed += [(item, of_single) for item in leaks.values()]
+    likest = float(np.logaddexp.reduce(alike)) - math.log(count) if alike else -math.inf
+    evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
+    unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
+    weighed.append((unknown, math.log(priors.unknown)))
+    return weighed
+
+
+def _left_by_given(observed: Observed, singles: Mapping[str, Single]) -> float | None:
+    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
+    others = [single for effect, single in singles.items() if not observed.has(effect)]
+    if not (observed.given and others):
+        return None
+    length = math.hypot(*(observed.length(point.curve, point.strength) for point in observed.given))
+    levels = [(1.0, observed.given[0].level)]
+    return max(single.log_evidence + left_in_place(observed, single.best, length, levels) for single in others)
+
+
+def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
+    """Hypotheses with log priors as probabilities, those with the same effects as one, most probable first."""
+    scores = np.array([item.log_evidence + prior for item, prior in weighed])
+    shares = np.exp(scores - scores.max())
+    shares /= shares.sum()
+    best: dict[tuple[str, ...], Hypothesis] = {}
+    total: dict[tuple[str, ...], float] = {}
+    for number in np.argsort(-scores):
+        item = weighed[number][0]
+        total[item.effects] = total.get(item.effects, 0.0) + float(shares[number])
+        best.setdefault(item.effects, item)
+    every = [replace(item, probability=total[effects]) for effects, item in best.items()]
+    return tuple(sorted(every, key=lambda item: (-item.probability, -item.log_evidence)))
+
+
+def evidence_with_rest(
+    observed: Observed, points: Sequence[Point], *, parts: NDArray[np.intp], part_names: Sequence[str]
+) -> tuple[float, float]:
+    """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs."""
+    rests = _Rests(observed, parts, part_names)
+    evidence, found = rests.beside(points)
+    return evidence, rests.ratio(points, found)
+
+
+class _Rests:
+    """What laws leave beside effects, in families of probes."""
+
+    def __init__(self, observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> None:
+        self._observed = observed
+        self._parts = parts
+        self._names = names
+        self.none = beyond(observed.standing(), parts, names)
+
+    def no_effect(self, rests: bool) -> Hypothesis:
+        """What the twin has and nothing else; with `rests` the laws of that may leave a rest."""
+        plain = Hypothesis(effects=(), probability=0.0, log_evidence=self.none.allowed)
+        if not (rests and self._observed.given):
+            return plain
+        return self._weighed(replace(plain, log_evidence=0.0), [], self.none.log_evidence, self.none)
+
+    def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
+        """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
+        points = [fit.point for fit in fits]
+        return self._weighed(hypothesis, points, *self.beside(points))
+
+    def _weighed(self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: Beyond) -> Hypothesis:
+        """A hypothesis with log evidence `evidence` where there is a rest `found`, and without."""
+        plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
+        with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(self.ratio(points, found)) - LOG_DENSITY
+        return replace(
+            hypothesis,
+            log_evidence=float(np.logaddexp(plain, with_rest)),
+            rest=found.place if with_rest > plain else "",
+        )
+
+    def ratio(self, points: Sequence[Point], found: Beyond) -> float:
+        """Length of a rest over that of what the laws beside it do, those of the twin's own effects among them."""
+        named = {point.curve.effect for point in points}
+        acting = [*points, *(point for point in self._observed.given if point.curve.effect not in named)]
+        moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in acting))
+        return found.length / max(moved, 1.0)
+
+    def of_another(self, single: Single) -> float:
+        """Log evidence over none of an effect that is only like one of the catalogue's."""
+        plain = log_mean_exp(
+            np.array([fit.averaged(LEVELS.of_another) for fit in single.fits if len(fit.by_level) > 1])
+        )
+        points = [single.best.at_level(LEVELS.levels[-1])]
+        evidence, found = self.beside(points, another=True)
+        evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
+        share = LEVELS.rest_of_another
+        return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
+
+    def beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
+        """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
+        effects = [point.curve.effect for point in points]
+        alone = beside = self._observed.standing(*effects)
+        for point in points:
+            beside = beside.beside(point)
+        found = beyond(beside, self._parts, self._names)
+        evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
+        evidence += found.log_evidence + sum(log_prior(point, another=another) for point in points)
+        return evidence, found
+
+
+def _of_fits(effects: tuple[str, ...], fits: Mapping[str, CurveFit], log_evidence: float) -> Hypothesis:
+    return Hypothesis(
+        effects=effects,
+        probability=0.0,
+        log_evidence=log_evidence,
+        strengths={effect: interval_of([fit]) for effect, fit in fits.items()},
+        variants={effect: fit.curve for effect, fit in fits.items()},
+        levels={effect: fit.level for effect, fit in fits.items()},
+    )
+
+
+def _singles(fits: Sequence[CurveFit]) -> dict[str, Single]:
+    """Effects by id, from the fits of their variants."""
+    by_effect: dict[str, list[CurveFit]] = {}
+    for fit in fits:
+        by_effect.setdefault(fit.curve.effect, []).append(fit)
+    return {
+        effect: Single(
+            fits=own,
+            best=max(own, key=lambda fit: fit.log_evidence),
+            log_evidence=float(log_mean_exp(np.array([fit.log_evidence for fit in own]))),
+        )
+        for effect, own in by_effect.items()
+    }

@@ -1,0 +1,153 @@
+"""What is weighed: standardised probes with what may vary beside an effect, the law of an effect that is there among it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from ..model.curves import Curve
+from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
+from .nuisances import Nuisances
+
+# of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
+FREE_SD = 1.0
+# of that of an effect which the twin has, besides its law: as far as intervals of strengths are widened for real laws
+GIVEN_SD = 0.12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """An effect at a strength, its law off by a level; the curve is in the units of the probes before any effect is taken off."""
+
+    curve: Curve
+    strength: float
+    level: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observed:
+    """A residual and its covariance.
+
+    Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
+    one factor; places (probe,), within which it is off by a share of no more than what is seen there; root (probe,): standard
+    deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still in the residual:
+    `standing` takes them off.
+    """
+
+    residual: NDArray[np.float64]
+    nuisances: Nuisances
+    groups: NDArray[np.intp]
+    places: NDArray[np.intp]
+    root: NDArray[np.float64] | None = None
+    given: tuple[Point, ...] = ()
+
+    @property
+    def units(self) -> NDArray[np.float64]:
+        """Standard deviations (probe,) of the probes in the units of the first."""
+        return np.ones(len(self.residual)) if self.root is None else self.root
+
+    @cached_property
+    def left(self) -> NDArray[np.float64]:
+        """What the nuisances leave of the residual (probe,)."""
+        return self.nuisances.solve(self.residual)
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Of the residual, but for a constant that all that come from the same probes share."""
+        squares = float(self.residual @ self.left)
+        return -0.5 * (self.nuisances.log_determinant + squares) - float(np.sum(np.log(self.units)))
+
+    @cached_property
+    def _standing(self) -> dict[frozenset[str], "Observed"]:
+        return {}
+
+    def has(self, effect: str) -> bool:
+        """Whether the twin has an effect."""
+        return bool(self._free([effect]))
+
+    def standing(self, *free: str) -> "Observed":
+        """The same with the effects that the twin has as strong as it has them, but those in `free`, which are not there."""
+        left_out = self._free(free)
+        if left_out not in self._standing:
+            found = replace(self, given=()) if self.given else self
+            for point in self.given:
+                if point.curve.effect not in left_out:
+                    found = found.beside(point, sd=GIVEN_SD)
+            self._standing[left_out] = found
+        return self._standing[left_out]
+
+    def over_none(self, *free: str) -> float:
+        """Log evidence, over all that the twin has and nothing else, of all that but the effects in `free`."""
+        return self.standing(*free).log_likelihood - self.standing().log_likelihood
+
+    def off_by(self, level: float) -> "Observed":
+        """The same with laws of the effects that the twin has off by another level."""
+        return replace(self, given=tuple(replace(point, level=level) for point in self.given))
+
+    def _free(self, effects: Sequence[str]) -> frozenset[str]:
+        return frozenset(point.curve.effect for point in self.given).intersection(effects)
+
+    def scaled(self, curve: Curve) -> Curve:
+        """A curve in the units of the first probes, in these."""
+        return curve if self.root is None else curve.over(self.root)
+
+    def widened(self, curve: Curve, strength: float, level: float, *, chance: bool = True) -> "Observed | None":
+        """The same residual where a curve's law (in these units) is off by a level at a strength; None: that moves nothing.
+
+        chance: with what the effect does by chance there, its spread; what it gives each probe by itself counts in either case.
+        """
+        effective = self.nuisances.solve(curve.response(strength))
+        effective = credible(effective, self.left, self.places)
+        law = law_factors(curve, strength, effective, self.groups, level, chance=chance)
+        own = own_variance(curve, strength, effective, self.places, level)
+        if not law and float(own.max()) < LEAST_FACTOR:
+            return None
+        root = np.sqrt(1.0 + own)
+        return replace(
+            self,
+            residual=self.residual / root,
+            nuisances=self.nuisances.over(root, law.spread, law.of_laws),
+            root=self.units * root,
+        )
+
+    def beside(self, point: Point, *, sd: float = FREE_SD) -> "Observed":
+        """What is left once an effect stands there, its strength free about that by `sd` in its logarithm, as a Gaussian."""
+        wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
+        own = wide.scaled(point.curve)
+        free = sd * slope(own, point.strength)[:, None]
+        nuisances = wide.nuisances
+        if np.any(free):
+            nuisances = nuisances.over(np.ones(len(free)), free, csc_array((0, len(free))))
+        return replace(wide, residual=wide.residual - own.response(point.strength), nuisances=nuisances)
+
+    def of_probes(self, probes: NDArray[np.bool_]) -> "Observed":
+        """Of some of its probes (probe,)."""
+        return replace(
+            self,
+            residual=self.residual[probes],
+            nuisances=self.nuisances.of_probes(probes),
+            groups=self.groups[probes],
+            places=self.places[probes],
+            root=None if self.root is None else self.root[probes],
+        )
+
+    def length(self, curve: Curve, strength: float) -> float:
+        """How far a curve (in these units) moves the probes at a strength, by its law and by chance, nuisances aside; sd."""
+        moved = curve.response(strength)[None, :]
+        if curve.spread is not None:
+            moved = np.concatenate([moved, strength * curve.spread.T])
+        squares = float(np.trace(self.nuisances.inner(moved, moved)))
+        if curve.jitter is not None:
+            squares += strength**2 * float(np.sum(curve.jitter))
+        return math.sqrt(max(squares, 0.0))
+
+
+def slope(curve: Curve, strength: float) -> NDArray[np.float64]:
+    """Change (probe,) of a response with the logarithm of the strength."""
+    step = 0.02
+    above, below = curve.response(strength * math.exp(step)), curve.response(strength * math.exp(-step))
+    return np.asarray((above - below) / (2.0 * step))

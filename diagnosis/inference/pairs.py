@@ -1,0 +1,164 @@
+"""Two effects at once, each brought to what the other leaves, in turn, until neither moves.
+
+The evidence is the chain rule's: of the first at its strength (its uncertainty as a Gaussian's), times that of the second in what
+the first leaves. Which of two is the first makes no difference where both have settled.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..model.curves import Curve
+from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral
+from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
+from .observed import FREE_SD, Observed, Point
+
+_IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
+_TURNS, _SETTLED = 6, 0.1  # in which two settle, and gain of log evidence that ends them
+_CARRIED = LEVELS.up_to(FARTHEST_LEVEL)
+_VARIANTS = 2  # of an effect beside another, the likeliest at first sight, that are fitted with all levels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Single:
+    """One effect against the probes: fits of its variants, the best of them, log evidence over none (variants averaged)."""
+
+    fits: Sequence[CurveFit]
+    best: CurveFit
+    log_evidence: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """Two effects: log evidence over none, and the fit of each beside the other, by effect."""
+
+    log_evidence: float
+    fits: Mapping[str, CurveFit]
+
+    @property
+    def effects(self) -> tuple[str, str]:
+        """The two, in alphabetical order."""
+        first, second = sorted(self.fits)
+        return first, second
+
+
+def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: int) -> list[Pair]:
+    """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
+
+    Args:
+        observed: what is weighed.
+        singles: all effects, by id.
+        leading: how many effects are the first of a pair.
+    """
+    if len(singles) < 2:
+        return []
+    curves = {name: [fit.curve for fit in single.fits] for name, single in singles.items()}
+    ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
+    seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
+    for first in ranked[:leading]:
+        best = singles[first].best
+        point = best.at_level(min(best.level, FARTHEST_LEVEL))
+        alone = _beside_first(observed, point, first)
+        for second, own in curves.items():
+            if second == first:
+                continue
+            start, beside = _beside_first(observed, point, second) if observed.has(second) else alone
+            gain = max(fit_curve(beside, beside.scaled(curve), exact=True).log_evidence for curve in own)
+            a, b = sorted((first, second))
+            if (a, b) not in seen or start + gain > seen[a, b][0]:
+                seen[a, b] = start + gain, point, second
+    likely = sorted(seen.values(), key=lambda item: -item[0])[:_IN_FULL]
+    return [_settled(observed, point, curves, other) for _, point, other in likely]
+
+
+def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Curve]], other: str) -> Pair:
+    """Two effects by turns: `other` beside a first one at its point, then the first beside the other, and so on."""
+    best, fits = -math.inf, {}
+    for turn in range(_TURNS):
+        start, beside = _beside_first(observed, point, other)
+        fit = _beside(beside, curves[other])
+        second = Point(curve=_own(curves[other], fit), strength=fit.best, level=fit.level)
+        evidence = start + log_prior(point) + fit.log_evidence
+        fits[other] = replace(fit, curve=second.curve)
+        before, best = best, max(best, evidence)
+        if turn and evidence < before + _SETTLED:
+            break
+        point, other = second, point.curve.effect
+    return Pair(log_evidence=best, fits=fits)
+
+
+def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, Observed]:
+    """What a first effect leaves to another, and its log evidence over none without the prior; neither is there by the twin."""
+    both = (point.curve.effect, other)
+    alone = observed.standing(*both)
+    beside = alone.beside(point)
+    return observed.over_none(*both) + beside.log_likelihood - alone.log_likelihood, beside
+
+
+def _own(curves: Sequence[Curve], fit: CurveFit) -> Curve:
+    """The curve of a fit, in the units before any effect is taken off."""
+    return next(curve for curve in curves if curve.variant == fit.curve.variant)
+
+
+def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
+    """The best of an effect's variants beside another, its evidence that of all variants."""
+    first = [
+        (fit_curve(beside, beside.scaled(curve), exact=True).log_evidence, number)
+        for number, curve in enumerate(curves)
+    ]
+    likely = sorted(first, reverse=True)[:_VARIANTS]
+    fits = [fit_curve(beside, beside.scaled(curves[number]), levels=_CARRIED) for _, number in likely]
+    best = max(fits, key=lambda fit: fit.log_evidence)
+    total = float(np.logaddexp.reduce([fit.log_evidence for fit in fits])) - math.log(len(curves))
+    return replace(best, log_evidence=total)
+
+
+def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
+    """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
+
+    The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
+    """
+    lengths = {effect: observed.length(fit.curve, fit.best) for effect, fit in pair.fits.items()}
+    strong, weak = sorted(lengths, key=lambda effect: -lengths[effect])
+    first = pair.fits[strong]
+    shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
+    shares = np.exp(shares - np.logaddexp.reduce(shares))
+    return strong, left_in_place(
+        observed, pair.fits[weak], lengths[strong], list(zip(shares, LEVELS.levels, strict=False))
+    )
+
+
+def left_in_place(observed: Observed, second: CurveFit, length: float, levels: Sequence[tuple[float, float]]) -> float:
+    """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
+
+    Args:
+        observed: what is weighed.
+        second: the effect's fit beside that law.
+        length: how far the law moves the probes, standard deviations.
+        levels: by which it is off, each after its probability.
+    """
+    ratios = observed.length(second.curve, second.best) / max(length, 1e-12) * second.strengths / second.best
+    least = 1.0 / max(length, 1.0)  # a standard deviation
+    density = sum(share * leak_density(ratios, level, least) for share, level in levels)
+    low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
+    top = float(second.log_likelihood.max())
+    likelihood = np.exp(second.log_likelihood - top)
+    left = float(np.trapezoid(likelihood * density, np.log(second.strengths))) + float(likelihood[0]) * low
+    there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
+    return top + math.log(max(left, 1e-300)) - there
+
+
+def log_prior(point: Point, *, another: bool = False) -> float:
+    """Log of what a point takes of the prior: how often laws (of the kind, or of `another`) are off by its level, and its strengths'.
+
+    Strengths are even in their logarithm; those about the point are as free as `Observed.beside` leaves them.
+    """
+    curve, log = point.curve, math.log
+    if curve.low <= point.strength <= curve.high:
+        density = (1.0 - IMPLAUSIBLE) / log(curve.high / curve.low)
+    else:
+        low, high = curve.reach
+        density = IMPLAUSIBLE / (log(high / low) - log(curve.high / curve.low))
+    return log_frequency(point.level, another=another) + log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)

@@ -1,0 +1,177 @@
+"""Inner parameters and strengths brought to where the probes want them, by asking the forward model again.
+
+The first weighing knows every effect at a few strengths and inner parameters only. An effect that is seen at tens of
+standard deviations would be refused for that coarseness alone; so what leads is asked again, closer and closer.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ...generator.effects.effect import Placement
+from ..model.changes import Variant
+from ..model.curves import Curve
+from .curve_fits import CurveFit
+from .discrepancy import USUAL_LEVEL
+from .inference import Hypothesis
+from .observed import Observed, Point
+from .refine_tasks import Task, tasks_of
+from .search import curve_of, searched
+from .seen import Blocks, Responder, Seen, Whitener
+
+REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
+_STARTS = 2
+_OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
+
+
+def refine(
+    hypotheses: Sequence[Hypothesis],
+    *,
+    variants: Mapping[tuple[str, str], Variant],
+    curves: Sequence[Curve],
+    observed: Observed,
+    respond: Responder,
+    whitener: Whitener,
+    blocks: Blocks | None = None,
+) -> list[tuple[Variant, NDArray[np.float64]]]:
+    """Variants nearer to what was measured than those of the grid, with their responses (strength, probe).
+
+    Args:
+        hypotheses: of the first weighing, with whitened curves.
+        variants: of the grid, by effect and name.
+        curves: of the grid, whitened.
+        observed: what is weighed, whitened.
+        respond: asks the forward model.
+        whitener: of responses.
+        blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
+    """
+    whole = Seen(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
+    refinement = _Refinement(whole, variants, curves)
+    for task in tasks_of(hypotheses):
+        refinement.run(task)
+    return refinement.found
+
+
+class _Refinement:
+    """Variants found so far; what stands beside an effect is taken as it was found last."""
+
+    def __init__(self, whole: Seen, variants: Mapping[tuple[str, str], Variant], curves: Sequence[Curve]) -> None:
+        self._whole = whole
+        self._variants = variants
+        self._curves = curves
+        self._closer: dict[str, _Closer] = {}
+        self.found: list[tuple[Variant, NDArray[np.float64]]] = []
+
+    def run(self, task: Task) -> None:
+        """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
+        seen = self._standing(task)
+        if task.beside is not None:
+            if task.moves_more and not self._clear(
+                task.beside[0].effect, seen.beside(self._where(task.effect, task.own))
+            ):
+                return
+            seen = seen.beside(self._where(task.beside[0].effect, task.beside))
+        # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
+        known = self._closer.get(task.effect) if task.moves_more else None
+        if known is not None:
+            starts = [(known.variant, seen.fit(known.curve))]
+        else:
+            clear = self._clear(task.effect, seen)
+            starts = [
+                (self._variants[task.effect, fit.curve.variant], fit)
+                for fit in _starts_of(clear, task.leads or task.beside is None)
+            ]
+            placement = EFFECTS[task.effect].placement
+            if placement is not None:
+                starts += _displaced_and_distorted(clear, self._variants, placement)
+        best: _Closer | None = None
+        for variant, fit in starts:
+            found = searched(variant, fit, seen)
+            if found is None:
+                continue
+            self.found.append(found)
+            name = fit.curve.variant if known is None else known.variant.name
+            like = next(item for item in self._curves if (item.effect, item.variant) == (variant.effect, name))
+            curve = curve_of(found[0], self._whole.own(found[1]), like)
+            there = seen.fit(curve)
+            if best is None or there.log_evidence > best.log_evidence:
+                start = replace(variant, name=name, parameters=found[0].parameters)
+                best = _Closer(start, curve, there.best, there.log_evidence)
+        if best is not None:
+            self._closer[task.effect] = best
+
+    def _standing(self, task: Task) -> Seen:
+        """What a task's effects are fitted to: the twin has its effects but these."""
+        effects = [task.effect] if task.beside is None else [task.effect, task.beside[0].effect]
+        return replace(self._whole, observed=self._whole.observed.standing(*effects))
+
+    def _where(self, effect: str, grid: tuple[Curve, float]) -> Point:
+        """An effect as it was found last, its law off as usual; that of the grid before."""
+        known = self._closer.get(effect)
+        curve, strength = grid if known is None else (known.curve, known.strength)
+        return Point(curve=curve, strength=strength, level=USUAL_LEVEL)
+
+    def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
+        """Fits of an effect's curves of the grid that show it clearly."""
+        fits = [seen.fit(curve) for curve in self._curves if curve.effect == effect]
+        return [fit for fit in fits if _separation(fit, seen) >= REFINED_FROM]
+
+
+@dataclass(frozen=True, slots=True)
+class _Closer:
+    """An effect as refinement found it: the variant of the grid with other inner parameters, its whitened curve, and its strength."""
+
+    variant: Variant
+    curve: Curve
+    strength: float
+    log_evidence: float
+
+
+def _separation(fit: CurveFit, seen: "Seen") -> float:
+    """Of a fit from none, its law taken as exact."""
+    response = fit.curve.response(fit.best)
+    return math.sqrt(max(float(response @ seen.observed.nuisances.solve(response)), 0.0))
+
+
+def _displaced_and_distorted(
+    fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant], placement: Placement
+) -> list[tuple[Variant, CurveFit]]:
+    """A displacement that shifts as the best mere shift does, and enlarges or turns as the best that does so.
+
+    From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
+    """
+    best: dict[bool, tuple[CurveFit, dict[str, float]]] = {}
+    for fit in sorted(fits, key=lambda item: item.log_evidence):
+        known = variants[fit.curve.effect, fit.curve.variant].parameters
+        parameters = {**known, "strength": fit.best}
+        best[abs(placement.parts(parameters).shift_px) > 0.5 * fit.best] = fit, parameters
+    if len(best) < 2:
+        return []
+    shift, shifted = best[True]
+    variant = variants[shift.curve.effect, shift.curve.variant]
+    parameters = placement.combined(shifted, best[False][1])
+    strength = min(max(parameters.pop("strength"), variant.low), variant.high)
+    found = replace(shift, strengths=np.array([strength]), log_likelihood=np.zeros(1))
+    return [(replace(variant, parameters=parameters, name=f"{variant.name}, distorted"), found)]
+
+
+def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
+    """The best on the grid, which is not always the one that leads furthest, and another: of the other onset if any is near.
+
+    A law as good as exact and one that is off on the grid cannot be weighed against each other: where a share of the
+    evidence speaks for either onset, both are refined. several: the second best, too, where that has the same onset.
+    """
+    ranked = sorted(fits, key=lambda item: -item.log_evidence)
+    if not ranked:
+        return []
+    first = ranked[0]
+    others = [
+        item
+        for item in ranked
+        if item.curve.since != first.curve.since and item.log_evidence > _OTHER_ONSET * first.log_evidence
+    ]
+    return [first, *(others or ranked[1 : _STARTS if several else 1])[: _STARTS - 1]]

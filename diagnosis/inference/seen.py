@@ -1,0 +1,118 @@
+"""What refinement fits an effect to: the residual less what others explain, of all series or of those that tell most."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model.changes import Variant
+from ..model.curves import Curve
+from .curve_fits import CurveFit, fit_curve
+from .discrepancy import USUAL, USUAL_LEVEL
+from .observed import Observed, Point
+
+_TELLS = 0.8  # share of what tells an effect, its law off as usual, that the series of a search hold
+_WORTH = 0.7  # share of all series' cost from which a search asks all of them
+
+
+class Responder(Protocol):
+    """Responses (strength, probe) of variants, by their place; those that cannot be asked are left out.
+
+    `wanted` (probe,) says which probes are; others may be 0.
+    """
+
+    def __call__(
+        self, asked: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
+    ) -> Mapping[int, NDArray[np.float64]]: ...
+
+
+class Whitener(Protocol):
+    """Responses with the local nuisances integrated out."""
+
+    def apply(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Series that share local nuisances: `of` (probe,) is the block of each probe, `costs` (block,) how long it takes to ask it."""
+
+    of: NDArray[np.intp]
+    costs: NDArray[np.float64]
+
+    def telling(self, tells: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+        """Probes (probe,) of the blocks that tell most for what they cost; None: nearly all are needed.
+
+        Blocks that cost less than a tenth of the dearest are always among them: they say what nuisances do.
+
+        Args:
+            tells: what each probe tells (probe,).
+        """
+        of_block = np.maximum(np.bincount(self.of, weights=tells, minlength=len(self.costs)), 0.0)
+        kept = self.costs < 0.1 * self.costs.max()
+        for block in np.argsort(-of_block / self.costs):
+            if float(of_block[kept].sum()) >= _TELLS * float(of_block.sum()):
+                break
+            kept[block] = True
+        if float(self.costs[kept].sum()) > _WORTH * float(self.costs.sum()):
+            return None
+        return np.asarray(kept[self.of])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
+
+    Fields: observed; respond: the forward model; whitener of its responses; blocks of series (None: all are asked); wanted: which of
+    all probes these are (None: all).
+    """
+
+    observed: Observed
+    respond: Responder
+    whitener: Whitener
+    blocks: Blocks | None = None
+    wanted: NDArray[np.bool_] | None = None
+
+    def beside(self, point: Point) -> "Seen":
+        """The same once another effect stands there."""
+        return replace(self, observed=self.observed.beside(point))
+
+    def where_told(self, fit: CurveFit) -> "Seen":
+        """The same of the series that tell most of a fitted curve in these units; itself where nearly all are needed."""
+        if self.blocks is None:
+            return self
+        wide, root = self.widened(fit.curve, fit.best)
+        response = fit.curve.response(fit.best) / root
+        kept = self.blocks.telling(response * wide.nuisances.solve(response))
+        if kept is None:
+            return self
+        return replace(self, observed=self.observed.of_probes(kept), blocks=None, wanted=kept)
+
+    def widened(self, curve: Curve, strength: float) -> tuple[Observed, NDArray[np.float64]]:
+        """What is seen where a curve's law (in these units) is off as usual at a strength, and its units in these (probe,)."""
+        wide = self.observed.widened(curve, strength, USUAL_LEVEL) or self.observed
+        return wide, wide.units / self.observed.units
+
+    def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
+        """Responses (strength, probe) of variants by their place, whitened and in these units."""
+        return {number: self.own(found) for number, found in self.respond(variants, wanted=self.wanted).items()}
+
+    def own(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses of all probes as the forward model gives them, whitened and in these units."""
+        whitened = self.whitener.apply(responses)
+        if self.wanted is not None:
+            whitened = whitened[:, self.wanted]
+        return np.asarray(whitened / self.observed.units)
+
+    def cut(self, curve: Curve) -> Curve:
+        """A curve of all probes, of these."""
+        return curve if self.wanted is None else curve.of_probes(self.wanted)
+
+    def fit(self, curve: Curve) -> CurveFit:
+        """A whitened curve of all probes, fitted."""
+        return self.fit_scaled(self.observed.scaled(self.cut(curve)))
+
+    def fit_scaled(self, curve: Curve) -> CurveFit:
+        """A curve in these units, fitted with its law off as usual."""
+        return fit_curve(self.observed, curve, levels=USUAL)

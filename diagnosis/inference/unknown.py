@@ -1,0 +1,163 @@
+"""What no catalogue holds: more variance in some families of probes than anything known gives them.
+
+In how many families an unknown effect shows is not known: every number of them is as likely as another. A single family that is
+off by a little is what sessions without any effect show now and then (`Chance`).
+"""
+
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .observed import Observed
+
+SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
+LOG_DENSITY = -math.log(math.log(SIZES[-1] / SIZES[0]))  # of their logarithm, where every size is as likely
+_SWEEPS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chance:
+    """One family of probes that is off where there is no effect: how often, and by how much at most (standard deviations)."""
+
+    frequency: float
+    largest: float
+
+
+def _learnt() -> Chance:
+    """As `validation/learn_discrepancy.py` left it."""
+    table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
+    return Chance(**table["chance"])
+
+
+CHANCE = _learnt()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beyond:
+    """What a residual shows beyond what may vary.
+
+    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_size (size,): log
+    evidence over none of one family that is off, by each of `SIZES`; length: root of the sum of the extra variances of all probes, in
+    standard deviations of the first probes.
+    """
+
+    log_evidence: float
+    place: str
+    length: float
+    by_size: NDArray[np.float64]
+
+    @property
+    def by_chance(self) -> float:
+        """Log evidence over none of one family that is off by as much as chance does at most."""
+        small = self.by_size[np.less_equal(SIZES, CHANCE.largest)]
+        return float(np.logaddexp.reduce(small)) - math.log(len(small))
+
+    @property
+    def allowed(self) -> float:
+        """Log evidence of no effect, one family off now and then, over that of none ever off."""
+        return float(np.logaddexp(math.log1p(-CHANCE.frequency), math.log(CHANCE.frequency) + self.by_chance))
+
+
+def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> Beyond:
+    """What a residual shows beyond what may vary, in families `parts` (probe,) of probes.
+
+    Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
+    family's tau in turn, several sweeps), its prior in it, of one family at least.
+    """
+    residual, nuisances = observed.residual, observed.nuisances
+    factors = nuisances.full()
+    members = [np.nonzero(parts == number)[0] for number in range(len(names))]
+    grams = np.stack([factors[part].T @ factors[part] for part in members])
+    sums = np.stack([factors[part].T @ residual[part] for part in members])
+    squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
+    sizes = np.array([len(part) for part in members])
+    count = int(np.count_nonzero(sizes))
+    grid = np.concatenate([[0.0], SIZES])
+    normal = np.eye(factors.shape[1]) + grams.sum(axis=0)
+    tau2 = np.zeros(len(members))
+    alone = np.full((len(members), len(grid)), -np.inf)
+    base, best = 0.0, -math.inf
+    for sweep in range(_SWEEPS):
+        changed = False
+        for g, part in enumerate(members):
+            if not len(part):
+                continue
+            weights = 1.0 / (1.0 + tau2)
+            weights[g] = 0.0
+            without = normal - grams[g] / (1.0 + tau2[g])
+            rest: NDArray[np.float64] = np.asarray(np.linalg.cholesky(without))
+            found = _at_each(1.0 / (1.0 + grid**2), rest, weights @ sums, factors[part], residual[part])
+            weights[g] = 1.0
+            found += 0.5 * float(sizes @ np.log(weights) - (weights @ squares - squares[g]))
+            others = int(np.count_nonzero(np.delete(tau2, g)))
+            if sweep == 0 and not others:
+                base = float(found[0])
+                alone[g] = found
+            found = found + _price(others, count)
+            found[1:] += _price(others + 1, count) - _price(others, count)
+            at = int(np.argmax(found))
+            changed |= bool(grid[at] ** 2 != tau2[g])
+            tau2[g] = grid[at] ** 2
+            normal = without + grams[g] / (1.0 + tau2[g])
+            best = float(found[at])
+        if not changed:
+            break
+    own = alone[:, 1:] - base
+    if not np.any(tau2):
+        best = float(own.max()) + _price(1, count) + base
+        place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
+    else:
+        place = int(np.argmax(tau2 * sizes))
+    by_size = np.logaddexp.reduce(own, axis=0) - math.log(count)
+    units = observed.units
+    length = math.sqrt(
+        sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
+    )
+    return Beyond(log_evidence=best - base, place=str(names[place]), length=length, by_size=by_size)
+
+
+def _price(shown: int, count: int) -> float:
+    """Log prior of certain `shown` of `count` families at certain sizes; 0 of none, which is no such effect."""
+    if not shown:
+        return 0.0
+    ways = math.lgamma(count + 1) - math.lgamma(shown + 1) - math.lgamma(count - shown + 1)
+    return -math.log(count) - ways - shown * math.log(len(SIZES))
+
+
+def _at_each(
+    weights: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    vector: NDArray[np.float64],
+    factors: NDArray[np.float64],
+    residual: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Log likelihood (weight,) with the probes of one group counting so much, but for a constant that they do not change.
+
+    Args:
+        weights: of these probes, one over their variance (weight,).
+        rest: Cholesky factor of the precision of the nuisances that all others leave (factor, factor).
+        vector: what the others say of the nuisances (factor,).
+        factors, residual: of the group's probes (probe, factor), (probe,).
+    """
+    from scipy.linalg import solve_triangular
+
+    right = np.concatenate([factors, vector[None, :]]).T
+    solved = solve_triangular(rest, right, lower=True, check_finite=False).T
+    across, asked = solved[:-1], solved[-1]
+    values, vectors = np.linalg.eigh(across @ across.T)
+    values = np.maximum(values, 0.0)
+    own = across.T @ residual
+    # both along the eigenvectors of what the group sees of the nuisances
+    of_asked, of_own = vectors.T @ (across @ asked), values * (vectors.T @ residual)
+    grown = 1.0 + np.multiply.outer(weights, values)
+    along = of_asked + np.multiply.outer(weights, of_own)
+    explained = float(asked @ asked) + 2.0 * weights * float(asked @ own) + weights**2 * float(own @ own)
+    explained -= np.sum(weights[:, None] * along**2 / grown, axis=1)
+    determinant = 2.0 * float(np.sum(np.log(np.diag(rest)))) + np.sum(np.log(grown), axis=1)
+    spread = len(residual) * np.log(weights) - weights * float(residual @ residual)
+    return np.asarray(0.5 * (spread + explained - determinant))

@@ -1,0 +1,408 @@
+"""What a session's probes say: which hypothesis explains the gap, how well its laws fit, and what to measure next."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ...generator.line.twin import Twin
+from ..advice.next_series import best_measurement, proposal_text
+from ..advice.plan import WORTH_IT, best_repeat, repeat_text
+from ..inference.curve_fits import CurveFit, fit_effects
+from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS
+from ..inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from ..inference.local_nuisances import LocalNuisances
+from ..inference.nuisances import Nuisances
+from ..inference.observed import Observed
+from ..inference.refine import refine
+from ..inference.whitening import Whitening
+from ..model.curves import Curve
+from ..problem.known_effects import with_found
+from ..problem.problem import Problem
+from .answer import Cause, Diagnosis, Place
+from .held_out import held_out
+from .strengths import applied_at_best, strength_of
+
+EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from which it is named as the explanation
+_WORST_PLACES = 30
+_MUCH = 0.5  # of the gap that an effect removes to be listed, though an unknown one is likelier
+_WORTH_LISTING = 0.02  # probability of an effect that is neither named nor tied
+SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
+STRAINED_FROM = 5.0  # prior standard deviations
+_OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
+
+
+def judge(
+    problem: Problem,
+    twin: Twin,
+    *,
+    rng: np.random.Generator,
+    priors: Priors | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """The answer to an assembled problem."""
+    tell = progress or (lambda stage: None)
+    weighed = weigh_problem(problem, priors=priors, tell=tell)
+    problem = weighed.problem
+    nuisances = LocalNuisances(problem.factors, problem.blocks)
+    verdict = verdict_of(weighed.hypotheses)
+    tell("held-out data")
+    gap, by_axis, shares = held_out(problem, verdict.leading, rng)
+    leading, named = verdict.leading, verdict.named
+    likeliest = _likeliest_known(problem, verdict, rng)
+    marginal = _by_effect(verdict.hypotheses)
+    added = tuple(applied_at_best(problem, leading, effect) for effect in named)
+    ambiguous = verdict.word == "ambiguous"
+    beside = replace(problem, residual=_left(problem, leading))
+    return Diagnosis(
+        verdict=verdict.word,
+        hypotheses=verdict.hypotheses,
+        causes=_causes(problem, verdict, shares | likeliest, _places(beside, nuisances)),
+        probability_no_gap=next((item.probability for item in verdict.hypotheses if not item.effects), 0.0),
+        probability_unknown=marginal.get(UNKNOWN, 0.0),
+        unknown_location=next((item.location for item in verdict.hypotheses if item.effects == (UNKNOWN,)), ""),
+        where=_places(problem, nuisances),
+        threshold_z=_threshold(len(problem.residual)),
+        gap=gap,
+        held_out=by_axis,
+        ambiguous_with=_indistinct(verdict.tied) if ambiguous else (),
+        next_measurement=_next_measurement(problem, verdict.tied, rng) if ambiguous else None,
+        twin=replace(twin, effects=with_found(twin.effects, added)),
+        added=added,
+        named=named,
+        problem=problem,
+        warnings=tuple(problem.skipped),
+        notes=(*_beyond_plausible(leading), *_of_another_strength(problem, verdict)),
+        not_tested=weighed.out_of_reach,
+        strained=_strained(problem, leading, nuisances),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weighed:
+    """Hypotheses, most probable first, and what they were weighed with.
+
+    Fields: problem, with what was refined; hypotheses; out_of_reach: effects that it could not show, and why; observed, whitened, and
+    the fits of every curve to it.
+    """
+
+    problem: Problem
+    hypotheses: tuple[Hypothesis, ...]
+    out_of_reach: dict[str, str]
+    observed: Observed
+    fits: Sequence[CurveFit]
+
+
+def weigh_problem(
+    problem: Problem, *, priors: Priors | None = None, tell: Callable[[str], None] = lambda stage: None
+) -> Weighed:
+    """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
+    tell("hypotheses")
+    whitening = Whitening(problem.factors, problem.blocks)
+    had = [point.curve.effect for point in problem.given]
+    given = whitening.curves([point.curve for point in problem.given])
+    observed = Observed(
+        residual=whitening.apply(problem.residual_without(had)[None, :])[0],
+        nuisances=Nuisances(whitening.factors),
+        groups=problem.groups,
+        places=problem.places,
+        given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
+    )
+    whitened = whitening.curves(problem.curves)
+
+    fits = fit_effects(observed, whitened)
+
+    def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, rests: bool) -> tuple[Hypothesis, ...]:
+        return weigh_hypotheses(
+            seen,
+            parts=problem.parts,
+            part_names=problem.part_names,
+            priors=priors,
+            of_catalogue=len(EFFECTS),
+            rests=rests,
+        )
+
+    first = weigh([(observed, fits)], rests=False)
+    tell("refinement")
+    closer = refine(
+        first,
+        variants={(item.effect, item.name): item for item in problem.variants},
+        curves=whitened,
+        observed=observed,
+        respond=problem.respond,
+        whitener=whitening,
+        blocks=problem.asked_in_blocks,
+    )
+    if closer:
+        problem = problem.with_variants(closer)
+        whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
+        fits = fit_effects(observed, whitened)
+    tell("all hypotheses")
+    seen = [(observed, fits)]
+    if observed.given:
+        levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
+        seen = [(one, fit_effects(one, whitened)) for one in levels]
+    hypotheses = weigh(seen, rests=True)
+    problem = problem.released()
+    own = {(curve.effect, curve.variant): curve for curve in problem.curves}
+    return Weighed(
+        problem=problem,
+        hypotheses=tuple(
+            replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
+            for item in hypotheses
+        ),
+        out_of_reach=_out_of_reach(problem, whitened, observed),
+        observed=observed,
+        fits=fits,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """One of VERDICTS, all hypotheses, the one that leads, and those that are tied with it."""
+
+    word: str
+    hypotheses: tuple[Hypothesis, ...]
+    leading: Hypothesis
+    tied: tuple[Hypothesis, ...] = ()
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Effects of the leading hypothesis; none where it is the unknown one."""
+        return () if self.leading.effects == (UNKNOWN,) else tuple(self.leading.effects)
+
+
+def verdict_of(hypotheses: tuple[Hypothesis, ...]) -> Verdict:
+    """What hypotheses, most probable first, amount to before held-out data are asked."""
+    # an effect that nearly every likely hypothesis holds is named, whatever companions it is offered with
+    core = {effect for effect, value in _by_effect(hypotheses).items() if effect != UNKNOWN and value >= EXPLAINED_FROM}
+    leading = next((item for item in hypotheses if core and set(item.effects) == core), hypotheses[0])
+    tied: list[Hypothesis] = []
+    if not leading.effects:
+        word = "no_gap"
+    elif leading.effects == (UNKNOWN,):
+        word = "unknown_effect"
+    elif core == set(leading.effects):
+        word = "explained_in_part" if leading.rest else "explained"
+    else:
+        total = 0.0
+        for item in hypotheses:
+            if item.effects and item.effects != (UNKNOWN,):
+                tied.append(item)
+            total += item.probability
+            if total > 0.9 and len(tied) > 1:
+                break
+        several = len({effect for item in tied for effect in item.effects}) > 1
+        word = "ambiguous" if several else "explained"
+    return Verdict(word=word, hypotheses=hypotheses, leading=leading, tied=tuple(tied))
+
+
+def _indistinct(tied: Sequence[Hypothesis]) -> tuple[tuple[str, str], ...]:
+    """Pairs of effects of which one stands in the other's place in hypotheses that are tied."""
+    return tuple(
+        sorted(
+            {
+                (min(a, b), max(a, b))
+                for first in tied
+                for second in tied
+                for a in first.effects
+                for b in second.effects
+                if a != b
+                and not (set(first.effects) <= set(second.effects) or set(second.effects) <= set(first.effects))
+            }
+        )
+    )
+
+
+def _likeliest_known(
+    problem: Problem, verdict: Verdict, rng: np.random.Generator
+) -> dict[str, tuple[float, float, float]]:
+    """How far the likeliest effect of the catalogue shrinks the gap where an unknown one is likelier; empty elsewhere."""
+    known = next((item for item in verdict.hypotheses if len(item.effects) == 1 and item.effects != (UNKNOWN,)), None)
+    if verdict.word != "unknown_effect" or known is None:
+        return {}
+    return {effect: found for effect, found in held_out(problem, known, rng)[2].items() if found[0] > _MUCH}
+
+
+def _causes(
+    problem: Problem,
+    verdict: Verdict,
+    shares: Mapping[str, tuple[float, float, float] | None],
+    left: tuple[Place, ...],
+) -> tuple[Cause, ...]:
+    """Effects that are named, tied or not out of the question, most probable first.
+
+    shares: how far each shrinks the gap; left: where what is named leaves most.
+    """
+    marginal = _by_effect(verdict.hypotheses)
+    marginal.pop(UNKNOWN, None)
+    named = verdict.named
+    listed = {*named, *(effect for item in verdict.tied for effect in item.effects)}
+    order = [*named, *sorted((item for item in marginal if item not in named), key=lambda item: -marginal[item])]
+    causes = []
+    for effect in order:
+        if effect not in listed and marginal[effect] < _WORTH_LISTING and effect not in shares:
+            continue
+        # of what is named, as it stands in the explanation that leads
+        best = next(item for item in (verdict.leading, *verdict.hypotheses) if effect in item.effects)
+        curve = best.variants[effect]
+        variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+        causes.append(
+            Cause(
+                effect=effect,
+                probability=min(marginal[effect], 1.0),
+                strength=strength_of(problem, best, effect),
+                unit=EFFECTS[effect].strength.unit,
+                parameters=dict(curve.parameters),
+                sign=variant.sign,
+                since=variant.since,
+                shrinks_by=shares.get(effect),
+                level=best.levels.get(effect, 0.0),
+                left=left if effect in named else (),
+            )
+        )
+    return tuple(sorted(causes, key=lambda item: -item.probability))
+
+
+def _places(problem: Problem, nuisances: LocalNuisances) -> tuple[Place, ...]:
+    """Probes that depart beyond `_threshold` once the nuisances took their part, the farthest first."""
+    z = nuisances.given_others(problem.residual)
+    threshold = _threshold(len(problem.residual))
+    return tuple(
+        Place(
+            axis=problem.names[index].axis,
+            series=problem.views[problem.series_of[index]].session.name,
+            statistic=problem.names[index].statistic,
+            location=problem.names[index].location,
+            unit=problem.names[index].unit,
+            z=float(z[index]),
+        )
+        for index in np.argsort(-np.abs(z))[:_WORST_PLACES]
+        if abs(z[index]) > threshold
+    )
+
+
+def _by_effect(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
+    """Probability of each effect over all hypotheses that hold it."""
+    result: dict[str, float] = {}
+    for hypothesis in hypotheses:
+        for effect in hypothesis.effects:
+            result[effect] = result.get(effect, 0.0) + hypothesis.probability
+    return result
+
+
+def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
+    """What to say of effects that are weaker or stronger than their plausible range."""
+    notes = []
+    for effect, curve in leading.variants.items():
+        known, value = EFFECTS[effect].strength, leading.strengths[effect][0]
+        if not curve.low <= value <= curve.high:
+            side = "weaker" if value < curve.low else "stronger"
+            notes.append(
+                f"{effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
+                " strength was given little weight beforehand"
+            )
+    return tuple(notes)
+
+
+def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
+    """What to say of effects that the twin has and that are named: how strong the session shows them."""
+    notes = []
+    for point in problem.given:
+        effect = point.curve.effect
+        if effect in verdict.named:
+            value, low, high = (one / point.strength for one in strength_of(problem, verdict.leading, effect))
+            notes.append(
+                f"the twin has {effect}, and this session shows {value:.2f} ({low:.2f} to {high:.2f}) times as much of it"
+            )
+    return tuple(notes)
+
+
+def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
+    """What the leading explanation leaves of the residual (probe,)."""
+    return problem.left_by(
+        {effect: (curve, leading.strengths[effect][0]) for effect, curve in leading.variants.items()}
+    )
+
+
+def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
+    """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
+    found = zip(problem.factor_names, nuisances.fitted(_left(problem, leading)), strict=True)
+    far = [
+        (name, float(value))
+        for name, value in found
+        if abs(value) > STRAINED_FROM and not name.startswith(_OF_RENDERING)
+    ]
+    return tuple(sorted(far, key=lambda item: -abs(item[1])))
+
+
+def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed) -> dict[str, str]:
+    """Effects that the session could not show at their largest plausible strength, each with the reason."""
+    farthest: dict[str, tuple[float, float]] = {}
+    for curve in curves:
+        length = observed.length(curve, curve.high)
+        if length >= farthest.get(curve.effect, (-1.0, 0.0))[0]:
+            farthest[curve.effect] = (length, curve.high)
+    found = dict(problem.missing_effects)
+    for effect, (length, high) in farthest.items():
+        if length < SEEN_FROM:
+            found[effect] = (
+                f"at {high:g} {EFFECTS[effect].strength.unit}, the largest plausible, it would lie {length:.1f} standard"
+                " deviations from nothing in these series"
+            )
+    return {effect: found[effect] for effect in EFFECTS if effect in found}
+
+
+def _next_measurement(
+    problem: Problem, tied: Sequence[Hypothesis], rng: np.random.Generator
+) -> Mapping[str, Any] | None:
+    """What to measure to tell the two likeliest explanations apart, found from the forward model and its noise.
+
+    A series taken again where that settles it, else the measurement that the session lacks which does.
+    """
+    if len(tied) < 2:
+        return None
+    first, second = (
+        {effect: (item.variants[effect], item.strengths[effect][0]) for effect in item.effects} for item in tied[:2]
+    )
+    answer: dict[str, Any] = {"separates": sorted({effect for item in tied[:2] for effect in item.effects})}
+    found, other = best_repeat(problem, first, second), None
+    if found is None or found.separation_then < WORTH_IT:
+        planned = best_measurement(problem, first, second, rng=rng)
+        if planned is not None and (planned.separation_then >= WORTH_IT or found is None):
+            return answer | {
+                "text": proposal_text(planned, tied[0].effects, tied[1].effects),
+                "measurement": planned.measurement.name,
+                "measure": [item.as_dict() for item in planned.measurement.series],
+                "separation": planned.separation,
+                "separation_then": planned.separation_then,
+            }
+        if planned is not None and _all_later(problem, (*first.values(), *second.values())):
+            other = planned.measurement.text, planned.separation_then
+    if found is None:
+        return None
+    return answer | {
+        "text": repeat_text(found, tied[0].effects, tied[1].effects, other=other),
+        "series": found.series,
+        "separation": found.separation,
+        "separation_then": found.separation_then,
+    }
+
+
+def _all_later(problem: Problem, curves: Sequence[tuple[Curve, float]]) -> bool:
+    """Whether curves (with strengths) all stand for effects that set in after the calibration."""
+    named = {(curve.effect, curve.variant) for curve, _ in curves}
+    return all(item.since == "calibration" for item in problem.variants if (item.effect, item.name) in named)
+
+
+def _threshold(probes: int) -> float:
+    """The |z| that the largest of so many Gaussian probes, however correlated, exceeds in at most 5 % of sessions without a gap.
+
+    Source: Sidak (1967), doi:10.1080/01621459.1967.10482935.
+    """
+    from scipy.special import ndtri
+
+    return float(-ndtri(0.5 * (1.0 - 0.95 ** (1.0 / probes))))

@@ -1,0 +1,183 @@
+"""How strong an effect is: from the fit, or from where a session shows outright what its strength means."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.frames.series import with_conditions
+from ..inference.curve_fits import fit_curve
+from ..inference.discrepancy import USUAL
+from ..inference.inference import Hypothesis
+from ..inference.nuisances import Nuisances
+from ..inference.observed import Observed
+from ..problem.assemble import map_changes
+from ..problem.output_course import rms_about_mean
+from ..problem.problem import Problem, SeriesView
+from ..session.even_maps import Map, mean_over
+
+_NODES = 800
+_BEYOND_NODES = 2.0  # times the outermost strengths asked
+_MOST_MOVED = 0.01  # of a series' level, by an effect beside a drifting output: its law is known to a tenth of that
+_NOISIEST = (
+    0.01  # of its level: noise of a frame's mean, beyond which (behind opaque objects) it tells nothing of the output
+)
+_LEAST_SERIES = 5
+_LEAST_OPEN = 0.02  # share of the field that lies open in a series whose level tells of the output
+_NEAR_PX = 6  # from an object's outline: where it may really lie, and what its edge spreads
+
+
+def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> AppliedEffect:
+    """The effect as a hypothesis has it, in this session, with the strength that fits all probes best.
+
+    A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
+    """
+    strength = hypothesis.strengths[effect][0]
+    if EFFECTS[effect].reading.frame_levels:
+        strength = strength_of(problem, hypothesis, effect)[0]
+    return replace(_applied(problem, hypothesis, effect, strength), law_sd=hypothesis.levels[effect])
+
+
+def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
+    curve = hypothesis.variants[effect]
+    variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+    return with_conditions(variant.applied(strength), problem.conditions)
+
+
+def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
+    """Value and 95 % interval, with what real effects depart from the catalogue's laws and definitions of strength.
+
+    Where the session shows what the strength means, it is read from there, whatever the rest of the law asks for.
+    """
+    curve, reading = hypothesis.variants[effect], EFFECTS[effect].reading
+    found = None
+    if reading.frame_levels:
+        found = _output_rms(problem, hypothesis, effect)
+    elif reading.sd is not None and curve.exact is not None and bool(curve.exact.any()):
+        found = _outright(problem, hypothesis, effect)
+    value, low, high = hypothesis.strengths[effect] if found is None else found
+    sd = reading.law_sd if found is None or reading.sd is None else reading.sd
+    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
+    return value, value * math.exp(-below), value * math.exp(above)
+
+
+def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
+    """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
+    curve = hypothesis.variants[effect]
+    exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
+    others = {
+        other: (hypothesis.variants[other], hypothesis.strengths[other][0])
+        for other in hypothesis.effects
+        if other != effect
+    }
+    left = problem.left_by(others, without=[effect])[exact]
+    lowest, highest = curve.reach
+    if len(curve.strengths) > 1:
+        # a refined curve is known about its nodes: far from them its cubics may come back to what was measured
+        lowest = max(lowest, float(curve.strengths.min()) / _BEYOND_NODES)
+        highest = min(highest, float(curve.strengths.max()) * _BEYOND_NODES)
+    strengths = np.geomspace(lowest, highest, _NODES)
+    responses = curve.weights(strengths) @ curve.responses[:, exact]
+    distance = np.sum((left - responses) ** 2, axis=1)
+    at = int(np.argmin(distance))
+    near = distance < distance[at] + 1.96**2
+    if at in (0, len(strengths) - 1):
+        return None
+    return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
+
+
+def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[float, float, float] | None:
+    """Rms of the output over the lit frames, %, about their mean; None: beside another effect hardly any level is known.
+
+    Slow and fast parts of an output that wanders are no one law, but every frame tells its own level. Levels of the calibrating
+    series went into the twin, so the mean over the session says nothing of the output.
+    """
+    others = [effect for effect in hypothesis.effects if effect != output]
+    since = hypothesis.variants[output].since == "calibration"
+    signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
+    noises = [_noise_of_a_frame(view) for view in problem.views]
+    fields = [_open_field(view) for view in problem.views]
+    lit = [
+        number
+        for number, view in enumerate(problem.views)
+        if view.session.request.beam_on
+        and not (since and view.session.calibrates)
+        and noises[number] < (_NOISIEST * signals_DN[number]) ** 2
+        and np.count_nonzero(fields[number]) > _LEAST_OPEN * fields[number].size
+    ]
+    moved = np.zeros(len(problem.views))
+    if others:
+        applied = [_applied(problem, hypothesis, effect, hypothesis.strengths[effect][0]) for effect in others]
+        changes = map_changes(problem, applied)
+        for number in lit:
+            moved[number] = _relative(problem.views[number], changes[number], fields[number])
+        lit = [number for number in lit if abs(moved[number]) < _MOST_MOVED]
+    if len(lit) < _LEAST_SERIES:
+        return None
+    levels, courses, noise = [], [], []
+    for number in lit:
+        view, signal_DN = problem.views[number], signals_DN[number]
+        levels.append(_relative(view, view.residual_DN, fields[number]) - moved[number])
+        courses.append(view.summary.frame_mean_DN / signal_DN)
+        noise.append(noises[number] / signal_DN**2)
+    rms = rms_about_mean(levels, courses, noise)
+    return None if rms <= 0.0 else (100.0 * rms, 100.0 * rms, 100.0 * rms)
+
+
+def _open_field(view: SeriesView) -> NDArray[np.bool_]:
+    """Compared pixels (row, column) that no object covers: behind one its thickness is as uncertain as the output drifts."""
+    request = view.session.request
+    if not request.thickness_mm:
+        return view.mask
+    from scipy.ndimage import binary_dilation
+
+    covered = np.zeros(view.mask.shape, dtype=bool)
+    for thickness_mm in request.thickness_mm.values():
+        covered |= np.asarray(thickness_mm) > 0.0
+    return np.asarray(view.mask & ~binary_dilation(covered, iterations=_NEAR_PX))
+
+
+def _relative(view: SeriesView, change_DN: Map, field: NDArray[np.bool_]) -> float:
+    """Mean of a change over a part of the field (row, column), relative to the signal there."""
+    return mean_over(change_DN, field) / mean_over(view.signal_DN, field)
+
+
+def _noise_of_a_frame(view: SeriesView) -> float:
+    """Variance of a frame's mean over the pixels, DN^2, that is no common factor."""
+    pixels = int(np.count_nonzero(view.mask))
+    return mean_over(view.noise_DN**2, view.mask) * view.summary.frames / max(pixels, 1)
+
+
+def strengths_on(
+    problem: Problem, leading: Hypothesis, effects: Sequence[str], fit: NDArray[np.bool_]
+) -> dict[str, float]:
+    """Strengths fitted on part of the probes; with two effects, one after the other, three rounds."""
+    strengths = {effect: leading.strengths[effect][0] for effect in effects}
+    if not effects:
+        return strengths
+    # in the probes as they are: whitened ones gave a heel of 5 % a strength on half of a session that left three times the gap
+    had = [point.curve.effect for point in problem.given]
+    part = Observed(
+        residual=problem.residual_without(had)[fit],
+        nuisances=Nuisances(problem.factors[fit]),
+        groups=problem.groups[fit],
+        places=problem.places[fit],
+        given=tuple(
+            replace(point, curve=point.curve.of_probes(fit))
+            for point in problem.given
+            if point.curve.effect not in effects
+        ),
+    )
+    for _ in range(3 if len(effects) > 1 else 1):
+        for effect in effects:
+            curve = leading.variants[effect]
+            if curve.by_chance_alone:
+                continue  # the strength is that of all probes
+            others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
+            rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
+            own = rest.scaled(replace(curve.of_probes(fit), spread=None))
+            strengths[effect] = fit_curve(rest, own, levels=USUAL).best
+    return strengths

@@ -1,0 +1,211 @@
+"""What the calibrating series make of dark and gain map: how each adds to them, and the noise that they leave there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ...generator.line.twin import Twin
+from ..probes.fixed_pattern import smooth_part
+from ..session.even_maps import full_size, mean_over
+from ..session.session import SessionSeries
+from ..session.summaries import FirstLook
+
+_LEAST_GAIN = 0.05  # of a pixel in use
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibratedDarks:
+    """Darks as the calibrating series show them; the twin's where there are none.
+
+    Fields: twin; weights: of each calibrating dark in the dark of an exposure (ms), by name; means_DN (row, column),
+    white_DN2 (row, column or 1, 1; of one frame) and frames of the calibrating darks, by name.
+    """
+
+    twin: Twin
+    weights: dict[float, dict[str, float]]
+    means_DN: Mapping[str, NDArray[np.float64]]
+    white_DN2: Mapping[str, NDArray[np.float64]]
+    frames: Mapping[str, int]
+
+    def under(self, item: SessionSeries) -> NDArray[np.float64]:
+        """Dark (row, column), DN, that is subtracted from a series; 0 where the series had it subtracted before."""
+        if "offset" in item.series.corrected:
+            return np.zeros(self.twin.maps.shape)
+        weights = self.weights[exposure_of(item)]
+        if not weights:
+            return np.asarray(self.twin.maps.dark_at(item.series.exposure_ms), dtype=np.float64)
+        result = np.zeros(self.twin.maps.shape)
+        for name, weight in weights.items():
+            result += weight * self.means_DN[name]
+        return result
+
+    def weights_under(self, item: SessionSeries) -> Mapping[str, float]:
+        """Weight of each calibrating dark, by name, in the dark that is subtracted from a series."""
+        return {} if "offset" in item.series.corrected else self.weights[exposure_of(item)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibratedMaps:
+    """Dark and gain map.
+
+    Fields: darks; gain (row, column): what the calibrating flats show over what the smooth model expects; shares: of each
+    calibrating flat in it, by name (none: the twin's gain map); beams (row, column): what the twin's flats of a series' beam
+    show over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
+    gain, correlated as quanta are, and white; gain_darks: change of the gain, 1/DN, when a calibrating dark is brighter, by
+    name: what is subtracted from a series as bright as the calibrating flats was subtracted from these as well; good (row,
+    column): pixels in use; frames of the calibrating flats, by name.
+    """
+
+    darks: CalibratedDarks
+    gain: NDArray[np.float64]
+    shares: dict[str, float]
+    beams: Mapping[str, NDArray[np.float64]]
+    gain_quantum: float
+    gain_white: float
+    gain_darks: Mapping[str, float]
+    good: NDArray[np.bool_]
+    frames: Mapping[str, int]
+
+    def dark_noise(self, item: SessionSeries, signal_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance, DN^2, that noise of the calibrating darks gives a pixel of a corrected mean frame, through the gain map as well.
+
+        signal_DN: of the series, of any shape, which the result has.
+        """
+        under = self.darks.weights_under(item)
+        divided = item.request.beam_on and "gain" not in item.series.corrected
+        total = np.zeros(np.shape(signal_DN))
+        for name, white_DN2 in self.darks.white_DN2.items():
+            variance = mean_over(white_DN2, self.good) / self.darks.frames[name]
+            own, divisor = under.get(name, 0.0), self.gain_darks[name] if divided else 0.0
+            if own or divisor:
+                total += (own + divisor * signal_DN) ** 2 * variance
+        return total
+
+    def corrected(self, item: SessionSeries, mean_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A series' mean frame (row, column) less the dark and over the gain map, DN."""
+        measured = mean_DN - self.darks.under(item)
+        if item.request.beam_on and "gain" not in item.series.corrected:
+            measured = measured / np.where(self.good, self.gain, 1.0)
+            if item.name in self.beams:
+                measured = measured / self.beams[item.name]
+        return measured
+
+
+def exposure_of(item: SessionSeries) -> float:
+    """Exposure in ms by which a series' dark is known; 0 where it is not stated."""
+    return item.series.exposure_ms or 0.0
+
+
+def calibrated_maps(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    looks: Mapping[str, FirstLook],
+    *,
+    twin: Twin,
+    good: NDArray[np.bool_],
+) -> CalibratedMaps:
+    """Dark and gain map from the calibrating series among those kept.
+
+    Args:
+        kept: series that can be compared.
+        expected: by the twin with all pixels alike, by name.
+        looks: mean frames and numbers of frames, by name.
+        twin: calibrated; its own maps stand in where no series calibrates.
+        good: pixels that are not known to be bad (row, column).
+    """
+    darks = [item for item in kept if item.calibrates and item.series.kind == "dark"]
+    flats = [item for item in kept if item.calibrates and item.series.kind == "flat"]
+    under = CalibratedDarks(
+        twin=twin,
+        weights={exposure: _dark_weights(darks, exposure) for exposure in dict.fromkeys(map(exposure_of, kept))},
+        means_DN={item.name: looks[item.name].mean_DN for item in darks},
+        white_DN2={item.name: expected[item.name].white_variance_DN2 for item in darks},
+        frames={item.name: looks[item.name].frames for item in darks},
+    )
+    shares = _flat_shares(flats, expected, good)
+    gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
+    quantum = white = 0.0
+    gain_darks = dict.fromkeys(under.white_DN2, 0.0)
+    for item in flats:
+        model = expected[item.name]
+        share = shares[item.name] / mean_over(model.signal_DN, good)
+        weight = share**2 / item.series.n_frames
+        quantum += weight * mean_over(model.quantum_variance_DN2, good)
+        white += weight * mean_over(model.white_variance_DN2, good)
+        for name, part in under.weights_under(item).items():
+            gain_darks[name] -= share * part
+        signal = np.maximum(full_size(model.signal_DN, good.shape), 1e-9)
+        gain += shares[item.name] * (looks[item.name].mean_DN - under.under(item)) / signal
+    return CalibratedMaps(
+        darks=under,
+        gain=gain,
+        shares=shares,
+        beams={} if flats else _beams_of_twin(twin, kept, gain, good),
+        gain_quantum=quantum,
+        gain_white=white,
+        gain_darks=gain_darks,
+        good=good & (gain > _LEAST_GAIN),
+        frames={item.name: looks[item.name].frames for item in flats},
+    )
+
+
+def _flat_shares(
+    flats: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], good: NDArray[np.bool_]
+) -> dict[str, float]:
+    """Share of each calibrating flat in the gain map: as its signal-to-noise ratio squared."""
+    weights = {}
+    for item in flats:
+        model = expected[item.name]
+        variance = mean_over(model.quantum_variance_DN2 + model.white_variance_DN2, good)
+        weights[item.name] = mean_over(model.signal_DN, good) ** 2 / max(variance, 1e-12) * item.series.n_frames
+    total = sum(weights.values())
+    return {name: value / total for name, value in weights.items()}
+
+
+def _dark_weights(darks: Sequence[SessionSeries], exposure_ms: float) -> dict[str, float]:
+    """Weights with which calibrating darks add up to the dark of an exposure; empty without darks."""
+    if not darks:
+        return {}
+    same = [item for item in darks if abs((item.series.exposure_ms or 0.0) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
+    if same:
+        frames = sum(item.series.n_frames for item in same)
+        return {item.name: item.series.n_frames / frames for item in same}
+    x = np.array([item.series.exposure_ms or 0.0 for item in darks])
+    n = np.array([item.series.n_frames for item in darks], dtype=float)
+    if np.ptp(x) <= 0:
+        return {item.name: float(w) for item, w in zip(darks, n / n.sum(), strict=True)}
+    # a straight line through the darks, evaluated at the exposure: linear in the darks
+    design = np.stack([np.ones_like(x), x], axis=1)
+    solved = np.linalg.solve(design.T @ (n[:, None] * design), design.T * n)
+    weights = np.array([1.0, exposure_ms]) @ solved
+    return {item.name: float(w) for item, w in zip(darks, weights, strict=True)}
+
+
+def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:
+    shapes = [level.flat_shape for level in twin.levels]
+    gain = np.asarray(twin.maps.gain_relative, dtype=np.float64)
+    if shapes:
+        gain = np.asarray(np.mean(np.stack(shapes), axis=0), dtype=np.float64)
+    return gain
+
+
+def _beams_of_twin(
+    twin: Twin, kept: Sequence[SessionSeries], gain: NDArray[np.float64], good: NDArray[np.bool_]
+) -> dict[str, NDArray[np.float64]]:
+    """Smooth shape (row, column) of the twin's flats of each lit series' beam over its gain map: a heel differs from beam to beam."""
+    if len(twin.levels) < 2:
+        return {}
+    in_use = good & (gain > _LEAST_GAIN)
+    shapes: dict[str, NDArray[np.float64]] = {}
+    beams = {}
+    for item in kept:
+        level = twin.level_nearest(item.request.setting) if item.request.beam_on else None
+        if level is not None:
+            if level.name not in shapes:
+                over = np.where(in_use, level.flat_shape / np.where(in_use, gain, 1.0), 1.0) - 1.0
+                shapes[level.name] = 1.0 + smooth_part(over, in_use)
+            beams[item.name] = shapes[level.name]
+    return beams

@@ -1,0 +1,140 @@
+"""Pixels that stand out of the panel and are not known to be bad: they count as outliers and are left out of all else."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ..probes.fixed_pattern import smooth_part
+from ..session.even_maps import full_size, signal_map
+from ..session.session import SessionSeries
+from ..session.summaries import LEAST_NOISE_DN2, FirstLook
+from .calibrated_maps import CalibratedMaps
+from .changes import DUST_LIMIT
+
+_OUTLYING = 8.0  # standard deviations from which a pixel stands out
+_LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
+_MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandingOut:
+    """Pixels (row, column) in use that stand out: `bad` ones, and `any`, with those that dust would explain (1 % of the light)."""
+
+    bad: NDArray[np.bool_]
+    any: NDArray[np.bool_]
+
+
+def new_outliers(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    looks: Mapping[str, FirstLook],
+    maps: CalibratedMaps,
+) -> StandingOut:
+    """Pixels in use that stand out in any dark or flat, or in all objects from some time on.
+
+    Args:
+        kept: series that can be compared.
+        expected: by the twin with all pixels alike, by name.
+        looks: mean frames and variances, by name.
+        maps: dark and gain map of the calibrating series.
+    """
+    good, shape = maps.good, maps.good.shape
+    outlying, dusty = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    for item in kept:
+        if item.series.kind not in ("dark", "flat"):
+            continue
+        look = looks[item.name]
+        residual = maps.corrected(item, look.mean_DN)
+        if item.series.kind == "flat":
+            signal = signal_map(expected[item.name], shape)
+            residual = residual - signal * float(np.median((residual / np.maximum(signal, 1e-9))[good]))
+        residual = residual - smooth_part(residual, good)
+        centre = float(np.median(residual[good]))
+        spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
+        departs = np.abs(residual - centre)
+        out = departs > _OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
+        if item.series.kind == "flat":
+            dusty |= out
+            out &= departs > DUST_LIMIT * signal_map(expected[item.name], shape)
+        outlying |= out
+        if look.frames > 9:
+            ratio = look.pair_variance_DN2 / max(float(np.median(look.pair_variance_DN2[good])), LEAST_NOISE_DN2)
+            limit = max(_largest_ratio(look.frames), 2.5)
+            if bool(np.any(ratio[good] > limit)):
+                outlying |= (ratio > limit * np.maximum(1.0, _of_lines(ratio, good))) & good
+    outlying |= _out_in_every_object(kept, expected, looks, maps)
+    # a detector full of outliers is a pattern, not a set of defects
+    bad, all_of_them = (
+        found if found.sum() < _MOST_OUTLYING * good.sum() else np.zeros(shape, dtype=bool)
+        for found in (outlying & good, (outlying | dusty) & good)
+    )
+    return StandingOut(bad=bad, any=all_of_them | bad)
+
+
+def _out_in_every_object(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    looks: Mapping[str, FirstLook],
+    maps: CalibratedMaps,
+) -> NDArray[np.bool_]:
+    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow."""
+    from scipy.ndimage import median_filter
+
+    good = maps.good
+    # a hot one stands out of the longer exposures alone
+    alike: dict[tuple[float | None, float | None], list[SessionSeries]] = {}
+    for item in kept:
+        if item.series.kind == "object" and not item.calibrates:
+            alike.setdefault((item.series.kV, item.series.exposure_ms), []).append(item)
+    found = np.zeros(good.shape, dtype=bool)
+    for members in alike.values():
+        times, scenes = np.zeros(good.shape), set()
+        for number, item in enumerate(reversed(members), start=1):
+            measured = maps.corrected(item, looks[item.name].mean_DN)
+            residual = measured - full_size(expected[item.name].signal_DN, good.shape)
+            residual = residual - median_filter(residual, size=5, mode="nearest")
+            times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
+            scenes.add(item.series.scene)
+            if len(scenes) >= _LEAST_SCENES:
+                found |= times >= _NEARLY_ALWAYS * number
+    return found
+
+
+def _of_lines(ratio: NDArray[np.floating], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Median of a map (row, column) of 1 as a rule along each pixel's row or column, the larger: noise that a line has in common."""
+    known = np.where(good, np.asarray(ratio, dtype=np.float64), 1.0)
+    rows, columns = (np.median(known, axis=axis, keepdims=True) for axis in (1, 0))
+    return np.asarray(np.maximum(rows, columns))
+
+
+@lru_cache(maxsize=64)
+def _largest_ratio(frames: int) -> float:
+    """Variance from differences of successive frames over its expectation that one pixel in ten million passes by chance."""
+    from scipy.special import gammainccinv
+
+    freedom = 2.0 * (frames - 1.0) / 3.0  # successive differences share frames
+    # upper end of chi squared
+    return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
+
+
+def memory_of(look: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:
+    """Median share of outlying pixels' variance that lasts from frame to frame, and their number; None: none is noisy."""
+    stack, pair = look.stack_variance_DN2[outlying], look.pair_variance_DN2[outlying]
+    seen = stack > 0
+    if not seen.any():
+        return None
+    return float(np.median(1.0 - pair[seen] / stack[seen])), int(np.count_nonzero(seen))
+
+
+def counting_series(kept: Sequence[SessionSeries]) -> str:
+    """The later series that pixels standing out anywhere are counted with; empty where dead or hot ones cannot show."""
+    later = [item for item in kept if not item.calibrates and item.series.kind in ("dark", "flat")]
+    if later:
+        return later[-1].name if {item.series.kind for item in later} == {"dark", "flat"} else ""
+    objects = [item for item in kept if not item.calibrates and item.series.kind == "object"]
+    return objects[-1].name if len({item.series.scene for item in objects}) >= _LEAST_SCENES else ""

@@ -1,0 +1,216 @@
+"""The base twin as series ask it, and the changes of it that a diagnosis tries: what each can move at all."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.effects.effect import Displacement, Placement
+from ...generator.frames.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
+from ...generator.line.twin import Twin
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
+from ..probes.registration import SHARP_PX
+from ..session.session import SessionSeries
+from .changes import OF_BEAMS_GROWS, TwinChange, Variant, departures_found
+
+_CACHE_BYTES = 200_000_000
+_IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
+_IN_MAPS_OF_BEAMS = "maps of beams"  # the twin's own maps hold what was always there of these
+_OBJECTS_ALONE = ("object",)
+_ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
+
+
+def draft_cache() -> ModelCache:
+    """A cache for responses: single pixels stand for maps that are the same everywhere."""
+    return ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """A change asked of the forward model.
+
+    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
+    one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
+    standard deviations; spectral: moves lit series alone.
+    """
+
+    label: str
+    twin: Twin
+    effects: tuple[AppliedEffect, ...] = ()
+    instead_of: tuple[AppliedEffect, ...] = ()
+    parameters: NDArray[np.float64] | None = None
+    step_sd: float = 1.0
+    spectral: bool = False
+
+    @classmethod
+    def of_twin(cls, step: TwinChange) -> "Change":
+        """A step in what calibration has fitted."""
+        return cls(
+            label=step.name,
+            twin=step.twin,
+            parameters=step.parameters,
+            step_sd=step.step_sd,
+            spectral=step.parameters is not None,
+        )
+
+    def touches(self, request: SeriesRequest) -> bool:
+        """Whether the change can show in a series."""
+        if not (self.effects or self.instead_of):
+            return self.spectral is False or request.beam_on
+        if any(effect.since == "always" or request.after_calibration for effect in self.instead_of):
+            return True
+        for effect in self.effects:
+            if effect.since == "calibration" and not request.after_calibration:
+                continue
+            series = EFFECTS[effect.id].shows.series
+            if request.kind in series and not (series == _OBJECTS_ALONE and self.only_displaces):
+                return True
+        return False
+
+    @property
+    def only_displaces(self) -> bool:
+        """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
+        if self._misplaced is None:
+            return False
+        lies = self._misplaced.lies
+        return math.hypot(lies.radial_px, lies.turn_px) <= _ALL_SHIFT * lies.size_px
+
+    @property
+    def displacement(self) -> dict[str, float]:
+        """Displacement (px) that the change brings to a scene's picture, by probe; empty: none."""
+        if self._misplaced is None:
+            return {}
+        lies = self._misplaced.lies
+        angle = math.radians(lies.direction_deg)
+        return {ALONG_ROWS: lies.shift_px * math.cos(angle), ALONG_COLUMNS: lies.shift_px * math.sin(angle)}
+
+    def found_in_place(self) -> "Change":
+        """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
+        misplaced = self._misplaced
+        if misplaced is None or self.only_displaces:
+            return self
+        effect = misplaced.effect
+        others = (item for item in self.effects if item is not effect)
+        rest = misplaced.placement.without_shift(effect.parameters)
+        return replace(self, effects=(*others, replace(effect, parameters=rest)))
+
+    @property
+    def _misplaced(self) -> "_Misplaced | None":
+        for effect in self.effects:
+            placement = EFFECTS[effect.id].placement
+            if placement is not None:
+                return _Misplaced(effect, placement, placement.parts(effect.parameters))
+        return None
+
+    def whenever_it_began(self, request: SeriesRequest) -> object | None:
+        """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
+        if (
+            self.instead_of
+            or len(self.effects) != 1
+            or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS
+            or not self.touches(request)
+        ):
+            return None
+        effect = self.effects[0]
+        if effect.since == "always" and any(not item.after_calibration for item in request.previous):
+            return None  # what was exposed before calibration ended remembers when it began
+        return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Misplaced:
+    """An effect that displaces scenes, and how they lie with it."""
+
+    effect: AppliedEffect
+    placement: Placement
+    lies: Displacement
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForwardModel:
+    """The base twin as the series of a session ask it.
+
+    Fields: base: the twin with all pixels alike, and the effects that it has; conditions of the session that effects know;
+    own_maps: flats of the session make the gain map, so that these, too, are asked for what was always there;
+    cache, filled by asking.
+    """
+
+    base: Twin
+    conditions: dict[str, float]
+    own_maps: bool = True
+    cache: ModelCache = field(default_factory=draft_cache)
+
+    @property
+    def sharp(self) -> bool:
+        """Whether pixels see no farther than themselves."""
+        return self.base.noise.spread.value.sigma_px < SHARP_PX
+
+    @property
+    def beams_differ(self) -> float:
+        """How many times more than usual beams may differ from the spectral model: 1 unless calibration found large departures."""
+        return 1.0 + OF_BEAMS_GROWS * (departures_found(self.base.spectral) - 1.0)
+
+    def change(self, variant: Variant, strength: float) -> Change:
+        """An effect of the catalogue at a strength, in this session; it takes the place of the same one, if the base has that."""
+        applied = with_conditions(variant.applied(strength), self.conditions)
+        return replace(self.without(variant.effect), label=variant.effect, effects=(applied,))
+
+    def without(self, effect: str) -> Change:
+        """The base twin less one of its effects; the base itself where it has not that."""
+        had = tuple(item for item in self.base.effects if item.id == effect)
+        rest = tuple(item for item in self.base.effects if item.id != effect)
+        twin = replace(self.base, effects=rest) if had else self.base
+        return Change(label=f"without {effect}", twin=twin, instead_of=had)
+
+    def expect(self, request: SeriesRequest) -> ExpectedSeries:
+        """The series as the base twin expects it.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
+        return self._asked(request, Change(label="base", twin=self.base))
+
+    def expect_changed(self, request: SeriesRequest, change: Change, unchanged: ExpectedSeries) -> ExpectedSeries:
+        """The series under a change: `unchanged` itself where the change cannot show.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
+        return self._asked(request, change) if change.touches(request) else unchanged
+
+    def expect_all(self, items: Sequence[SessionSeries]) -> tuple[dict[str, ExpectedSeries], list[str]]:
+        """The series as the base twin expects them, by name, and why others cannot be."""
+        expected: dict[str, ExpectedSeries] = {}
+        refused: list[str] = []
+        for item in items:
+            try:
+                expected[item.name] = self.expect(item.request)
+            except InputError as error:
+                refused.append(f"{item.name}: {error}")
+        return expected, refused
+
+    def _asked(self, request: SeriesRequest, change: Change) -> ExpectedSeries:
+        effects = (*change.twin.effects, *change.effects)
+        in_maps = {item.id for item in effects if EFFECTS[item.id].absorbed == _IN_MAPS_OF_BEAMS}
+        if self.own_maps and any(item.id in in_maps and item.since == "always" for item in effects):
+            acting = (item for item in effects if item.since == "always" or request.after_calibration)
+            effects = tuple(replace(item, since="calibration") if item.id in in_maps else item for item in acting)
+            request = replace(request, after_calibration=True)
+        return expected_series(
+            change.twin,
+            request,
+            effects=effects,
+            parameters=change.parameters,
+            cache=self.cache,
+            use_measured_level=False,
+        )
+
+
+def strength_rows(variants: Sequence[Variant]) -> list[range]:
+    """Where each variant's strengths lie among those of all variants one after the other."""
+    stops = np.cumsum([len(variant.strengths) for variant in variants], dtype=np.intp)
+    return [range(int(stop) - len(variant.strengths), int(stop)) for variant, stop in zip(variants, stops, strict=True)]

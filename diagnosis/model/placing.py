@@ -1,0 +1,211 @@
+"""Where scenes lie against their thickness maps, and what the model expects once they are drawn there."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries, SeriesRequest
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
+from ..probes.registration import LARGEST_PX, Placement, left_over, register, register_drawn
+from ..session.even_maps import full_size, signal_map
+from ..session.session import SessionSeries
+from . import changes as scales
+
+SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
+_Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
+_PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
+_CLOSER = 0.5  # of the displacement: what a round may add to it
+# an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
+# was found 1.5 px from where it lies with a box of that length
+_BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
+_GAUSSIANS_PX = (2.0, 3.0, 4.0, 6.0)
+_SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many blurs must leave for others to be tried
+_SEEN_PX = 0.3  # standard deviation below which a displacement is a probe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedSeries:
+    """Series with their scenes drawn where they were found.
+
+    Fields: kept, in order of time, requests displaced; expected: of these, by name; placements: of series whose scene was
+    found, by name; telling: names of the series, one a place, that tell the displacement.
+    """
+
+    kept: tuple[SessionSeries, ...]
+    expected: Mapping[str, ExpectedSeries]
+    placements: Mapping[str, Placement]
+    telling: frozenset[str]
+
+
+def place_scenes(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    pictures: Mapping[str, NDArray[np.float64]],
+    *,
+    clean: NDArray[np.bool_],
+    sharp: bool,
+    expect: Callable[[SeriesRequest], ExpectedSeries],
+) -> PlacedSeries:
+    """Registers every scene, all series of a place together.
+
+    Args:
+        kept: series that can be compared.
+        expected: by the base twin, scenes where their maps have them, by name.
+        pictures: corrected mean frames (row, column), DN, by name.
+        clean: pixels in use that do not stand out (row, column).
+        sharp: pixels see no farther than themselves.
+        expect: asks the base twin.
+    """
+    requests: dict[str, SeriesRequest] = {}
+    drawn = dict(expected)
+    placements: dict[str, Placement] = {}
+    telling: set[str] = set()
+    for members in _places(kept).values():
+        placement = _placement(members, expected, pictures, clean=clean, sharp=sharp, expect=expect)
+        if placement is None:
+            continue
+        telling.add(members[0].name)
+        for item in members:
+            placements[item.name] = placement
+            requests[item.name] = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
+            drawn[item.name] = expect(requests[item.name])
+    return PlacedSeries(
+        kept=tuple(replace(item, request=requests.get(item.name, item.request)) for item in kept),
+        expected=drawn,
+        placements=placements,
+        telling=frozenset(telling),
+    )
+
+
+def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[SessionSeries]]:
+    """Object series by where their scene stood."""
+    places: dict[tuple[str, float], list[SessionSeries]] = {}
+    for item in kept:
+        if item.series.kind == "object":
+            places.setdefault((item.series.scene, item.request.source_object_mm or 0.0), []).append(item)
+    return places
+
+
+def _placement(
+    members: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    pictures: Mapping[str, NDArray[np.float64]],
+    *,
+    clean: NDArray[np.bool_],
+    sharp: bool,
+    expect: Callable[[SeriesRequest], ExpectedSeries],
+) -> Placement | None:
+    """Where the scene of series of one place lies; None: nothing shows it, or it is nowhere near its maps."""
+    shape = clean.shape
+    seen = [pictures[item.name] for item in members]
+    noises = [
+        full_size(expected[item.name].quantum_variance_DN2 + expected[item.name].white_variance_DN2, shape)
+        / item.series.n_frames
+        for item in members
+    ]
+    pictured = [signal_map(expected[item.name], shape) for item in members]
+    found = register(seen, pictured, noises, clean)
+    if not found.found:
+        return None
+
+    def drawn(at: tuple[float, float]) -> list[NDArray[np.float64]]:
+        return [signal_map(expect(replace(item.request, displacement_px=at)), shape) for item in members]
+
+    # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
+    if sharp or members[0].request.scene_kind in SHARP_SCENES:
+        found = register_drawn(seen, drawn, noises, clean, found, whole_cells=sharp)
+    else:
+        # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
+        found, blur = _smeared(members, seen, pictured, noises, clean, found)
+        for _ in range(_PLACEMENTS):
+            rest = register(seen, blur(drawn((found.row_px, found.column_px))), noises, clean)
+            if math.hypot(rest.row_px, rest.column_px) > _CLOSER * math.hypot(found.row_px, found.column_px):
+                break  # it leads away: something else is seen than a displacement
+            found = replace(rest, row_px=found.row_px + rest.row_px, column_px=found.column_px + rest.column_px)
+    # nowhere near its maps: compared as it is, and the gap says so
+    return found if math.hypot(found.row_px, found.column_px) <= LARGEST_PX else None
+
+
+def _smeared(
+    members: Sequence[SessionSeries],
+    seen: Sequence[NDArray[np.float64]],
+    pictured: Sequence[NDArray[np.float64]],
+    noises: Sequence[NDArray[np.floating]],
+    clean: NDArray[np.bool_],
+    found: Placement,
+) -> tuple[Placement, _Blur]:
+    """Where a scene lies whose pictures are smeared by more than their slopes show, and the blur that leaves least of them.
+
+    The blur goes along the belt in proportion to the exposure, or to all sides; none, where the least of either leaves no less.
+    """
+    from scipy.ndimage import gaussian_filter, uniform_filter1d
+
+    exposures_ms = [item.request.exposure_ms for item in members]
+    # where no series says how long it was all count as equally long
+    shares = [one / max(exposures_ms) if max(exposures_ms) > 0.0 else 1.0 for one in exposures_ms]
+    axis = 1 if members[0].request.belt_axis == "column" else 0
+
+    def box(length_px: float) -> _Blur:
+        def blur(pictures: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+            # odd: an even box would move them by half a pixel
+            lengths = [max(2 * round((length_px * share - 1.0) / 2.0) + 1, 1) for share in shares]
+            return [uniform_filter1d(one, at, axis=axis) for one, at in zip(pictures, lengths, strict=True)]
+
+        return blur
+
+    def gaussian(sd_px: float) -> _Blur:
+        return lambda pictures: [gaussian_filter(one, sd_px) for one in pictures]
+
+    # smeared, it may be found far from where it lies
+    unmoved = replace(found, row_px=0.0, column_px=0.0)
+    best: tuple[Placement, _Blur, float] = found, _as_it_is, left_over(seen, pictured, clean, found)
+    for make, sizes in ((box, _BOXES_PX), (gaussian, _GAUSSIANS_PX)):
+        here = best[2]
+        tried = [make(size)(pictured) for size in sizes[:_SMEARED_SIZES]]
+        if min(left_over(seen, one, clean, at) for one in tried for at in (found, unmoved)) > _SMEARED * here:
+            continue
+        for size in sizes:
+            blur = make(size)
+            blurred = blur(pictured)
+            placed = register(seen, blurred, noises, clean)
+            rest = left_over(seen, blurred, clean, placed)
+            if rest > here:
+                break
+            here = rest
+            if here < best[2]:
+                best = placed, blur, here
+    return best[0], best[1]
+
+
+def _as_it_is(pictures: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
+    return pictures
+
+
+def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:
+    """The mask (row, column) less the border that a displaced picture does not cover."""
+    margin = 2 + math.ceil(max(abs(placement.row_px), abs(placement.column_px)))
+    covered = np.zeros_like(mask)
+    covered[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin]
+    return covered
+
+
+def displacement_probes(placement: Placement) -> list[Scalar]:
+    """The displacement as probes, px, along the axes where it is seen."""
+    return [
+        Scalar(
+            axis="sharpness",
+            name=name,
+            unit="px",
+            value=value,
+            sd=math.hypot(sd, scales.POSITION_SD_PX),
+            sampling_sd=sd,
+        )
+        for name, value, sd in (
+            (ALONG_ROWS, placement.row_px, placement.row_sd_px),
+            (ALONG_COLUMNS, placement.column_px, placement.column_sd_px),
+        )
+        if sd < _SEEN_PX
+    ]

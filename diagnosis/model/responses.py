@@ -1,0 +1,354 @@
+"""What changes of the forward model do to a session's corrected mean frames and scalar probes, calibration taking in its part."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...generator.frames.series import ExpectedSeries
+from ..probes.fixed_pattern import lines_of, pattern_noise
+from ..probes.model_scalars import expected_scalars
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS
+from ..probes.registration import Placement
+from ..probes.scalar_context import ScalarContext
+from ..session.even_maps import NOWHERE, Map, compact, mean_over
+from ..session.session import SessionSeries
+from ..session.summaries import SeriesSummary
+from ..session.usable import SeenSeries
+from .calibrated_maps import CalibratedMaps, exposure_of
+from .defects import counting_series
+from .forward_model import Change, ForwardModel
+from .placing import PlacedSeries
+
+Lines = dict[
+    str, tuple[float, float]
+]  # variance of rows and columns from frame to frame, DN^2, of each calibrating series
+Moved = tuple[
+    Map, Mapping[str, float]
+]  # change of a corrected mean frame, DN, and the scalar probes under the change, by name
+Known = dict[object, tuple[ExpectedSeries, Map, dict[str, float]]]
+_NO_DISPLACEMENT = {ALONG_ROWS: 0.0, ALONG_COLUMNS: 0.0}
+_WHOLE_LINES = 0.98  # share of the pixels in use that a series must show for noise of rows and columns
+_CODES_SHARE, _CODES_FRAMES = (
+    0.02,
+    16,
+)  # range of codes to the pixels of so many frames, at most, in which all codes occur
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesModel:
+    """One series as the base twin expects it.
+
+    Fields: session; expected; context of its scalar probes; scalars_alone: expected scalar probes by name, without what line noise
+    leaves in dark and gain map; scalars: with that; placement of its scene (None: not found); tells_displacement: its scene's
+    displacement is among its probes.
+    """
+
+    session: SessionSeries
+    expected: ExpectedSeries
+    context: ScalarContext
+    scalars_alone: dict[str, float]
+    scalars: dict[str, float]
+    placement: Placement | None
+    tells_displacement: bool
+
+    @property
+    def name(self) -> str:
+        """The series' name."""
+        return self.session.name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Absorbed:
+    """What calibration takes in of a change.
+
+    Fields: mean_DN: change of each calibrating mean frame (row, column or 1, 1), by name; scalars of these series under the change;
+    dark_DN: change of the dark by exposure (ms); gain: relative change of the gain map; lines under the change.
+    """
+
+    mean_DN: dict[str, Map] = field(default_factory=dict)
+    scalars: dict[str, dict[str, float]] = field(default_factory=dict)
+    dark_DN: dict[float, Map] = field(default_factory=dict)
+    gain: Map = field(default_factory=lambda: NOWHERE)
+    lines: Lines = field(default_factory=dict)
+
+
+@dataclass(slots=True, kw_only=True)
+class Asked:
+    """A change that a session is asked with, and what calibration took in of it; `failed` says why it cannot be asked."""
+
+    change: Change
+    absorbed: Absorbed
+    failed: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionModel:
+    """A session's series under changes of the forward model.
+
+    Fields: model; maps: dark and gain map of the calibrating series; series, in order of time; signals_DN: mean expected signal over
+    pixels that do not stand out, by name; lines_DN2: variance of rows and of columns from exposure to exposure, DN^2, that is no
+    effect.
+    """
+
+    model: ForwardModel
+    maps: CalibratedMaps
+    series: tuple[SeriesModel, ...]
+    signals_DN: Mapping[str, float]
+    lines_DN2: tuple[float, float] = (0.0, 0.0)
+
+    def usual_lines(self, item: SessionSeries) -> tuple[float, float]:
+        """Variance of rows and columns, DN^2, that a series' corrected mean frame has from noise of lines which is no effect."""
+        shares = 1.0 / (item.request.frames * item.request.exposures_per_frame)
+        if not item.calibrates:
+            weights = self.maps.darks.weights_under(item)
+            shares += sum(weight**2 / self.maps.darks.frames[name] for name, weight in weights.items())
+        return self.lines_DN2[0] * shares, self.lines_DN2[1] * shares
+
+    def ask(self, change: Change, *, refused: str = "") -> Asked:
+        """A change with what it does to the calibrating series; refused: why it is not to be asked."""
+        if refused:
+            return Asked(change=change, absorbed=Absorbed(), failed=refused)
+        try:
+            return Asked(change=change, absorbed=self._absorbed(change))
+        except InputError as error:
+            return Asked(change=change, absorbed=Absorbed(), failed=str(error))
+
+    def _absorbed(self, change: Change) -> Absorbed:
+        """What a change does to the calibrating series, and through them to darks and gain map."""
+        mean_DN: dict[str, Map] = {}
+        scalars: dict[str, dict[str, float]] = {}
+        lines: Lines = {}
+        calibrating = [one for one in self.series if one.session.calibrates]
+        for one in calibrating:
+            model = self.model.expect_changed(one.session.request, change, one.expected)
+            lines[one.name] = _lines_of_noise(model)
+            if model is one.expected:
+                mean_DN[one.name], scalars[one.name] = NOWHERE, one.scalars
+            else:
+                mean_DN[one.name] = self._moved_alone(one, model)
+                scalars[one.name] = expected_scalars(model, one.context)
+        dark_DN: dict[float, Map] = {}
+        for exposure, weights in self.maps.darks.weights.items():
+            dark = NOWHERE
+            for name, weight in weights.items():
+                dark = dark + np.float32(weight) * mean_DN[name]
+            dark_DN[exposure] = dark
+        gain = NOWHERE
+        for one in calibrating:
+            if one.session.series.kind == "flat":
+                signal = np.maximum(np.asarray(one.expected.signal_DN, dtype=np.float32), 1e-6)
+                lit = mean_DN[one.name] - dark_DN[exposure_of(one.session)]
+                gain = gain + np.float32(self.maps.shares[one.name]) * (lit / compact(signal, 1.0))
+        return Absorbed(mean_DN=mean_DN, scalars=scalars, dark_DN=dark_DN, gain=gain, lines=lines)
+
+    def _moved_alone(self, one: SeriesModel, changed: ExpectedSeries) -> Map:
+        """Change of a series' mean frame before dark and gain map, DN."""
+        scale = max(self.signals_DN[one.name], 1.0)
+        return compact(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), scale)
+
+    def moved(self, one: SeriesModel, asked: Sequence[Asked]) -> list[Moved | None]:
+        """What each change does to the corrected mean frame of a series, DN, and its scalar probes; None: it cannot be asked."""
+        known: Known = {}
+        return [self._moved(one, item, known) for item in asked]
+
+    def _moved(self, one: SeriesModel, asked: Asked, known: Known) -> Moved | None:
+        """The same of one change; known: what others do to the series' frames, by what they are whenever they began."""
+        if asked.failed:
+            return None
+        item, change, absorbed = one.session, asked.change, asked.absorbed
+        dark_shift = absorbed.dark_DN.get(exposure_of(item), NOWHERE)
+        moved: Map
+        values: Mapping[str, float]
+        if item.calibrates:
+            moved, values = absorbed.mean_DN[one.name], absorbed.scalars[one.name]
+        else:
+            shown = change if one.placement is None else change.found_in_place()
+            try:
+                changed, moved, values = self._alone(one, shown, known)
+            except InputError as error:
+                asked.failed = str(error)
+                return None
+            if item.series.kind == "afterglow" and bool(np.any(dark_shift)):
+                values = expected_scalars(changed, one.context, dark_change_DN=-dark_shift)
+        moved = moved - dark_shift
+        if one.placement is not None and change.only_displaces:
+            moved = NOWHERE
+        if item.request.beam_on and bool(np.any(absorbed.gain)):
+            moved = moved - np.asarray(one.expected.signal_DN, dtype=np.float32) * absorbed.gain
+        if not item.calibrates:
+            values = _with_lines(
+                values,
+                absorbed.lines,
+                moved,
+                item=item,
+                context=one.context,
+                maps=self.maps,
+                signals_DN=self.signals_DN,
+            )
+        if one.tells_displacement:
+            values = {**values, **_NO_DISPLACEMENT, **change.displacement}
+        return np.asarray(moved, dtype=np.float32), values
+
+    def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
+        """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
+        own = change.whenever_it_began(one.session.request)
+        if own in known:
+            return known[own]
+        changed = self.model.expect_changed(one.session.request, change, one.expected)
+        if changed is one.expected:
+            found = changed, NOWHERE, one.scalars_alone
+        else:
+            found = changed, self._moved_alone(one, changed), expected_scalars(changed, one.context)
+        if own is not None:
+            known[own] = found
+        return found
+
+
+def session_model(
+    model: ForwardModel,
+    maps: CalibratedMaps,
+    placed: PlacedSeries,
+    seen: SeenSeries,
+    summaries: Mapping[str, SeriesSummary],
+    clean: NDArray[np.bool_],
+    *,
+    lines_DN2: tuple[float, float] = (0.0, 0.0),
+) -> SessionModel:
+    """The session's series as the base twin expects them, with what their scalar probes refer to.
+
+    Args:
+        model: the base twin.
+        maps: dark and gain map of the calibrating series.
+        placed: series with their scenes drawn where they lie.
+        seen: noise labels.
+        summaries: what the frames' noise says, by name of series.
+        clean: pixels in use that do not stand out (row, column).
+        lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
+    """
+    signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
+    lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
+    counting = counting_series(placed.kept)
+    series = []
+    before: float | None = None
+    for item in placed.kept:
+        expected = placed.expected[item.name]
+        context = _context(
+            item,
+            expected,
+            maps,
+            seen,
+            clean,
+            signal_DN=signals_DN[item.name],
+            previous_DN=before,
+            code_range=summaries[item.name].code_range,
+            counts_all=item.name == counting,
+        )
+        alone = expected_scalars(expected, context)
+        tells = item.name in placed.telling
+        series.append(
+            SeriesModel(
+                session=item,
+                expected=expected,
+                context=context,
+                scalars_alone=alone,
+                scalars=_with_lines(alone, lines, NOWHERE, item=item, context=context, maps=maps, signals_DN=signals_DN)
+                | (_NO_DISPLACEMENT if tells else {}),
+                placement=placed.placements.get(item.name),
+                tells_displacement=tells,
+            )
+        )
+        if item.request.beam_on:
+            before = signals_DN[item.name]
+    return SessionModel(model=model, maps=maps, series=tuple(series), signals_DN=signals_DN, lines_DN2=lines_DN2)
+
+
+def _context(
+    item: SessionSeries,
+    expected: ExpectedSeries,
+    maps: CalibratedMaps,
+    seen: SeenSeries,
+    clean: NDArray[np.bool_],
+    *,
+    signal_DN: float,
+    previous_DN: float | None,
+    code_range: int,
+    counts_all: bool,
+) -> ScalarContext:
+    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it."""
+    in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
+    kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
+    lit_DN = np.asarray(signal_DN if lit else 0.0)
+    squared = float(lit_DN) ** 2
+    noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + float(maps.dark_noise(item, lit_DN))
+    return ScalarContext(
+        kind=kind,
+        frames=frames,
+        good=clean,
+        labels=np.where(clean, seen.labels[item.name], -1),
+        label_names=seen.label_names[item.name],
+        reference_signal_DN=max(signal_DN, 1e-9) if lit else 1.0,
+        previous_signal_DN=previous_DN,
+        calibrates=item.calibrates,
+        codes_usable=kind in ("dark", "flat")
+        and 0 < code_range < _CODES_SHARE * clean.sum() * min(frames, _CODES_FRAMES),
+        pattern_noise=pattern_noise(
+            expected, clean, frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
+        ),
+        quantum_DN2=mean_over(expected.quantum_variance_DN2, clean),
+        dark_DN=mean_over(expected.dark_DN, clean),
+        counts_all_outliers=counts_all,
+        gain=maps.gain if lit and "gain" not in item.series.corrected else None,
+        averaged=item.request.exposures_per_frame,
+        whole_lines=int(clean.sum()) > _WHOLE_LINES * in_use,
+    )
+
+
+def _lines_of_noise(model: ExpectedSeries) -> tuple[float, float]:
+    """Variance of rows and of columns from frame to frame, DN^2."""
+    return model.row_variance_DN2, model.column_variance_DN2
+
+
+def _with_lines(
+    values: Mapping[str, float],
+    lines: Lines,
+    moved: Map,
+    *,
+    item: SessionSeries,
+    context: ScalarContext,
+    maps: CalibratedMaps,
+    signals_DN: Mapping[str, float],
+) -> dict[str, float]:
+    """Scalars with what line noise leaves in dark and gain map, and what the picture that moved shows of lines.
+
+    Args:
+        values: scalar probes without that, by name.
+        lines: of the calibrating series.
+        moved: change of the corrected mean frame (row, column or 1, 1), DN.
+        item: the series.
+        context: what its scalar probes refer to.
+        maps: dark and gain map.
+        signals_DN: mean signals by name of series.
+    """
+    noise = context.pattern_noise
+    if noise.rows_DN2 is None or noise.columns_DN2 is None or FIXED_ROWS not in values:
+        return dict(values)
+    added = np.array(lines_of(moved))
+    weights = {} if "offset" in item.series.corrected else maps.darks.weights[exposure_of(item)]
+    for name, weight in weights.items():
+        added += weight**2 * np.array(lines[name]) / maps.darks.frames[name]
+    for name, share in maps.shares.items():
+        there = share * signals_DN[item.name] / max(signals_DN[name], 1e-9)
+        added += there**2 * np.array(lines[name]) / maps.frames[name]
+    of_noise = zip((FIXED_ROWS, FIXED_COLUMNS), added, (noise.rows_DN2, noise.columns_DN2), strict=True)
+    return {
+        **values,
+        **{name: 0.5 * math.log(math.exp(2.0 * values[name]) + float(one) / own) for name, one, own in of_noise},
+    }

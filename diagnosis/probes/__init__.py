@@ -1,0 +1,16 @@
+"""Numbers with known noise that frames and forward model both give.
+
+Files:
+    probes              names and axes of probes
+    map_probes          a mean frame projected on templates
+    frame_scalars       noise, times and patterns of measured frames
+    model_scalars       the same by the forward model
+    scalar_context      pixels, times and numbers that both refer to
+    fixed_pattern       patterns that stand in mean frames, and pixels that stand out
+    registration        displacement of a scene against its thickness maps
+    moving_picture      noise that a fading picture seems to add
+    noise_correlation   correlation of neighbouring pixels' noise, summed
+    lost_bits           kurtosis of rounded noise
+    _projection_loops   templates weighed by the noise, compiled
+    _moving_loops       sums over fading pictures, compiled
+"""

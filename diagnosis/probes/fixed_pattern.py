@@ -1,0 +1,194 @@
+"""Fixed patterns of mean frames: from pixel to pixel, between blocks, from line to line; and pixels that stand out.
+
+A gain map that changed pixel by pixel shows in all of them as its grain does. Lines that changed as a whole (seams of tiles,
+readout lines) show in the means of rows or columns far above what single pixels' changes leave there.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ..session.even_maps import mean_over
+from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2
+from .noise_correlation import autocovariance, correlation_sum
+
+OUTLIER_SD = 7.0
+_LEAST_BLOCKS, _LEAST_LINES = 8, 16
+_NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
+_OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
+_LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
+_LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pattern:
+    """Variances that stand in a mean frame, DN^2; None: cannot be seen.
+
+    Fields: pixel_DN2, half the mean square of differences of neighbours along rows; blocks_DN2, the same of means of blocks of
+    BLOCK_PX; rows_DN2, columns_DN2, a sixth of the mean square of second differences of the lines' means (smooth shapes leave
+    nothing there).
+    """
+
+    pixel_DN2: float
+    blocks_DN2: float | None
+    rows_DN2: float | None
+    columns_DN2: float | None
+
+
+def pattern_noise(
+    model: ExpectedSeries,
+    mask: NDArray[np.bool_],
+    frames: int,
+    map_quantum_DN2: float,
+    map_white_DN2: float,
+    *,
+    lines: bool,
+) -> Pattern:
+    """What noise alone leaves in the corrected mean frame.
+
+    map_quantum_DN2, map_white_DN2: noise that dark and gain map bring in, correlated as quanta are, and white. lines: whether
+    lines can be judged.
+    """
+    q = mean_over(model.quantum_variance_DN2, mask) / frames + map_quantum_DN2
+    w = max(mean_over(model.white_variance_DN2, mask), LEAST_NOISE_DN2) / frames + map_white_DN2
+    # fewer pixels of a line count than it has
+    rows, columns = (max(float(mask.mean()) * length, 1.0) for length in mask.shape)
+    pixel = q * (1.0 - autocovariance(model, 0, 1)) + w
+    block = (q * correlation_sum(model, BLOCK_PX, BLOCK_PX) + w) / BLOCK_PX**2
+    return Pattern(
+        pixel_DN2=pixel,
+        blocks_DN2=block,
+        rows_DN2=(q * _second_difference(model, mask.shape[1], along=1) + w) / columns if lines else None,
+        columns_DN2=(q * _second_difference(model, mask.shape[0], along=0) + w) / rows if lines else None,
+    )
+
+
+def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> float:
+    """A sixth of the variance of second differences of lines' sums over that of as many pixels without correlation."""
+    one, two, three = (
+        correlation_sum(model, *((number, length) if along == 1 else (length, number))) for number in (1, 2, 3)
+    )
+    # sums of two and three lines hold the covariances of lines one and two apart
+    next_to = two - one
+    two_apart = 1.5 * (three - one) - 2.0 * next_to
+    return one - (4.0 * next_to - two_apart) / 3.0
+
+
+def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Cubic surface (row, column) through the medians of blocks: what map probes hold, and what is no pixel's own."""
+    rows, columns = residual.shape
+    if min(rows, columns) < 5 * BLOCK_PX:
+        return np.zeros(residual.shape)
+    whole = residual[: rows - rows % BLOCK_PX, : columns - columns % BLOCK_PX]
+    inside = mask[: whole.shape[0], : whole.shape[1]]
+    part = np.where(inside, whole, np.nan).reshape(
+        whole.shape[0] // BLOCK_PX, BLOCK_PX, whole.shape[1] // BLOCK_PX, BLOCK_PX
+    )
+    filled = np.moveaxis(part, 1, 2).reshape(part.shape[0], part.shape[2], -1)
+    known = np.count_nonzero(np.isfinite(filled), axis=-1) > BLOCK_PX**2 // 2
+    if np.count_nonzero(known) < 16:
+        return np.zeros(residual.shape)
+    medians = np.nanmedian(filled[known], axis=-1)
+
+    def terms(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, x**3, y**3], axis=-1)
+
+    centre = 0.5 * (BLOCK_PX - 1)
+    block_y, block_x = (np.asarray(index * BLOCK_PX + centre, dtype=np.float64) for index in np.nonzero(known))
+    solved = np.linalg.lstsq(terms(2.0 * block_y / rows - 1.0, 2.0 * block_x / columns - 1.0), medians, rcond=None)[0]
+    y, x = np.meshgrid(2.0 * np.arange(rows) / rows - 1.0, 2.0 * np.arange(columns) / columns - 1.0, indexing="ij")
+    return np.asarray(terms(y, x) @ solved)
+
+
+def pattern_statistics(
+    residual: NDArray[np.float64],
+    signal_DN: NDArray[np.float64] | None,
+    *,
+    clean: NDArray[np.bool_],
+    good: NDArray[np.bool_],
+) -> Pattern:
+    """What stands in a flat's or dark's residual map (row, column), DN.
+
+    Args:
+        residual: measured mean frame less the model's.
+        signal_DN: expected signal of a flat (row, column); None: lines are not judged.
+        clean: pixels without those that stand out.
+        good: all pixels in use.
+    """
+    level = residual - smooth_part(residual, clean)
+    pair = clean[:, 1:] & clean[:, :-1]
+    step = (level[:, 1:] - level[:, :-1])[pair]
+    pixel = float(np.mean(step**2)) / 2.0
+    rows, columns = (side - side % BLOCK_PX for side in clean.shape)
+    part = clean[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+    weight = part.sum(axis=(1, 3))
+    values = np.where(clean, level, 0.0)[:rows, :columns].reshape(part.shape).sum(axis=(1, 3))
+    means = values / np.maximum(weight, 1)
+    # neighbouring blocks' differences: free of the smooth shapes that the map probes hold
+    across = (means[:, 1:] - means[:, :-1])[(weight[:, 1:] > 32) & (weight[:, :-1] > 32)]
+    lines: tuple[float | None, float | None] = (None, None)
+    if signal_DN is not None:
+        # a whole line that changed a little is a line, not a row of defects
+        changed = good & (np.abs(residual) < _LINE_CHANGE * signal_DN)
+        lines = _of_lines(level, clean, changed), _of_lines(level.T, clean.T, changed.T)
+    return Pattern(
+        pixel_DN2=pixel,
+        blocks_DN2=float(np.mean(across**2)) / 2.0 if across.size >= _LEAST_BLOCKS else None,
+        rows_DN2=lines[0],
+        columns_DN2=lines[1],
+    )
+
+
+def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: NDArray[np.bool_]) -> float | None:
+    """A sixth of the mean square of second differences of the means of rows, DN^2."""
+    # a stretch of defects is no line that changed: of that nearly all stands out
+    use = np.where((clean.mean(axis=1) >= _LINE_CLEAN)[:, None], clean, changed)
+    seen = use.mean(axis=1) >= 0.5
+    means = np.where(use, residual, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
+    bent = (means[2:] - 2.0 * means[1:-1] + means[:-2])[seen[2:] & seen[1:-1] & seen[:-2]]
+    return float(np.mean(bent**2)) / 6.0 if bent.size >= _LEAST_LINES else None
+
+
+def lines_of(change_DN: NDArray[np.floating]) -> tuple[float, float]:
+    """What a change of the mean frame (row, column) leaves from row to row and from column to column, DN^2, as in `Pattern`."""
+    if change_DN.size == 1:
+        return 0.0, 0.0
+    bent = (np.diff(change_DN.mean(axis=axis, dtype=np.float64), n=2) for axis in (1, 0))
+    rows, columns = (float(np.mean(one**2)) / 6.0 if one.size else 0.0 for one in bent)
+    return rows, columns
+
+
+def count_outliers(
+    residual: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    pixel_DN2: float,
+    *,
+    clean: NDArray[np.bool_],
+    good: NDArray[np.bool_],
+    least_DN: NDArray[np.float64] | None = None,
+) -> int:
+    """Good pixels of a residual map (row, column) that stand out of noise (variance, DN^2), pattern and the clean ones around.
+
+    An edge that a picture left in a residual is none of its pixels' own: beside it neighbours differ as much. least_DN (row,
+    column): departures below it make no bad pixel, such as dust on a flat.
+    """
+    level = residual - smooth_part(residual, clean)
+    limit = OUTLIER_SD * np.sqrt(variance)
+    limit = limit * max(1.0, math.sqrt(pixel_DN2 / max(float(np.mean(variance[clean])), 1e-30)))
+    if least_DN is not None:
+        limit = np.maximum(limit, least_DN)
+    out = (np.abs(level - float(np.median(level[clean]))) > limit) & good
+    if not out.any():
+        return 0
+    around = np.pad(np.where(clean, level, np.nan), _NEIGHBOURS_PX // 2, constant_values=np.nan)
+    windows = sliding_window_view(around, (_NEIGHBOURS_PX, _NEIGHBOURS_PX))[out]
+    ordered = np.sort(windows.reshape(len(windows), -1), axis=1)  # pixels that are not clean come last
+    known = np.count_nonzero(np.isfinite(ordered), axis=1)
+    places = (np.maximum(known - 1, 0) * quarter // 4 for quarter in (1, 2, 3))
+    low, middle, high = (ordered[np.arange(len(ordered)), place] for place in places)
+    beside = np.maximum(limit[out], _OUT_OF_NEIGHBOURS * (high - low))
+    return int(np.count_nonzero((known == 0) | (np.abs(level[out] - middle) > beside)))

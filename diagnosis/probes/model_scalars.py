@@ -1,0 +1,152 @@
+"""Scalar probes by the forward model."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ...generator.line.rounding import variance_before_rounding
+from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
+from .lost_bits import rounded_kurtosis
+from .moving_picture import MovingPicture, lag_loss
+from .noise_correlation import autocovariance, correlation_sum
+from .probes import FIXED_COLUMNS, FIXED_ROWS, OUTLIERS, OUTLIERS_ANYWHERE, PATTERN_PIXEL_SHARE
+from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
+
+
+def expected_scalars(
+    expected: ExpectedSeries, context: ScalarContext, *, dark_change_DN: NDArray[np.floating] | float = 0.0
+) -> dict[str, float]:
+    """The scalar probes' values by the forward model, by name; only those that this kind of series has.
+
+    dark_change_DN: what the effects changed in the dark that is subtracted (an afterglow is judged against it).
+    """
+    values: dict[str, float] = {}
+    areas = context.areas
+    profile = frame_profile(expected, areas)
+    if context.frames > 2:
+        values |= _noise_scalars(expected, context, profile)
+    profiles = time_templates(context.frames)
+    if profiles and context.kind != "afterglow":
+        scale = 1.0 if context.kind == "dark" else 1.0 / context.reference_signal_DN
+        for name, template in profiles:
+            values[f"trend {name}"] = float(profile @ template) * scale / math.sqrt(context.frames)
+    if context.kind == "afterglow" and context.previous_signal_DN:
+        profile = profile + float(areas.mean(expected.mean_DN) + areas.mean(dark_change_DN) - context.dark_DN)
+        for start, stop in afterglow_bins(context.frames):
+            values[f"afterglow frames {start}-{stop - 1}"] = (
+                float(profile[start:stop].mean()) / context.previous_signal_DN
+            )
+    if context.codes_usable:
+        values["codes"] = max(expected.quantisation_step_DN, 1.0)
+    if not context.calibrates and context.kind in ("flat", "dark"):
+        values |= _pattern_scalars(expected, context)
+    if context.counts_all_outliers:
+        values[OUTLIERS_ANYWHERE] = math.sqrt(expected.bad_pixel_share * areas.order.size + 0.375)
+    return values
+
+
+def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: NDArray[np.float64]) -> dict[str, float]:
+    """Noise by label and of whole frames: variance, correlation of neighbours, lines, blocks, times and tails.
+
+    profile: change of the mean from frame to frame (n,), DN.
+    """
+    values: dict[str, float] = {}
+    areas = context.areas
+    rows, columns = context.good.shape
+    keep = lag_loss(expected)
+    row, column = expected.row_variance_DN2, expected.column_variance_DN2
+    mean_q, label_q = areas.means(expected.quantum_variance_DN2)
+    mean_w, label_w = areas.means(expected.white_variance_DN2)
+    moving = MovingPicture.of(expected, context)
+    moved = moving.pixels()
+    total = max(mean_q * keep + mean_w + row + column + moved, LEAST_NOISE_DN2)
+    correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
+    lines = [(row if dr == 0 else 0.0) + (column if dc == 0 else 0.0) for dr, dc in LAGS]
+    for label, name in enumerate(context.label_names):
+        # an area whose pixels are brighter than others by their gain is noisier by its square
+        q, w = float(label_q[label] * context.label_gain[label]) * keep, float(label_w[label])
+        shared = moving.pixels(label)
+        here = max(q + w + row + column + shared, LEAST_NOISE_DN2)
+        variance_name, correlation_names = _noise_names(name)
+        values[variance_name] = math.log(here)
+        for known, correlation, line in zip(correlation_names, correlations, lines, strict=True):
+            values[known] = (q * correlation + shared + line) / here
+
+    def over_total(variance_DN2: float) -> float:
+        return math.log(max(variance_DN2, 1e-12) / total)
+
+    line_q = mean_q * keep
+    if context.whole_lines:
+        of_row = (row + moving.rows()) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w
+        of_column = (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w
+        values["row_ratio"], values["column_ratio"] = over_total(of_row), over_total(of_column)
+    of_block = line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX) + mean_w
+    values["block_ratio"] = over_total(of_block + BLOCK_PX * (row + column) + BLOCK_PX**2 * moved)
+    temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
+    full = max(mean_q + mean_w + row + column + moved, LEAST_NOISE_DN2)
+    for step in (1, 2):
+        correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
+        values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
+    values["kurtosis"] = _kurtosis(expected, context, full) + moving.kurtosis(expected)
+    if context.kind in ("flat", "object"):
+        quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / areas.order.size
+        quantum += row / rows + column / columns
+        # seen in steps from frame to frame
+        steps = 1.0 - float(expected.frame_factor_correlation[1])
+        wandering = steps * (expected.frame_factor_rms * context.reference_signal_DN) ** 2
+        # what is left in the traps fades in steps as well
+        fading = 0.5 * float(np.mean(np.diff(profile) ** 2))
+        values["frame_factor"] = math.log(quantum + wandering + fading)
+    return values
+
+
+def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[str, float]:
+    """What stands in the mean frame of a flat or dark that does not calibrate: pattern, its blocks and lines, outliers."""
+    values: dict[str, float] = {}
+    rows, columns = context.good.shape
+    row, column = expected.row_variance_DN2, expected.column_variance_DN2
+    signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
+    pattern = PATTERN_PIXEL_SHARE * expected.fixed_pattern_rms**2 * signal2
+    # more quanta's noise in the frames is more of it in their mean
+    mean_q, _ = context.areas.means(expected.quantum_variance_DN2)
+    added = (mean_q - context.quantum_DN2) / context.frames
+    neighbours = 1.0 - autocovariance(expected, 0, 1)
+    lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
+    noise = context.pattern_noise
+    values["fixed_pattern"] = math.sqrt(max(1.0 + (pattern + added * neighbours) / noise.pixel_DN2, 1e-3))
+    if noise.blocks_DN2 is not None:
+        of_blocks = (pattern + lasting) / BLOCK_PX**2 / noise.blocks_DN2
+        values["fixed_pattern blocks"] = math.sqrt(max(1.0 + of_blocks, 1e-3))
+    if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
+        # a pattern is no more alike along a line than across it; lines that change leave their mean
+        for name, noise_DN2, line, length in (
+            (FIXED_ROWS, noise.rows_DN2, row, columns),
+            (FIXED_COLUMNS, noise.columns_DN2, column, rows),
+        ):
+            of_lines = ((pattern + added) / length + line / context.frames) / noise_DN2
+            values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
+    # about half of the hot ones are lost in a flat's light
+    hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
+    seen = hot if context.kind == "dark" else bad - 0.5 * hot
+    values[OUTLIERS] = math.sqrt(seen * context.areas.order.size + 0.375)
+    # what bad pixels add is new in every frame
+    values["memory of outliers"] = 0.0
+    return values
+
+
+@lru_cache(maxsize=64)
+def _noise_names(label: str) -> tuple[str, tuple[str, ...]]:
+    """Names of a label's variance and of its correlation at each of LAGS."""
+    return f"log_variance {label}", tuple(f"correlation {label} ({dr},{dc})" for dr, dc in LAGS)
+
+
+def _kurtosis(expected: ExpectedSeries, context: ScalarContext, variance_DN2: float) -> float:
+    """Excess kurtosis that the ADC's steps leave in noise of a variance, rounding included."""
+    step, of_one = expected.quantisation_step_DN, context.averaged * variance_DN2
+    if step <= 0.0 or of_one > step**2:
+        return 0.0
+    before = float(variance_before_rounding(of_one, step))
+    return rounded_kurtosis(math.sqrt(before) / step, context.frames) / context.averaged

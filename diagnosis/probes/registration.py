@@ -1,0 +1,356 @@
+"""Where a scene really lies: the displacement of measured pictures against their thickness maps.
+
+A wedge or an edge is put down within fractions of a pixel, and at a sharp edge a tenth of a pixel is hundreds of standard
+deviations. So each placement of a scene is registered first, over all its series together, and pictures are compared
+where they lie; the displacement itself stays as a probe.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.spread._fine_picture import FINE
+
+# shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
+_CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
+_SETTLED_PX = 0.0005  # step below which a further one with the same share changes nothing
+LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
+_STRAY_PX = 2.0  # radius over which light that strays is taken as even
+_WEAK = 0.05
+_BEYOND_PX = 12  # of a picture's border that its splines hold
+_FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
+SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
+_DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
+_LARGEST_STEP_PX = 0.25
+_SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
+_WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
+CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
+RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """Displacement of the measured picture along rows and columns, px, with standard deviations."""
+
+    row_px: float
+    column_px: float
+    row_sd_px: float
+    column_sd_px: float
+
+    @property
+    def found(self) -> bool:
+        """Whether anything in the scene has shown where it lies."""
+        return self.row_sd_px < 0.3 or self.column_sd_px < 0.3
+
+
+def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes along rows and along columns (row, column), a pixel."""
+    along_rows, along_columns = np.gradient(np.asarray(image, dtype=np.float64))
+    return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
+
+
+def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1) -> NDArray[np.float64]:
+    """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
+
+    far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
+    else: a share of the range within some of the panel's pixels stays open; side: of the squares that the picture has for
+    pixels.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    result = np.zeros(signal_DN.shape)
+    reaches = ((reach, share) for reach, share in _FAR_SHARES if far)
+    for reach, share in ((side, RENDER_SHARE), *reaches):
+        size = 2 * math.ceil(reach / side) + 1
+        local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
+        result = np.maximum(result, share * local)
+    return np.asarray(result**2, dtype=np.float64)
+
+
+def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The image with pixels outside the mask taken from the median of their neighbours."""
+    if mask.all():
+        return np.asarray(image, dtype=np.float64)
+    rough = np.where(mask, image, float(np.median(image[mask]))).astype(np.float64)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(rough, 2, mode="symmetric"), (5, 5))
+    rough[~mask] = np.median(around[~mask], axis=(-2, -1))
+    return rough
+
+
+def _splines(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of the cubic splines through a picture that goes on beyond its borders as it ends there."""
+    from scipy.ndimage import spline_filter
+
+    return np.asarray(spline_filter(np.pad(image, _BEYOND_PX, mode="edge"), order=3, mode="nearest"), dtype=np.float64)
+
+
+def resample(image: NDArray[np.floating], placement: Placement) -> NDArray[np.float64]:
+    """The measured picture brought to where the thickness maps are (cubic splines)."""
+    return _resampled(_splines(np.asarray(image, dtype=np.float64)), placement)
+
+
+def _resampled(splines: NDArray[np.float64], placement: Placement) -> NDArray[np.float64]:
+    """The measured picture (row, column) brought to where the thickness maps are, from its splines' coefficients."""
+    for along in (placement.row_px, placement.column_px):
+        whole = math.floor(along)
+        t = along - whole
+        weights = (
+            (1.0 - t) ** 3,
+            3.0 * t**3 - 6.0 * t**2 + 4.0,
+            3.0 * (1.0 - t) ** 3 - 6.0 * (1.0 - t) ** 2 + 4.0,
+            t**3,
+        )
+        first, length = _BEYOND_PX + whole - 1, len(splines) - 2 * _BEYOND_PX
+        moved = np.zeros((length, splines.shape[1]))
+        for k, weight in enumerate(weights):
+            moved += weight / 6.0 * splines[first + k : first + k + length]
+        splines = moved.T  # the other axis comes first in turn, and first again after both
+    return splines
+
+
+def register(
+    measured: Sequence[NDArray[np.floating]],
+    expected: Sequence[NDArray[np.floating]],
+    variance: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    *,
+    prior_px: float = 1.0,
+) -> Placement:
+    """Placement of a scene from the pictures of all its series: Gauss-Newton, level and smooth light left free.
+
+    Args:
+        measured, expected: signals (row, column), DN, of each series.
+        variance: of the measured ones.
+        mask: pixels to use; the outermost three are left out.
+        prior_px: standard deviation of a displacement before looking.
+    """
+    inner = mask.copy()
+    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
+        edge[...] = False
+    current = np.zeros(2)
+    precision = np.eye(2) / prior_px**2
+    covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+    splines = [_splines(fill(image, mask)) for image in measured]
+    models = [np.asarray(model, dtype=np.float64) for model in expected]
+    slopes = [np.stack(gradient(model))[:, inner] for model in models]
+    doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
+    # edges are rendered with errors that any number of series share
+    share = 1.0 / max(len(measured), 1)
+    settled = False
+    for caution, before in zip(_CAUTION, (math.inf, *_CAUTION), strict=False):
+        if settled and caution == before:
+            break
+        placement = _placement(current, covariance)
+        normal, right = precision.copy(), precision @ current
+        for image, model, noise, design, doubtful in zip(splines, models, variance, slopes, doubts, strict=True):
+            picture = _resampled(image, placement)
+            doubt = doubtful * caution**2
+            weight = share / (noise + doubt)[inner]
+            level = model[inner]
+            level_weight = float((level * weight) @ level) + 1e-30
+            # a brighter beam is no light that strays: smoothed, what it leaves at an edge would look like a displacement
+            apart = picture - float((level * weight) @ picture[inner]) / level_weight * model
+            residual = (apart - _stray(apart, *_away(inner / (noise + 100.0 * doubt))))[inner]
+            cross = (design * weight) @ level
+            normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
+            right += (design * weight) @ residual - cross * float((level * weight) @ residual) / level_weight
+        # along a single edge nothing shows the displacement: a weak direction stays where the prior has it
+        values, vectors = np.linalg.eigh(normal - precision)
+        weak = values < _WEAK * values[-1]
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
+        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        # where the measured picture still lies further on than the model, the residual falls along the model's slope
+        step = -((vectors * inverse) @ vectors.T) @ right
+        current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
+        settled = float(np.hypot(*step)) < _SETTLED_PX
+    return _placement(current, covariance)
+
+
+def left_over(
+    measured: Sequence[NDArray[np.floating]],
+    expected: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    placement: Placement,
+) -> float:
+    """Sum of the squares that pictures leave of measured ones at a placement, levels free, each over its highest signal squared.
+
+    Args:
+        measured, expected: signals (row, column), DN, of each series.
+        mask: pixels to use.
+        placement: where the scene is taken to lie.
+    """
+    total = 0.0
+    for image, model in zip(measured, expected, strict=True):
+        picture, level = resample(fill(image, mask), placement)[mask], np.asarray(model, dtype=np.float64)[mask]
+        power = float(level @ level) + 1e-30
+        total += (
+            max(float(picture @ picture) - float(level @ picture) ** 2 / power, 0.0)
+            / max(float(level.max()), 1e-30) ** 2
+        )
+    return total
+
+
+def register_drawn(
+    measured: Sequence[NDArray[np.floating]],
+    draw: Callable[[tuple[float, float]], Sequence[NDArray[np.floating]]],
+    variance: Sequence[NDArray[np.floating]],
+    mask: NDArray[np.bool_],
+    start: Placement,
+    *,
+    whole_cells: bool,
+    prior_px: float = 1.0,
+) -> Placement:
+    """Placement of a scene by drawing it where it may lie: nothing that was measured is resampled.
+
+    In whole cells of the drawing first: from `start` or from no displacement, whichever leaves less, to the neighbour that
+    leaves least until none leaves less. Then by Gauss-Newton with slopes by differences of drawn pictures; a step is taken
+    only where less is left after it.
+
+    Args:
+        measured, variance, mask, prior_px: as in `register`.
+        draw: pictures (row, column) of all series with the scene displaced along rows and columns, px.
+        start: where splines have it.
+        whole_cells: no finer than that; a picture with little blur cannot be moved by a part of a cell without ringing.
+    """
+    inner = mask.copy()
+    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
+        edge[...] = False
+    images = [fill(image, mask) for image in measured]
+
+    models = draw((0.0, 0.0))
+    # every pixel alike: with the noise of the shadow, or with edges taken as doubtful, a blur that the twin does not know
+    # would pull an edge away; doubts of rendering are those that any number of series share
+    doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
+    fit = _LeftOver(
+        images=images,
+        inner=inner,
+        weights=[
+            1.0 / len(images) / (float(np.max(noise[inner])) + _CAUTION[-1] ** 2 * float(np.max(doubt[inner])))
+            for noise, doubt in zip(variance, doubts, strict=True)
+        ],
+        away=[_away(inner / (noise + 100.0 * doubt)) for noise, doubt in zip(variance, doubts, strict=True)],
+    )
+    known: dict[tuple[int, int], float] = {}
+
+    def left(cell: tuple[int, int]) -> float:
+        if cell not in known:
+            known[cell] = fit.of(draw((cell[0] / FINE, cell[1] / FINE)))
+        return known[cell]
+
+    most = round(LARGEST_PX * FINE)
+    cell = min(((0, 0), (round(start.row_px * FINE), round(start.column_px * FINE))), key=left)
+    while True:
+        around = [(cell[0] + row, cell[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        best = min((one for one in around if max(map(abs, one)) <= most), key=left)
+        if not left(best) < _WORTH_A_CELL * left(cell):
+            break
+        cell = best
+    current = np.array(cell) / FINE
+    if whole_cells:
+        sds = np.maximum([start.row_sd_px, start.column_sd_px], CELL_SD_PX)
+        return _placement(current, np.diag(sds**2))
+    models = draw((float(current[0]), float(current[1])))
+    rest = fit.of(models)
+    covariance: NDArray[np.float64] = np.eye(2) * prior_px**2
+    slopes: list[NDArray[np.float64]] = []
+    for _ in range(_DRAWN_ROUNDS):
+        if not slopes:
+            moved = [draw((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
+            slopes = [
+                np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
+                for model, *pair in zip(models, *moved, strict=True)
+            ]
+        normal, right = fit.slope(models, slopes)
+        # along a single edge nothing shows the displacement: a weak direction stays where it is
+        values, vectors = np.linalg.eigh(normal)
+        weak = values < _WEAK * values[-1]
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
+        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        step = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        for part in (1.0, 0.4, 0.1):
+            there = np.clip(current + part * step, -LARGEST_PX, LARGEST_PX)
+            pictures = draw((float(there[0]), float(there[1])))
+            after = fit.of(pictures)
+            if after < rest:
+                break
+        else:
+            break
+        moved_px = float(np.hypot(*(there - current)))
+        rest, current, models = after, there, pictures
+        if moved_px < _DRAWN_ENOUGH_PX:
+            break
+        if moved_px > _SAME_SLOPES_PX:
+            slopes = []
+    return _placement(current, covariance)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _LeftOver:
+    """What pictures leave of measured ones, level and smooth light left free.
+
+    Fields: images, measured (row, column); inner, pixels that count (row, column); weights of the pixels of each image; away:
+    weights with which light that strays is seen, as `_away` has them.
+    """
+
+    images: Sequence[NDArray[np.float64]]
+    inner: NDArray[np.bool_]
+    weights: Sequence[float]
+    away: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+    def _residuals(
+        self, models: Sequence[NDArray[np.floating]]
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
+        """Residual and level (pixel,) and weight of each image, the level fitted."""
+        for image, model, weight, away in zip(self.images, models, self.weights, self.away, strict=True):
+            level = np.asarray(model, dtype=np.float64)[self.inner]
+            power = float(level @ level) + 1e-30
+            # the level first, as in `register`
+            brighter = float(level @ image[self.inner]) / power
+            apart = np.asarray(image - brighter * model, dtype=np.float64)
+            residual = (apart - _stray(apart, *away))[self.inner]
+            share = float(level @ residual) / power
+            yield residual - share * level, level, weight
+
+    def of(self, models: Sequence[NDArray[np.floating]]) -> float:
+        """Sum of squares."""
+        return sum(weight * float(residual @ residual) for residual, _, weight in self._residuals(models))
+
+    def slope(
+        self, models: Sequence[NDArray[np.floating]], slopes: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Normal matrix (2, 2) and right side (2,) of the step that leaves least, for slopes (2, pixel) of each picture."""
+        normal, right = np.zeros((2, 2)), np.zeros(2)
+        for (residual, level, weight), design in zip(self._residuals(models), slopes, strict=True):
+            cross = design @ level
+            normal += weight * (design @ design.T - np.outer(cross, cross) / (float(level @ level) + 1e-30))
+            right += weight * (design @ residual)
+        return normal, right
+
+
+def _away(weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (row, column) of pixels away from edges, and their smooth sum."""
+    from scipy.ndimage import gaussian_filter
+
+    return weight, np.maximum(gaussian_filter(weight, _STRAY_PX, mode="constant"), 1e-30)
+
+
+def _stray(
+    residual: NDArray[np.float64], weight: NDArray[np.float64], total: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The smooth part of a residual, as pixels away from edges show it; weight, total: see `_away`."""
+    from scipy.ndimage import gaussian_filter
+
+    return np.asarray(gaussian_filter(weight * residual, _STRAY_PX, mode="constant") / total)
+
+
+def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:
+    sd = np.sqrt(np.diag(covariance))
+    return Placement(
+        row_px=float(values[0]),
+        column_px=float(values[1]),
+        row_sd_px=math.sqrt(float(sd[0] ** 2) + 1e-6),
+        column_sd_px=math.sqrt(float(sd[1] ** 2) + 1e-6),
+    )

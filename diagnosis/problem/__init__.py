@@ -1,0 +1,13 @@
+"""A session and its twin as one problem: residual, nuisances, responses to every effect.
+
+Files:
+    assemble           session and twin to problem, top to bottom
+    problem            the problem: residual, factors, curves, names
+    series_probes      one series projected: templates, scalars, residual
+    series_block       one series in numbers: residual, nuisances, responses, random parts
+    nuisance_columns   nuisances of one series
+    point_maps         nuisances of maps sampled at points
+    line_noise         noise of rows and columns that is no effect
+    output_course      levels and trends of a drifting output
+    known_effects      effects that the twin has already
+"""

@@ -1,0 +1,571 @@
+"""Session and twin -> the problem that inference solves: residual probes, nuisance factors, responses to every effect."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.acquisition_io import AcquisitionFile, Series
+from ...acquisition.log_images import light_of_shares
+from ...errors import InputError
+from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.frames.series import beam_conditions, expected_series, session_conditions, with_conditions
+from ...generator.line.twin import Twin
+from ..checks.preparation import PreparedSession
+from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
+from ..inference.observed import Point
+from ..model import changes as scales
+from ..model.calibrated_maps import calibrated_maps, exposure_of
+from ..model.changes import (
+    Variant,
+    always_a_little,
+    catalogue_variants,
+    smooth_twin,
+    spectral_sds,
+    twin_changes,
+    with_pauses,
+)
+from ..model.curves import LEAST_RESPONSE, Curve
+from ..model.defects import memory_of, new_outliers
+from ..model.forward_model import Change, ForwardModel, draft_cache, strength_rows
+from ..model.placing import place_scenes
+from ..model.responses import Asked, Moved, SeriesModel, SessionModel, session_model
+from ..probes.model_scalars import expected_scalars
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
+from ..session.even_maps import Map
+from ..session.session import SessionSeries, only_own_noise, read_session
+from ..session.summaries import SeriesSummary
+from ..session.usable import SeenSeries, look_at_all, stated_series, summarise_all
+from .known_effects import lasting, with_found
+from .line_noise import usual_line_noise
+from .nuisance_columns import Columns
+from .problem import Problem, SeriesView
+from .series_block import SeriesBlock, by_chance, jitter_of, series_block
+from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
+
+_OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
+_LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
+# step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
+_NEAR_A_POINT = 0.2
+_PLACES = "places of scenes"
+
+
+def build_problem(
+    acquisition: AcquisitionFile,
+    twin: Twin,
+    *,
+    variants: Sequence[Variant],
+    calibrated_elsewhere: bool = False,
+    exposed: Sequence[Series] = (),
+    ends_at_zero: frozenset[str] = frozenset(),
+    spectral_point: NDArray[np.float64] | None = None,
+    side: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> Problem:
+    """Probes, nuisances and effect responses of a session.
+
+    Args:
+        acquisition: open file.
+        twin: calibrated from this session's calibrating series, or from another session; effects that it has are no gap.
+        variants: effects to try.
+        calibrated_elsewhere: the twin comes from another session (dark and gain maps from the twin unless series here are
+            marked as calibrating).
+        exposed, ends_at_zero: as in `read_session`.
+        spectral_point: spectral parameters (parameter,) at which these nuisances are taken as linear in place of the best ones,
+            about which they have their priors all the same.
+        side: of the squares of the panel's pixels that the acquisition has for pixels.
+        progress: called with the name of each stage.
+
+    Raises:
+        InputError: nothing that can be judged: no darks and flats, or another detector than the twin's.
+    """
+    tell = progress or (lambda stage: None)
+    session = read_session(
+        acquisition, calibrated_elsewhere=calibrated_elsewhere, exposed=exposed, ends_at_zero=ends_at_zero
+    )
+    requests = [item.request for item in session]
+    variants = with_pauses(variants, stated=all(item.pause_stated for item in requests[1:]))
+    conditions = session_conditions(requests, readout_ms=twin.instrument.readout_ms)
+    known = tuple(with_conditions(item, conditions) for item in lasting(twin.effects))
+    base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
+    back: dict[str, float] = {}
+    if spectral_point is not None and base.spectral is not None:
+        steps = (base.spectral.best - spectral_point) / spectral_sds(base.spectral)
+        back = dict(zip(base.spectral.names, map(float, steps), strict=True))
+        base = replace(base, spectral=replace(base.spectral, best=spectral_point))
+    conditions |= beam_conditions(base, requests, cache=cache)
+    own_maps = any(item.calibrates and item.series.kind == "flat" for item in session)
+    model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps, cache=cache)
+    measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
+    expected = measured.expected
+    tell("responses")
+    changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
+    steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
+    changes += [Change.of_twin(step) for step in steps_taken]
+    changes += [
+        replace(model.change(variant, variant.strengths[0]), label=variant.name)
+        for variant in always_a_little(side=side)
+    ]
+    had = {item.id: item for item in model.base.effects}
+    changes += [model.without(effect) for effect in had]
+    unjudged = _of_quanta() if only_own_noise(session) else {}
+    compared = _Compared(
+        measured=measured,
+        asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
+        had=had,
+        variants=tuple(variants),
+        thicker=_thicker_scenes(expected.series),
+        back=back,
+        side=side,
+    )
+    parts = []
+    for one in expected.series:
+        tell(f"responses of {one.name}")
+        parts.append(compared.part(one))
+    return _joined(parts, compared)
+
+
+def problem_of(
+    session: PreparedSession,
+    twin: Twin,
+    *,
+    without: Sequence[str] = (),
+    variants: Sequence[Variant] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Problem:
+    """What inference is asked about a prepared session, with a twin and `variants` (None: the catalogue less `without`)."""
+    return build_problem(
+        session.acquisition,
+        twin,
+        variants=catalogue_variants(without=without, side=session.factor) if variants is None else variants,
+        calibrated_elsewhere=session.calibrated_elsewhere,
+        exposed=session.exposed,
+        ends_at_zero=session.ends_at_zero,
+        spectral_point=session.spectral_point,
+        side=session.factor,
+        progress=progress,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Measured:
+    """What the frames of a session show, and what the base twin expects of them.
+
+    Fields: expected; pictures (row, column): corrected mean frames, DN, by name of series; summaries of the frames' noise, by name;
+    memory: of outlying pixels in darks, see `memory_of`, by name; clean: pixels in use that do not stand out (row, column);
+    outliers: how many stand out in any series; skipped: what could not be used and why.
+    """
+
+    expected: SessionModel
+    pictures: Mapping[str, NDArray[np.float64]]
+    summaries: Mapping[str, SeriesSummary]
+    memory: Mapping[str, tuple[float, int] | None]
+    clean: NDArray[np.bool_]
+    outliers: int
+    skipped: tuple[str, ...]
+
+
+def _measured(
+    session: Sequence[SessionSeries],
+    acquisition: AcquisitionFile,
+    twin: Twin,
+    model: ForwardModel,
+    *,
+    side: int,
+    tell: Callable[[str], None],
+) -> _Measured:
+    """Two passes over the frames: which pixels and series can be used, then what these say; scenes are found in between.
+
+    Raises:
+        InputError: no series that can be compared.
+    """
+    known_good = twin.maps.bad_pixels == 0
+    seen = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
+    maps = calibrated_maps(seen.kept, seen.expected, seen.looks, twin=twin, good=known_good)
+    standing_out = new_outliers(seen.kept, seen.expected, seen.looks, maps)
+    outlying = standing_out.bad
+    clean = maps.good & ~standing_out.any
+    # they count as outliers; what else is said of noise is said without them
+    summaries = summarise_all(seen, clean, tell=tell)
+    lines_DN2 = usual_line_noise(seen.kept, seen.expected, summaries, clean)
+    summaries = {
+        item.name: summaries[item.name].without_lines(*(one / item.request.exposures_per_frame for one in lines_DN2))
+        for item in seen.kept
+    }
+    tell("registration")
+    pictures = {item.name: maps.corrected(item, seen.looks[item.name].mean_DN) for item in seen.kept}
+    placed = place_scenes(seen.kept, seen.expected, pictures, clean=clean, sharp=model.sharp, expect=model.expect)
+    return _Measured(
+        expected=session_model(model, maps, placed, seen, summaries, clean, lines_DN2=lines_DN2),
+        pictures=pictures,
+        summaries=summaries,
+        memory={
+            item.name: memory_of(seen.looks[item.name], outlying) for item in seen.kept if item.series.kind == "dark"
+        },
+        clean=clean,
+        outliers=int(np.count_nonzero(outlying)),
+        skipped=seen.skipped,
+    )
+
+
+def _seen_series(
+    session: Sequence[SessionSeries],
+    acquisition: AcquisitionFile,
+    model: ForwardModel,
+    *,
+    good: NDArray[np.bool_],
+    side: int,
+    tell: Callable[[str], None],
+) -> SeenSeries:
+    """Series that the base twin can be compared with, and a first look at their frames.
+
+    Raises:
+        InputError: there are none.
+    """
+    stated, skipped = stated_series(session, acquisition, model.base.maps.shape)
+    tell("expectation")
+    expected, refused = model.expect_all(stated)
+    skipped += refused
+    if not expected:
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="; ".join(skipped) or "no series",
+            expected="darks and flats whose kV, exposure and tube load are stated",
+        )
+    tell("frames")
+    return look_at_all(
+        [_as_light(item, model) for item in stated if item.name in expected],
+        expected,
+        good=good,
+        bits=acquisition.instrument.bits,
+        dark_at=model.base.maps.dark_at,
+        side=side,
+        skipped=skipped,
+        tell=tell,
+    )
+
+
+def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
+    """Shares of the open field and their logarithms as light, of the open field that the base twin expects."""
+    if not item.shares:
+        return item
+    opened = model.expect(replace(item.request, kind="flat", thickness_mm=None, scene_kind=None))
+    return replace(item, series=light_of_shares(item.series, float(np.mean(opened.signal_DN))))
+
+
+def _thicker_scenes(series: Sequence[SeriesModel]) -> dict[tuple[str, str], dict[str, NDArray[np.floating]]]:
+    """Thickness maps (row, column), mm, of each scene with one material thicker, by scene and that material.
+
+    One mapping for all series of a scene, so that it is drawn once.
+    """
+    result: dict[tuple[str, str], dict[str, NDArray[np.floating]]] = {}
+    factor = np.float32(1.0 + scales.THICKNESS_SD)
+    for one in series:
+        if one.session.series.kind != "object":
+            continue
+        scene = one.session.request.thickness_mm or {}
+        for material in scene:
+            if (one.session.series.scene, material) not in result:
+                result[one.session.series.scene, material] = {
+                    name: image * factor if name == material else image for name, image in scene.items()
+                }
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Part:
+    """What one series brings into the problem."""
+
+    view: SeriesView
+    block: SeriesBlock
+    probes: SeriesProbes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Compared:
+    """A session and the changes that every series of it is asked with.
+
+    Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; had: these effects;
+    variants; thicker: see `_thicker_scenes`; back: prior standard deviations from the base twin's spectral parameters to the
+    calibrated ones, by name; side: of the squares of the panel's pixels that stand for pixels.
+    """
+
+    measured: _Measured
+    asked: tuple[Asked, ...]
+    had: Mapping[str, AppliedEffect]
+    variants: tuple[Variant, ...]
+    thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
+    back: Mapping[str, float]
+    side: int
+
+    def part(self, one: SeriesModel) -> _Part:
+        """One series: its templates and projections, and what every change does to it."""
+        measured, session = self.measured, self.measured.expected
+        moved = session.moved(one, self.asked)
+        frame = mean_frame(one, measured.pictures[one.name], session.maps, side=self.side)
+        probes = series_probes(
+            session,
+            one,
+            frame,
+            summary=measured.summaries[one.name],
+            moved=moved,
+            variants=self.variants,
+            all_outliers=measured.outliers,
+            memory=measured.memory.get(one.name),
+        )
+        block = series_block(session, probes, frame, self.asked, moved, self._thicker(one))
+        return _Part(view=_view(one, frame, measured.summaries[one.name]), block=block, probes=probes)
+
+    def _thicker(self, one: SeriesModel) -> dict[str, Moved]:
+        """What a scene with one material thicker would show in a series, by material; empty where there is none."""
+        if one.session.series.kind != "object":
+            return {}
+        result: dict[str, Moved] = {}
+        for material in one.session.request.thickness_mm or {}:
+            scene = self.thicker[one.session.series.scene, material]
+            changed = self.measured.expected.model.expect(replace(one.session.request, thickness_mm=scene))
+            moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
+            result[material] = moved, expected_scalars(changed, one.context)
+        return result
+
+
+def _view(one: SeriesModel, frame: MeanFrame, summary: SeriesSummary) -> SeriesView:
+    return SeriesView(
+        session=one.session,
+        summary=summary,
+        expected=one.expected,
+        signal_DN=np.asarray(frame.signal_DN, np.float32),
+        residual_DN=np.asarray(frame.residual_DN, np.float32),
+        noise_DN=np.sqrt(frame.quantum_DN2 + frame.white_DN2).astype(np.float32),
+        mask=frame.mask,
+        floor_rms=_half_difference(summary),
+    )
+
+
+def _half_difference(summary: SeriesSummary) -> float:
+    """Scatter of the mean frame as repeats show it, over what differences of frames predict (1 = noise only)."""
+    if summary.frames < 4:
+        return 1.0
+    steps = np.diff(summary.frame_mean_DN)
+    white = float(np.mean(steps**2)) / 2.0
+    total = float(np.var(summary.frame_mean_DN, ddof=1))
+    return math.sqrt(total / white) if white > 0 else 1.0
+
+
+def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
+    """The problem that all series together make."""
+    blocks = [part.block for part in parts]
+    session = compared.measured.expected
+    responses = np.concatenate([block.responses for block in blocks], axis=1)
+    names = tuple(name for block in blocks for name in block.names)
+    series_of = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
+    factors = _factors(blocks, responses, compared)
+    first_less = len(responses) - len(compared.had)
+    done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
+    curves, chosen, missing = _curves(blocks, responses, names, compared, done)
+    of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
+    groups, group_names = _numbered(
+        [
+            f"{axis}, {series.kind} {series.scene} {series.kV if series.kind != 'dark' else ''}".strip()
+            for axis, series in of_probes
+        ]
+    )
+    places, place_names = _numbered(
+        [
+            # a few probes a scene, lost among its others
+            _PLACES
+            if name.statistic in (ALONG_ROWS, ALONG_COLUMNS)
+            else f"{axis} of {series.kind} {series.scene}".strip()
+            for name, (axis, series) in zip(names, of_probes, strict=True)
+        ]
+    )
+    sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
+    residual = np.concatenate([block.residual for block in blocks])
+    for name, step in compared.back.items():
+        residual -= step * factors.get(name, 0.0)
+    return Problem(
+        residual=residual,
+        factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(names), 0)),
+        factor_names=tuple(factors),
+        curves=tuple(curves),
+        variants=tuple(chosen),
+        names=names,
+        series_of=series_of,
+        sd=np.concatenate([block.sd for block in blocks]),
+        noise=np.concatenate([block.noise for block in blocks]),
+        groups=groups,
+        group_names=group_names,
+        parts=places,
+        part_names=place_names,
+        blocks=sharing[series_of],
+        views=tuple(part.view for part in parts),
+        base=session.model.base,
+        gain_shares=session.maps.shares,
+        dark_weights=session.maps.darks.weights,
+        skipped=compared.measured.skipped,
+        missing_effects=missing,
+        conditions=session.model.conditions,
+        respond=partial(_respond, session, [part.probes for part in parts], done),
+        side=compared.side,
+        given=tuple(_as_given(item, done[effect]) for effect, item in compared.had.items()),
+    )
+
+
+def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
+    """An effect that the twin has, as it has it; done (probe,): what it does there."""
+    inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
+    strength = abs(effect.parameters["strength"])
+    curve = Curve(
+        effect=effect.id,
+        variant="as the twin has it",
+        parameters=inner,
+        low=strength,
+        high=strength,
+        strengths=np.array([strength]),
+        responses=done[None, :],
+        since=effect.since,
+    )
+    level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
+    return Point(curve=curve, strength=strength, level=level)
+
+
+def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+    """Number of each key (key,), in the order in which they first occur, and the keys by number."""
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return np.array([numbers[key] for key in keys], dtype=np.intp), tuple(numbers)
+
+
+def _shares_nuisances(item: SessionSeries) -> str:
+    """What series that share local nuisances have in common."""
+    if item.series.kind != "object":
+        return f"series {item.name}"
+    return f"scene {item.series.scene} at {item.request.source_object_mm or 0.0!r}"
+
+
+def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], compared: _Compared) -> Columns:
+    """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
+    columns: Columns = {}
+    first = sum(len(variant.strengths) for variant in compared.variants)
+    last = len(compared.asked) - len(compared.had)
+    for item, response in zip(compared.asked[first:last], responses[first:last], strict=True):
+        if not item.failed:
+            columns[item.change.label] = response / item.change.step_sd
+    start = 0
+    for block in blocks:
+        for name, column in block.nuisances.items():
+            columns.setdefault(name, np.zeros(responses.shape[1]))[start : start + len(block)] += column
+        start += len(block)
+    return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}
+
+
+def _of_quanta() -> dict[str, str]:
+    """Why effects on the statistics of quanta cannot be judged from the noise that calibrates, by id."""
+    return {effect.id: _OWN_NOISE for effect in EFFECTS.values() if effect.stage == "quanta"}
+
+
+def _curves(
+    blocks: Sequence[SeriesBlock],
+    responses: NDArray[np.float64],
+    names: Sequence[ProbeName],
+    compared: _Compared,
+    done: Mapping[str, NDArray[np.float64]],
+) -> tuple[list[Curve], list[Variant], dict[str, str]]:
+    """Curves with their variants, and why each effect without a curve cannot be judged; done (probe,): by the base's own effects."""
+    curves: list[Curve] = []
+    chosen: list[Variant] = []
+    missing: dict[str, str] = {}
+    base = compared.measured.expected.model.base
+    readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
+    for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
+        effect = EFFECTS[variant.effect]
+        failed = next((compared.asked[row].failed for row in rows if compared.asked[row].failed), "")
+        if failed:
+            missing.setdefault(variant.effect, failed)
+            continue
+        own = responses[list(rows)] + done.get(variant.effect, 0.0)
+        spread = by_chance(variant, blocks, rows[0], readout_ms)
+        # a wandering output shifts levels by chance even where too few frames show its noise
+        wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
+        if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):
+            missing.setdefault(variant.effect, "nothing in this session responds to it")
+            continue
+        exact = None
+        if effect.reading.probes:
+            exact = np.array([name.statistic in effect.reading.probes for name in names])
+        jitter = jitter_of(variant, blocks, read_noise_DN)
+        curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
+        chosen.append(variant)
+    for curve in curves:
+        missing.pop(curve.effect, None)
+    return curves, chosen, missing
+
+
+def _respond(
+    session: SessionModel,
+    probes: Sequence[SeriesProbes],
+    done: Mapping[str, NDArray[np.float64]],
+    variants: Sequence[Variant],
+    wanted: NDArray[np.bool_] | None = None,
+) -> dict[int, NDArray[np.float64]]:
+    """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
+
+    done: as in `_curves`. Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
+    """
+    asked = [
+        session.ask(session.model.change(variant, strength)) for variant in variants for strength in variant.strengths
+    ]
+    responses = np.zeros((len(asked), sum(map(len, probes))))
+    start = 0
+    for one in probes:
+        if wanted is not None and not wanted[start : start + len(one)].any():
+            start += len(one)
+            continue
+        moved = [(row, found) for row, found in enumerate(session.moved(one.series, asked)) if found is not None]
+        if moved:
+            stop = start + len(one)
+            responses[[row for row, _ in moved], start:stop] = one.responses([found for _, found in moved])
+        start += len(one)
+    return {
+        number: responses[list(rows)] + done.get(variants[number].effect, 0.0)
+        for number, rows in enumerate(strength_rows(variants))
+        if not any(asked[row].failed for row in rows)
+    }
+
+
+def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:
+    """What effects change in each view's corrected mean frame (row, column), DN, calibration having taken in its part.
+
+    They take the place of the same ones that the base has.
+    """
+    shape = problem.base.maps.shape
+    cache = draft_cache()
+    moved: dict[str, NDArray[np.float64]] = {}
+    for view in problem.views:
+        changed = expected_series(
+            problem.base,
+            view.session.request,
+            effects=with_found(problem.base.effects, effects),
+            cache=cache,
+            use_measured_level=False,
+        )
+        moved[view.session.name] = np.asarray(changed.mean_DN) - np.asarray(view.expected.mean_DN)
+
+    def lit(view: SeriesView) -> NDArray[np.float64]:
+        weights = problem.dark_weights.get(exposure_of(view.session), {})
+        return moved[view.session.name] - sum((w * moved[name] for name, w in weights.items()), np.zeros(shape))
+
+    taken = np.zeros(shape)
+    for view in problem.views:
+        share = problem.gain_shares.get(view.session.name)
+        if share:
+            taken = taken + share * lit(view) / np.maximum(view.signal_DN, 1e-6)
+    result = []
+    for view in problem.views:
+        change = lit(view)
+        if view.session.series.kind in ("flat", "object"):
+            change = change - view.signal_DN * taken
+        result.append(np.asarray(change, dtype=np.float32))
+    return result

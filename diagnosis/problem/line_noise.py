@@ -1,0 +1,51 @@
+"""Offsets of rows and columns that a panel has all the time: they belong to the base as far as they are small."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ..model.changes import LINE_NOISE_LIMIT
+from ..session.session import SessionSeries
+from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+
+
+def usual_line_noise(
+    kept: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    summaries: Mapping[str, SeriesSummary],
+    clean: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """Variance (DN^2) of the rows' and of the columns' offsets in one exposure, from darks, at most what no effect is.
+
+    Of a mean over C pixels of a row, var = r^2 + (v - r^2) / C, v the variance of a pixel; columns alike. What the twin knows
+    of it already is not counted again.
+
+    Args:
+        kept: series that can be compared; the darks that calibrate tell, all darks where none does.
+        expected: by the twin, by name.
+        summaries: what the frames' noise says, by name.
+        clean: pixels in use that do not stand out (row, column).
+    """
+    darks = [item for item in kept if item.series.kind == "dark" and summaries[item.name].frames > 2]
+    darks = [item for item in darks if item.calibrates] or darks
+    total = np.zeros(2)
+    steps = 0
+    # in a row, and in a column
+    pixels = np.array(clean.shape[::-1], dtype=np.float64)
+    for item in darks:
+        found, model = summaries[item.name], expected[item.name]
+        variance = float(np.mean(found.pair_variance_DN2[clean]))
+        if not variance > LEAST_NOISE_DN2:
+            continue
+        of_lines = np.array([found.row_variance_DN2, found.column_variance_DN2])
+        own = (of_lines - variance / pixels) / (1.0 - 1.0 / pixels)
+        known = np.array([model.row_variance_DN2, model.column_variance_DN2])
+        exposures = item.request.exposures_per_frame
+        limit = LINE_NOISE_LIMIT**2 * variance
+        weight = found.frames - 1
+        total += weight * np.clip(own - known, 0.0, limit) * exposures
+        steps += weight
+    rows, columns = total / max(steps, 1)
+    return float(rows), float(columns)

@@ -1,0 +1,390 @@
+"""What is no effect and may differ all the same: nuisances of one series, and what effects do by chance there.
+
+A nuisance is a response (probe,) of one prior standard deviation, not shrunk; equal names in several series are one nuisance.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import changes as scales
+from ..model.responses import Moved, SessionModel
+from ..probes.noise_correlation import autocovariance, correlation_sum
+from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
+from ..probes.registration import CELL_SD_PX, gradient
+from ..session.even_maps import Map
+from ..session.session import SessionSeries
+from ..session.summaries import BLOCK_PX, LAGS
+from .point_maps import blurred_between_points, sampled_at_points
+from .series_probes import SeriesProbes
+
+Columns = dict[str, NDArray[np.float64]]
+_Images = dict[str, NDArray[np.floating]]
+_UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
+_GAIN_MAP_MODES = 3  # cosines along each side
+
+
+def local_nuisances(
+    probes: SeriesProbes,
+    signal: NDArray[np.float64],
+    thicker: Mapping[str, Moved],
+    *,
+    sharp: bool,
+    beams_differ: float,
+) -> Columns:
+    """Nuisances of one series by name.
+
+    Args:
+        probes: of the series.
+        signal: expected (row, column), DN.
+        thicker: what a scene with one material thicker by THICKNESS_SD would show, by material.
+        sharp: pixels see no farther than themselves.
+        beams_differ: times more than usual from the spectral model.
+    """
+    item = probes.series.session
+    columns: Columns = {
+        "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
+    }
+    images: _Images = {}  # of nuisances that change the mean frame alone
+    if item.request.beam_on:
+        columns |= _of_beam(probes, beams_differ)
+        images |= _of_field(item, signal, beams_differ)
+    if item.series.kind != "flat":  # against a flat's light it is nothing
+        images[f"dark of {item.name}"] = np.full(signal.shape, scales.DARK_SD_DN)
+    if not item.calibrates:
+        columns["few new bad pixels"] = _few_bad_pixels(probes)
+    if item.series.kind == "object":
+        dy, dx = gradient(signal)
+        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
+        images |= _of_scene(item, dy, dx, sharp=sharp)
+        if sharp:
+            images |= _between_points(item, signal)
+    return columns | _projected(probes, images)
+
+
+def _projected(probes: SeriesProbes, images: Mapping[str, NDArray[np.floating]]) -> Columns:
+    """Responses to changes of the mean frame (row, column), DN, by the same names."""
+    found = probes.of_maps(np.stack(list(images.values())).astype(np.float32))
+    return dict(zip(images, found, strict=True))
+
+
+def _voltage(item: SessionSeries) -> str:
+    series = item.series
+    return f"unknown kV ({series.current_mA}, {series.power_W})" if series.kV is None else f"{series.kV:g} kV"
+
+
+def _beam(item: SessionSeries) -> str:
+    return f"{_voltage(item)} " + "+".join(str(layer) for layer in item.series.filters)
+
+
+def _place(item: SessionSeries) -> str:
+    return f"{item.series.scene} at {item.series.source_object_mm or 0:g}"
+
+
+def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
+    """Gain of a beam, noise of pixels that are brighter than others, and correlation of neighbours."""
+    item, context = probes.series.session, probes.series.context
+    brighter = dict(zip(context.label_names, context.label_gain, strict=True))
+    # without a voltage, or a calibrating flat of two frames, the noise of a beam is known only from its own series
+    unknown = item.series.kV is None or item.own_noise
+    gain_sd = _UNKNOWN_GAIN_SD if unknown else beams_differ * scales.GAIN_OF_BEAM_SD
+    columns: Columns = {
+        f"gain of {_beam(item)}": probes.of_scalars(
+            lambda probe: gain_sd if probe.name.startswith("log_variance") else 0.0
+        ),
+        "output from frame to frame": probes.of_scalars(
+            lambda probe: _of_steps(probes, probe.name) if probe.name == "frame_factor" else 0.0
+        ),
+        # by their electronics (noise as the gain's square) or by the light that they catch (as the gain)
+        "noise of bright pixels": probes.of_scalars(
+            lambda probe: (
+                0.5 * scales.GAIN_EXPONENT_SD * math.log(brighter.get(probe.name.removeprefix("log_variance "), 1.0))
+            )
+        ),
+    }
+    columns["widths of the spread"] = _two_widths(probes)
+    for lag in LAGS:
+        # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
+        texture = _texture(probes, lag)
+        columns[f"texture {lag}"] = texture
+        columns[f"texture {lag} at {_voltage(item)}"] = scales.TEXTURE_OF_BEAM_SHARE * texture
+    return columns
+
+
+def _two_widths(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Correlations under a spread that is wider along one axis by TWO_WIDTHS_SD, and as much narrower along the other.
+
+    Of a Gaussian rho = exp(-d^2 / 4 s^2), so d rho / d ln s = -2 rho ln rho at each lag.
+    """
+    expected = probes.series.expected
+    change: dict[str, float] = {}
+    for down, across in LAGS:
+        by_row, by_column = (max(autocovariance(expected, *lag), 1e-6) for lag in ((down, 0), (0, across)))
+        wider = -2.0 * by_row * by_column * (math.log(by_row) - math.log(by_column))
+        change[f"({down},{across})"] = 0.5 * scales.TWO_WIDTHS_SD * wider
+
+    def of(name: str) -> float:
+        return change[name.rsplit(" ", 1)[-1]] if name.startswith("correlation") else 0.0
+
+    return probes.of_scalars(lambda probe: of(probe.name))
+
+
+def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
+    ending = f"({lag[0]},{lag[1]})"
+    return probes.of_scalars(
+        lambda probe: scales.TEXTURE_SD if probe.name.startswith("correlation") and probe.name.endswith(ending) else 0.0
+    )
+
+
+def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
+    """Level of beam and series, and gradient of the field."""
+    rows, columns = signal.shape
+    y = np.linspace(-1, 1, rows)[:, None] * np.ones((1, columns))
+    x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
+    images: _Images = {
+        f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
+        level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
+    }
+    for number, shape in enumerate(_shapes(signal.shape)):
+        images[f"shape {number} of {item.name}"] = shape * signal
+    if item.divided:
+        images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
+        images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal
+        images[f"open field of {item.name}, y"] = scales.DIVIDED_TILT_SD * y * signal
+    return images
+
+
+@lru_cache(maxsize=2)
+def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
+    """Smooth changes (row, column) of the open field, relative: products of Legendre polynomials, SHAPE_SD rms in all.
+
+    Standard deviations fall as one over the order.
+    """
+    from numpy.polynomial.legendre import legval
+
+    y, x = (np.linspace(-1.0, 1.0, length) for length in size)
+    numbers = [(i, k) for i in range(scales.SHAPE_ORDER + 1) for k in range(scales.SHAPE_ORDER + 1 - i) if i or k]
+    total = math.sqrt(sum(1.0 / (i + k) ** 2 for i, k in numbers))
+    result = []
+    for i, k in numbers:
+        shape = np.outer(legval(y, np.eye(i + 1)[i]), legval(x, np.eye(k + 1)[k]))
+        result.append(scales.SHAPE_SD / (i + k) / total / float(np.sqrt(np.mean(shape**2))) * shape)
+    return tuple(result)
+
+
+def _of_steps(probes: SeriesProbes, name: str) -> float:
+    """What the largest output noise that is no effect adds to the logarithm of the variance of steps from frame to frame."""
+    own = math.exp(probes.series.scalars[name])
+    jitter = (scales.OUTPUT_STEP_LIMIT * probes.series.context.reference_signal_DN) ** 2
+    return math.log1p(jitter / own)
+
+
+def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Half of the few pixels that may turn bad without that being an effect, as counts of outliers show them."""
+    few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
+    more = math.sqrt(few + 0.375) - math.sqrt(0.375)
+    return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
+
+
+def level_of(item: SessionSeries) -> str:
+    """Name of the nuisance that is the level of one series, LEVEL_OF_SERIES_SD of it."""
+    return f"level of {item.name}"
+
+
+def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool) -> _Images:
+    """Where a scene lies and how its outline is drawn; dy, dx: slopes of the signal (row, column), DN a pixel."""
+    place = _place(item)
+    rows, columns = dy.shape
+    registered_px = CELL_SD_PX if sharp else scales.REGISTERED_SD_PX
+    row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
+    across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
+    slope = np.hypot(dy, dx)
+    images: _Images = {
+        f"column of {place}": registered_px * dx,
+        f"row of {place}": registered_px * dy,
+        f"outline of {place}": scales.OUTLINE_SD_PX * np.asarray(slope),
+        f"magnification of {place}": scales.MAGNIFICATION_SD * (row * dy + across * dx),
+        f"rotation of {place}": scales.MAGNIFICATION_SD * (across * dy - row * dx),
+    }
+    for number, field in enumerate(_rough_fields(dy.shape, place)):
+        images[f"rough edge {number} of {place}"] = slope * field
+    return images
+
+
+def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:
+    """Where pixels jump as maps of points do, what a blur shows of how borders run between them."""
+    maps = item.request.thickness_mm
+    if maps is None or not sampled_at_points(maps):
+        return {}
+    place = _place(item)
+    return {
+        f"outline of {place} between points, {number}": image
+        for number, image in enumerate(blurred_between_points(maps, signal))
+    }
+
+
+def _of_edges(probes: SeriesProbes, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> Columns:
+    """Profiles of edges, as pixels that an edge cuts are rendered."""
+    item = probes.series.session
+    columns: Columns = {}
+    for label, column in _projected(probes, _edge_profiles(dy, dx)).items():
+        columns[f"edges, {label}, of {_place(item)}"] = column
+        # the pixels that an edge cuts are not rendered quite alike for different beams
+        columns[f"edges, {label}, of {item.name}"] = scales.EDGE_OF_SERIES * column
+        # nor quite truly anywhere, and not the same where a pixel is another size in the object
+        columns[f"edges, {label}"] = scales.EDGE_OF_ALL * column
+        columns[f"edges, {label}, at {item.series.source_object_mm or 0:g}"] = scales.EDGE_OF_ALL * column
+    return columns
+
+
+def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> _Images:
+    """Derivatives across edges of second to fourth order, times what rendering leaves open of each."""
+    slope = np.hypot(dy, dx)
+    (yy, _), (_, xx) = gradient(dy), gradient(dx)
+    normal_y, normal_x = dy / np.maximum(slope, 1e-9), dx / np.maximum(slope, 1e-9)
+    steeper_y, steeper_x = gradient(xx + yy)
+    third = normal_y * steeper_y + normal_x * steeper_x
+    fourth = gradient(steeper_y)[0] + gradient(steeper_x)[1]
+    half = 0.5 * scales.EDGE_SD_PX2
+    return {
+        "columns": half * xx,
+        "rows": half * yy,
+        "third order": scales.EDGE_SD_PX3 * third,
+        "fourth order": scales.EDGE_SD_PX4 * fourth,
+    }
+
+
+@lru_cache(maxsize=2)
+def _rough_fields(shape: tuple[int, ...], place: str) -> NDArray[np.float32]:
+    """Fields (number, row, column) over the local slope, the same for every series of a place: rendering from pixel to pixel."""
+    from zlib import crc32
+
+    from scipy.ndimage import gaussian_filter
+
+    # fixed fields, not draws: the same scene always has the same ones
+    rng = np.random.default_rng(crc32(place.encode()))
+    result = np.empty((scales.ROUGH_FIELDS, *shape), np.float32)
+    for number in range(scales.ROUGH_FIELDS):
+        field = gaussian_filter(rng.standard_normal(shape), (0.7, 2.0, 5.0)[number % 3])
+        result[number] = scales.ROUGH_SHARE / math.sqrt(scales.ROUGH_FIELDS) / float(np.std(field)) * field
+    return result
+
+
+def _of_thickness(
+    probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved], beams_differ: float
+) -> Columns:
+    """Thickness and attenuation of the scene's materials; where beams differ, how attenuation changes with the depth as well."""
+    item, expected = probes.series.session, probes.series.scalars
+    columns: Columns = {}
+    of_beam = beams_differ * scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD
+    for material, (moved, values) in thicker.items():
+        # less light is less noise, too
+        quieter = [
+            (values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd for probe in probes.scalars
+        ]
+        response = np.concatenate([probes.projection.apply(moved), quieter])
+        columns[f"thickness of {material} in {item.series.scene}"] = response
+        columns[f"attenuation of {material}"] = response * (scales.ATTENUATION_SD / scales.THICKNESS_SD)
+        columns[f"attenuation of {material} at {_voltage(item)}"] = response * of_beam
+        if beams_differ > 1.0:
+            # another spectrum hardens in another way
+            depth = np.log(np.max(signal) / np.maximum(signal, 1e-9 * np.max(signal)))
+            harder = probes.of_maps((moved * depth)[None])[0]
+            columns[f"hardness at {_voltage(item)} behind {material}"] = of_beam * harder
+    return columns
+
+
+def gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
+    """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
+
+    Empty where the series has no part in it: without calibrating flats, before the beam, for those that calibrate, and where the
+    gain map was applied before. signal: expected (row, column), DN.
+    """
+    item, maps = probes.series.session, session.maps
+    if not maps.shares or not item.request.beam_on or item.calibrates or "gain" in item.series.corrected:
+        return {}
+    # relative, of one pixel's gain in sums over many pixels
+    lasting = maps.gain_white + maps.gain_quantum * correlation_sum(probes.series.expected, BLOCK_PX, BLOCK_PX)
+    pixel_sd = math.sqrt(lasting)
+    waves = _waves(signal.shape, _GAIN_MAP_MODES)  # the level has nuisances of its own
+    amounts = [pixel_sd / math.sqrt(float(np.sum(wave**2))) * wave for wave in waves.values()]
+    found = probes.of_maps(np.stack(amounts) * signal)
+    return {f"gain map {i},{j}": column for (i, j), column in zip(waves, found, strict=True)}
+
+
+def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
+    """What one DN more in every pixel of a later series does (probe,)."""
+    if probes.series.session.calibrates:
+        return np.zeros(len(probes))
+    previous_DN = probes.series.context.previous_signal_DN
+    scalars = [
+        1.0 / previous_DN / probe.sd if previous_DN and probe.name.startswith("afterglow") else 0.0
+        for probe in probes.scalars
+    ]
+    return np.concatenate([probes.projection.of_level, scalars])
+
+
+def changed_gain_pattern(
+    probes: SeriesProbes, signal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest.
+
+    signal: expected (row, column), DN.
+    """
+    waves, item, maps = _pattern_waves(signal.shape), probes.series.session, len(probes.projection)
+    smooth, rest = np.zeros((len(probes), len(waves))), np.zeros(len(probes))
+    if item.calibrates or not item.request.beam_on:
+        return smooth, rest
+    smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
+    rest[:maps] = probes.projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
+    return smooth, rest
+
+
+def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:
+    """Variance (2, probe) that noise of 1 DN, new in every exposure and common to rows (to columns), leaves in a mean frame."""
+    request = probes.series.session.request
+    variance = probes.projection.line_noise() / (request.frames * request.exposures_per_frame)
+    return np.pad(variance, ((0, 0), (0, len(probes) - variance.shape[1])))
+
+
+@lru_cache(maxsize=1)
+def _pattern_waves(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The smooth part of 1 % of a changed gain map: waves (wave, row, column) that it holds by chance."""
+    waves = _waves(shape, scales.PATTERN_WAVES + 1)
+    total = sum(1.0 / math.hypot(*numbers) for numbers in waves)
+    result = np.empty((len(waves), *shape), np.float32)
+    for image, (numbers, wave) in zip(result, waves.items(), strict=True):
+        share = scales.PATTERN_SMOOTH_SHARE / math.hypot(*numbers) / total
+        image[...] = 0.01 * math.sqrt(share / float(np.mean(wave**2))) * wave
+    return result
+
+
+@lru_cache(maxsize=8)
+def _waves(shape: tuple[int, ...], count: int) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Products of `count` cosines along each side (row, column), by their numbers; the even field is left out."""
+    y, x = (np.cos(np.pi * np.outer(np.arange(count), (np.arange(length) + 0.5) / length)) for length in shape)
+    return {(i, k): np.outer(y[i], x[k]) for i in range(count) for k in range(count) if i or k}
+
+
+def uneven(probes: SeriesProbes, images: Mapping[int, Map], shape: tuple[int, ...]) -> dict[int, NDArray[np.float64]]:
+    """Responses (2, probe), not shrunk, to more of a change on one side of the panel, along rows and along columns, by key.
+
+    A panel seldom warms evenly, and no anode's heel is a straight line. images: what changes do to the mean frame (row, column
+    or 1, 1), DN; shape: of the panel, rows and columns.
+    """
+    if not images:
+        return {}
+    rows, columns = shape
+    ramps = np.zeros((2, *shape), np.float32)
+    ramps[0], ramps[1] = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)[None, :]
+    uneven_ones = [key for key, image in images.items() if image.size > 1]
+    # all at once: the projection is larger than a processor's cache
+    under = [ramps, *(images[key] * ramps for key in uneven_ones)]
+    alike, *found = probes.projection.apply(np.stack(under))
+    result = {key: float(image.flat[0]) * alike for key, image in images.items()} | dict(
+        zip(uneven_ones, found, strict=True)
+    )
+    return {key: probes.without_scalars(columns) for key, columns in result.items()}

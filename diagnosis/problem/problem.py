@@ -1,0 +1,136 @@
+"""What inference is asked about: the probes of a session, what may explain them, and what stands beside them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ...generator.line.twin import Twin
+from ..inference.observed import Point
+from ..inference.seen import Blocks, Responder
+from ..model.changes import Variant
+from ..model.curves import Curve
+from ..probes.probes import ProbeName
+from ..session.even_maps import Map
+from ..session.session import SessionSeries
+from ..session.summaries import SeriesSummary
+
+_WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesView:
+    """One series with what pictures of the gap need: measured and expected signal (row, column), and the mean's noise."""
+
+    session: SessionSeries
+    summary: SeriesSummary
+    expected: ExpectedSeries
+    signal_DN: Map
+    residual_DN: Map
+    noise_DN: Map
+    mask: NDArray[np.bool_]
+    floor_rms: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """Everything that inference needs; probes are standardised.
+
+    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
+    series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
+    noise's share of each probe's standard deviation; blocks (probe,):
+    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
+    part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
+    calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
+    cannot be judged here and why; conditions of the session that effects know; respond asks the forward model for further
+    variants; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
+    the residual: what they do, at their strengths.
+    """
+
+    residual: NDArray[np.float64]
+    factors: NDArray[np.float64]
+    factor_names: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    variants: tuple[Variant, ...]
+    names: tuple[ProbeName, ...]
+    series_of: NDArray[np.intp]
+    sd: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    groups: NDArray[np.intp]
+    group_names: tuple[str, ...]
+    parts: NDArray[np.intp]
+    part_names: tuple[str, ...]
+    blocks: NDArray[np.intp]
+    views: tuple[SeriesView, ...]
+    base: Twin
+    gain_shares: dict[str, float]
+    dark_weights: dict[float, dict[str, float]]
+    skipped: tuple[str, ...]
+    missing_effects: dict[str, str]
+    conditions: dict[str, float]
+    respond: Responder
+    side: int = 1
+    given: tuple[Point, ...] = ()
+
+    def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
+        """The residual (probe,) of the base less those of its own effects that are among these."""
+        left = self.residual.copy()
+        for point in self.given:
+            if point.curve.effect in effects:
+                left += point.curve.response(point.strength)
+        return left
+
+    def left_by(
+        self, strengths: Mapping[str, tuple[Curve, float]], *, without: Sequence[str] = ()
+    ) -> NDArray[np.float64]:
+        """What effects, with their curves and strengths, leave of the residual (probe,).
+
+        They take the place of the base's own; of these, those in `without` are not there either.
+        """
+        left = self.residual_without((*strengths, *without))
+        for curve, strength in strengths.values():
+            left -= curve.response(strength)
+        return left
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """Place of each probe (probe,): one axis of one series."""
+        axes = {axis: number for number, axis in enumerate(dict.fromkeys(name.axis for name in self.names))}
+        return np.array(
+            [
+                int(series) * len(axes) + axes[name.axis]
+                for series, name in zip(self.series_of, self.names, strict=True)
+            ],
+            dtype=np.intp,
+        )
+
+    @property
+    def asked_in_blocks(self) -> Blocks:
+        """Series that share local nuisances, and what it costs to ask the forward model for them."""
+        costs = np.zeros(int(self.blocks.max()) + 1)
+        for number, first in zip(*np.unique(self.series_of, return_index=True), strict=True):
+            scene = self.views[number].session.series.kind == "object"
+            costs[self.blocks[first]] += 1.0 if scene else _WITHOUT_SCENE
+        return Blocks(of=self.blocks, costs=costs)
+
+    def released(self) -> "Problem":
+        """Without the frames' projections that `respond` holds."""
+
+        def spent(asked: Sequence[Variant], wanted: NDArray[np.bool_] | None = None) -> dict[int, NDArray[np.float64]]:
+            raise RuntimeError(f"{len(asked)} variants asked of a problem whose projections were released")
+
+        return replace(self, respond=spent)
+
+    def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
+        """With further variants and their responses (strength, probe)."""
+        curves = []
+        for variant, responses in more:
+            # what an effect does by chance depends on its onset (lost bits lower later levels only), and on the direction of a heel
+            alike = [item for item in self.curves if (item.effect, item.since) == (variant.effect, variant.since)]
+            like = next((item for item in alike if item.variant == variant.refined_from), alike[0])
+            curves.append(variant.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact))
+        return replace(
+            self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
+        )

@@ -1,0 +1,184 @@
+"""One series in numbers: its standardised residual, and what nuisances, changes and chance do to it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ..model import changes as scales
+from ..model.changes import Variant
+from ..model.responses import Asked, Moved, SessionModel
+from ..probes.probes import ProbeName
+from ..probes.scalar_context import time_templates
+from ..session.session import SessionSeries
+from .nuisance_columns import (
+    Columns,
+    changed_gain_pattern,
+    gain_map_noise,
+    level_of,
+    local_nuisances,
+    noise_of_lines,
+    offset_of_later,
+    uneven,
+)
+from .output_course import OutputCourse
+from .series_probes import MeanFrame, SeriesProbes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesBlock:
+    """The part of a problem that one series makes; its probes are standardised.
+
+    Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
+    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
+    pattern_jitter (probe,): what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to
+    rows (to columns) does; uneven (2, probe), by number of change: more of it on one side of the panel.
+    """
+
+    session: SessionSeries
+    names: list[ProbeName]
+    residual: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    nuisances: Columns
+    responses: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    pattern: NDArray[np.float64]
+    pattern_jitter: NDArray[np.float64]
+    lines: NDArray[np.float64]
+    uneven: dict[int, NDArray[np.float64]]
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+def series_block(
+    session: SessionModel,
+    probes: SeriesProbes,
+    frame: MeanFrame,
+    asked: Sequence[Asked],
+    moved: Sequence[Moved | None],
+    thicker: dict[str, Moved],
+) -> SeriesBlock:
+    """One series in numbers.
+
+    Args:
+        session: all series as the base twin expects them.
+        probes: of this series.
+        frame: its mean frame against the model.
+        asked: changes.
+        moved: what each does to this series.
+        thicker: what its scene with one material thicker by THICKNESS_SD would show, by material.
+    """
+    signal, shrink = frame.signal_DN, probes.shrink
+    nuisances = local_nuisances(
+        probes, signal, thicker, sharp=session.model.sharp, beams_differ=session.model.beams_differ
+    ) | gain_map_noise(session, probes, signal)
+    responses = np.zeros((len(asked), len(probes)))
+    known = [(number, found) for number, found in enumerate(moved) if found is not None]
+    if known:
+        responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
+    pattern, jitter = changed_gain_pattern(probes, signal)
+    by_side = uneven(
+        probes,
+        {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
+        signal.shape,
+    )
+    return SeriesBlock(
+        session=probes.series.session,
+        names=probes.names,
+        residual=probes.residual(frame.residual_DN),
+        sd=probes.sd,
+        noise=probes.noise,
+        nuisances={name: column * shrink for name, column in nuisances.items()},
+        responses=responses,
+        offset=offset_of_later(probes) * shrink,
+        pattern=pattern * shrink[:, None],
+        pattern_jitter=jitter * shrink**2,
+        lines=noise_of_lines(probes) * shrink**2,
+        uneven={number: columns * shrink for number, columns in by_side.items()},
+    )
+
+
+def _random_of(label: str) -> str:
+    """What is random of a change; nothing of a nuisance."""
+    return EFFECTS[label].variation.random if label in EFFECTS else ""
+
+
+def _places(blocks: Sequence[SeriesBlock]) -> list[slice]:
+    """Where each series' probes lie among those of all."""
+    stops = np.cumsum([len(block) for block in blocks])
+    return [slice(int(stop) - len(block), int(stop)) for block, stop in zip(blocks, stops, strict=True)]
+
+
+def by_chance(
+    variant: Variant, blocks: Sequence[SeriesBlock], row: int, readout_ms: float | None
+) -> NDArray[np.float64] | None:
+    """Random responses (probe, factor) a unit of strength; None: the effect does nothing by chance.
+
+    A drifting output moves each lit series' level and trend by chance; a dark's drift or a heel may be uneven over the panel;
+    a part of a gain map's change is smooth; bits that are cut off lower every level. row: number of the variant's first change.
+    """
+    random = EFFECTS[variant.effect].variation.random
+    if random == "sides":
+        sides = np.zeros((sum(map(len, blocks)), 2))
+        for block, place in zip(blocks, _places(blocks), strict=True):
+            if row in block.uneven:
+                sides[place] = block.uneven[row].T
+        return sides * (scales.UNEVEN_SHARE / variant.strengths[0])
+    if random == "offset" and variant.since == "calibration":
+        # lost bits may be cut off or rounded away: half a step between the two
+        return np.concatenate([block.offset for block in blocks])[:, None] * scales.CUT_OFF_SHARE
+    if random == "pixels":
+        return np.concatenate([block.pattern for block in blocks])
+    return _of_output(variant, blocks, readout_ms) if random == "output" else None
+
+
+def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: float) -> NDArray[np.float64] | None:
+    """Variance (probe,) a unit of strength squared that an effect gives each probe by itself; None: none.
+
+    A gain map changes from pixel to pixel; lines of a few frames differ by chance in their means.
+    """
+    random = EFFECTS[variant.effect].variation.random
+    if random == "pixels":
+        return np.concatenate([block.pattern_jitter for block in blocks])
+    if random == "lines":
+        columns = variant.parameters["column_share"]
+        shares = read_noise_DN**2 * np.array([1.0 - columns, columns])
+        every = variant.since == "always"
+        return np.concatenate([shares @ block.lines * float(every or not block.session.calibrates) for block in blocks])
+    return None
+
+
+def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:
+    """What a wandering output does by chance (probe, factor): levels of lit series together, trend and common factor of each."""
+    size = sum(map(len, blocks))
+    lit = [
+        (block, place) for block, place in zip(blocks, _places(blocks), strict=True) if block.session.request.beam_on
+    ]
+    if not lit:
+        return None
+    own = variant.parameters
+    wanders = OutputCourse(own["correlation_s"], own["jitter_share"], own.get("idle_s", 0.0))
+    means = wanders.means([block.session.request for block, _ in lit], readout_ms)
+    single = []  # (probe, what it does by itself)
+    levels = np.zeros((size, means.shape[1]))
+    for (block, place), shares in zip(lit, means, strict=True):
+        amount = 0.01 / scales.LEVEL_OF_SERIES_SD * block.nuisances[level_of(block.session)]
+        np.multiply.outer(amount, shares, out=levels[place])
+        request = block.session.request
+        profiles = dict(time_templates(request.frames))
+        for index, name in enumerate(block.names):
+            if name.statistic.startswith("trend"):
+                along = wanders.along(profiles[name.statistic.removeprefix("trend ")], request, readout_ms)
+                single.append((place.start + index, 0.01 * along / math.sqrt(request.frames) / block.sd[index]))
+            elif name.statistic == "frame_factor":
+                steps = wanders.steps(request, readout_ms)
+                single.append((place.start + index, 0.5 * steps / block.sd[index]))
+    alone = np.zeros((size, len(single)))
+    for column, (probe, amount_of_one) in enumerate(single):
+        alone[probe, column] = amount_of_one
+    return np.concatenate([levels, alone], axis=1)

@@ -1,0 +1,270 @@
+"""How one series is turned into standardised numbers: what its mean frame is projected on, and its scalar probes."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ..model import changes as scales
+from ..model.calibrated_maps import CalibratedMaps
+from ..model.changes import Variant
+from ..model.forward_model import strength_rows
+from ..model.placing import SHARP_SCENES, displacement_probes, inside
+from ..model.responses import Moved, SeriesModel, SessionModel
+from ..probes.fixed_pattern import count_outliers, pattern_statistics
+from ..probes.frame_scalars import measured_scalars
+from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
+from ..probes.probes import ProbeName, Scalar
+from ..probes.registration import render_variance
+from ..session.even_maps import Map, full_size, signal_map
+from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
+
+_NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
+_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeanFrame:
+    """A series' corrected mean frame against the model; maps (row, column).
+
+    Fields: signal_DN: expected; residual_DN: measured less expected; mask: pixels that are compared; quantum_DN2, white_DN2: variance
+    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white.
+    """
+
+    signal_DN: NDArray[np.float64]
+    residual_DN: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    quantum_DN2: NDArray[np.float64]
+    white_DN2: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesProbes:
+    """The probes of one series: projections of its mean frame, then scalars.
+
+    Fields: series; projection; scalars: measured; shrink (probe,): what each number is multiplied with to have unit noise again once
+    the floor of what edges show is added.
+    """
+
+    series: SeriesModel
+    projection: MapProjection
+    scalars: tuple[Scalar, ...]
+    shrink: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.shrink)
+
+    @property
+    def names(self) -> list[ProbeName]:
+        """One name a probe."""
+        return self.projection.names() + [_named(probe) for probe in self.scalars]
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """Standard deviation (probe,) of scalar probes in their unit; 1 for map probes."""
+        return np.concatenate([np.ones(len(self.projection)), [probe.sd for probe in self.scalars]])
+
+    @property
+    def noise(self) -> NDArray[np.float64]:
+        """Counting noise's share (probe,) of each probe's standard deviation."""
+        shares = [probe.sampling_sd / probe.sd for probe in self.scalars]
+        return np.concatenate([np.ones(len(self.projection)), shares]) * self.shrink
+
+    def residual(self, residual_DN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Measured less expected (probe,), standardised; residual_DN: of the mean frame (row, column)."""
+        expected = self.series.scalars
+        scalars = np.array([(probe.value - expected[probe.name]) / probe.sd for probe in self.scalars])
+        return np.concatenate([self.projection.apply(residual_DN), scalars]) * self.shrink
+
+    def responses(self, moved: Sequence[Moved]) -> NDArray[np.float64]:
+        """Responses (change, probe), standardised, to changes of the mean frame and of the scalars."""
+        expected = self.series.scalars
+        maps = self.projection.apply_each([image for image, _ in moved])
+        scalars = np.array(
+            [
+                [
+                    (values.get(probe.name, expected[probe.name]) - expected[probe.name]) / probe.sd
+                    for _, values in moved
+                ]
+                for probe in self.scalars
+            ]
+        ).reshape(-1, len(moved))
+        return np.asarray(np.concatenate([maps, scalars.T], axis=1) * self.shrink)
+
+    def of_maps(self, images_DN: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Responses (image, probe), not shrunk, to changes of the mean frame alone (image, row, column)."""
+        return self.without_scalars(self.projection.apply(images_DN))
+
+    def without_scalars(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses (image, probe) of which the map probes' are given (image, map probe) and the scalars' are 0."""
+        return np.pad(projected, ((0, 0), (0, len(self.scalars))))
+
+    def of_scalars(self, change: Callable[[Scalar], float]) -> NDArray[np.float64]:
+        """Response (probe,), not shrunk, to changes of the scalars alone, each in its unit."""
+        return np.concatenate([np.zeros(len(self.projection)), [change(probe) / probe.sd for probe in self.scalars]])
+
+
+def _named(probe: Scalar) -> ProbeName:
+    return ProbeName(axis=probe.axis, statistic=probe.name, location="", unit=probe.unit)
+
+
+def mean_frame(
+    one: SeriesModel,
+    corrected_DN: NDArray[np.float64],
+    maps: CalibratedMaps,
+    *,
+    side: int,
+) -> MeanFrame:
+    """A series' corrected mean frame (row, column) against the model.
+
+    side: of the squares of the panel's pixels that stand for pixels.
+    """
+    clean, frames, expected = one.context.good, one.session.series.n_frames, one.expected
+    shape = clean.shape
+    signal = signal_map(expected, shape)
+    mask = clean if one.placement is None else inside(clean, one.placement)
+    quantum = full_size(expected.quantum_variance_DN2, shape)
+    white = full_size(expected.white_variance_DN2, shape)
+    if one.session.request.beam_on and float(white.min()) <= LEAST_NOISE_DN2:
+        came = variance_of_what_came(quantum + white, signal, corrected_DN)
+        quantum = np.maximum(quantum, came - white)
+    white = np.maximum(white, LEAST_NOISE_DN2)
+    quantum = quantum / frames + signal**2 * maps.gain_quantum
+    white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
+    if one.session.series.kind == "object":
+        white = white + render_variance(signal, side=side)
+        if one.session.request.scene_kind not in SHARP_SCENES:
+            # steps of wedges and outlines of products are rendered no better than their maps' pixels
+            mask = mask & ~_near_steps(signal)
+    return MeanFrame(
+        signal_DN=signal, residual_DN=corrected_DN - signal, mask=mask, quantum_DN2=quantum, white_DN2=white
+    )
+
+
+def variance_of_what_came(
+    variance_DN2: NDArray[np.float64], signal_DN: NDArray[np.float64], corrected_DN: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Variance (row, column), DN^2, that the light which is there gives a frame, by the mean ratio of variance to signal.
+
+    Without noise of the detector's own, a deep shadow has none by the model, and light that strays there the evidence of thousands.
+    """
+    from scipy.ndimage import uniform_filter
+
+    seen = uniform_filter(np.asarray(corrected_DN, dtype=np.float64), _NEIGHBOURS_PX)
+    return np.asarray(seen * float(variance_DN2.sum()) / max(float(signal_DN.sum()), 1e-9))
+
+
+def _near_steps(signal: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels within two of a step in the signal."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
+    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
+    return steps
+
+
+def series_probes(
+    session: SessionModel,
+    one: SeriesModel,
+    frame: MeanFrame,
+    *,
+    summary: SeriesSummary,
+    moved: Sequence[Moved | None],
+    variants: Sequence[Variant],
+    all_outliers: int,
+    memory: tuple[float, int] | None,
+) -> SeriesProbes:
+    """The probes of one series.
+
+    Args:
+        session: all series as the base twin expects them.
+        one: this series.
+        frame: its mean frame against the model.
+        summary: what its frames' noise says.
+        moved: what the changes do to it, those of variants' strengths first.
+        variants: effects to try; the mean frame is projected on what each does at its first strength.
+        all_outliers: pixels that stand out in any series.
+        memory: of outlying pixels in this series, see `memory_of`.
+    """
+    first = [(variant, moved[rows[0]]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
+    projection = MapProjection(
+        _templates(session, one, frame, [(variant, found[0]) for variant, found in first if found is not None]),
+        mask=frame.mask,
+        quantum_DN2=frame.quantum_DN2,
+        white_DN2=frame.white_DN2,
+        autocovariance_table=one.expected.noise_autocovariance,
+    )
+    kind, good, clean = one.session.series.kind, session.maps.good, one.context.good
+    pattern, outliers = None, None
+    if kind in ("flat", "dark"):
+        lit = frame.signal_DN if kind == "flat" else None
+        pattern = pattern_statistics(frame.residual_DN, lit, clean=clean, good=good)
+        noise = frame.quantum_DN2 + frame.white_DN2
+        least_DN = scales.DUST_LIMIT * frame.signal_DN if kind == "flat" else None
+        outliers = count_outliers(
+            frame.residual_DN, noise, pattern.pixel_DN2, clean=clean, good=good, least_DN=least_DN
+        )
+    scalars = measured_scalars(
+        summary,
+        one.expected,
+        one.context,
+        dark_mean_DN=float(np.mean(session.maps.darks.under(one.session)[clean])),
+        pattern=pattern,
+        outliers=outliers,
+        all_outliers=all_outliers,
+        memory=memory,
+    )
+    scalars = [probe for probe in scalars if probe.name in one.scalars]
+    if one.placement is not None and one.tells_displacement:
+        scalars += displacement_probes(one.placement)
+    # noise of lines that is no effect stands in the mean frame as well
+    beyond = np.asarray(session.usual_lines(one.session)) @ projection.line_noise()
+    at_edges = [
+        kind == "object" and name.axis == "sharpness" and name.statistic == "mean frame" for name in projection.names()
+    ]
+    floors = scales.SHARPNESS_FLOOR * np.array(at_edges, dtype=np.float64)
+    return SeriesProbes(
+        series=one,
+        projection=projection,
+        scalars=tuple(scalars),
+        shrink=np.concatenate([1.0 / np.sqrt(1.0 + floors**2 + beyond), np.ones(len(scalars))]),
+    )
+
+
+def _templates(
+    session: SessionModel, one: SeriesModel, frame: MeanFrame, likenesses: Sequence[tuple[Variant, Map]]
+) -> list[Template]:
+    """What a mean frame is projected on, the plain shapes first; likenesses: what effects do to it."""
+    kind, signal = one.session.series.kind, frame.signal_DN
+    templates = smooth_templates(signal, frame.mask, kind=kind)
+    if kind == "object":
+        open_map = np.full(signal.shape, float(np.max(signal)))
+        templates += transmission_templates(signal, open_map, frame.mask)
+        templates += edge_templates(signal)
+    if kind == "afterglow":
+        templates += _ghost_templates(one, session.series, signal.shape)
+    templates += [
+        Template(
+            axis=EFFECTS[variant.effect].shows.axis,
+            name=f"like {variant.effect} {variant.name}".strip(),
+            unit="1",
+            image=image,
+        )
+        for variant, image in likenesses
+        if image.shape == signal.shape
+    ]
+    return templates
+
+
+def _ghost_templates(one: SeriesModel, series: Sequence[SeriesModel], shape: tuple[int, ...]) -> list[Template]:
+    """The picture exposed last before an afterglow."""
+    lit = [
+        other
+        for other in series
+        if other.session.request.beam_on and other.session.series.index < one.session.series.index
+    ]
+    if not lit:
+        return []
+    return [Template(axis="time", name=f"ghost of {lit[-1].name}", unit="1", image=signal_map(lit[-1].expected, shape))]

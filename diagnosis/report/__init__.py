@@ -1,0 +1,7 @@
+"""The answer in words and pictures.
+
+Files:
+    explanation   one paragraph
+    figures       gap maps, curves, hypotheses
+    report        the page
+"""

@@ -1,0 +1,204 @@
+"""The diagnosis in plain words: one paragraph that can be read once."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ...generator.effects import EFFECTS
+from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
+
+_NAMED_DOUBTS = 3
+_NAMED_STRAINED = 3
+_NAMED_UNTESTED = 8
+_NAMED_FAMILIES = 4
+_SHAPED_LIKE = "like "  # templates of what effects would do
+_KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
+_AXIS_WORDS = {
+    "level": "brightness",
+    "noise": "noise",
+    "sharpness": "sharpness at edges",
+    "texture": "noise texture",
+    "time": "change with time",
+    "position": "pattern across the field",
+    "energy": "change with tube voltage",
+    "tails": "outlying pixels and codes",
+}
+
+
+def title_of(effect: str) -> str:
+    """The effect's name in words."""
+    return EFFECTS[effect].title if effect in EFFECTS else effect
+
+
+def axis_text(axis: str) -> str:
+    """An axis of the gap in words."""
+    return _AXIS_WORDS.get(axis, axis)
+
+
+def _percent(value: tuple[float, float, float]) -> str:
+    return f"{100 * value[0]:.0f} % ({100 * value[1]:.0f} to {100 * value[2]:.0f})"
+
+
+def strength_text(cause: Cause) -> str:
+    """Strength with its 95 % interval and unit."""
+    value, low, high = cause.strength
+    digits = min(max(0, 2 - math.floor(math.log10(max(value, 1e-9)))), 4)
+    if cause.sign < 0:
+        value, low, high = -value, -high, -low
+    return f"{value:.{digits}f} {cause.unit} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def location_text(location: str) -> str:
+    """Where within a series, in words; what effects would do is called by their titles."""
+    if not location.startswith(_SHAPED_LIKE):
+        return location
+    return f"in the shape of: {title_of(location.removeprefix(_SHAPED_LIKE).split(' ')[0])}"
+
+
+def _place_text(place: Place) -> str:
+    where = location_text(place.location)
+    what = f"{place.statistic}, {where}" if where else place.statistic
+    return f"{axis_text(place.axis)} of {place.series} ({what}, z {place.z:+.1f})"
+
+
+def _family_text(axis: str, kind: str, scene: str) -> str:
+    """One axis of a kind of series, or of those of a scene."""
+    return f"{axis_text(axis)} of {scene or _KIND_WORDS.get(kind, kind)}"
+
+
+def _signature_text(diagnosis: Diagnosis) -> str:
+    """Where an effect outside the catalogue is seen most, and its largest departures, one a kind of series and axis."""
+    series = {view.session.name: view.session.series for view in diagnosis.compared.views}
+    largest: dict[str, float] = {}
+    for place in diagnosis.where:
+        # objects of all scenes together: a signature is not one product's
+        kind = series[place.series].kind if place.series in series else ""
+        family = _family_text(place.axis, kind, "" if kind else place.series)
+        if abs(place.z) > abs(largest.get(family, 0.0)):
+            largest[family] = place.z
+    text = ""
+    axis, _, where = diagnosis.unknown_location.partition(" of ")
+    if where:
+        kind, _, scene = where.partition(" ")
+        text = f" It is seen most in the {_family_text(axis, kind, scene)}."
+    if largest:
+        shown = sorted(largest.items(), key=lambda item: -abs(item[1]))[:_NAMED_FAMILIES]
+        text += f" Its signature: {'; '.join(f'{family} (z {z:+.0f})' for family, z in shown)}."
+    return text
+
+
+def _where_text(places: Sequence[Place]) -> str:
+    if not places:
+        return "No single probe stands out beyond noise and what calibration leaves open."
+    axes = list(dict.fromkeys(axis_text(place.axis) for place in places[:12]))
+    return f"The gap shows in {', '.join(axes[:3])}; most clearly in the {_place_text(places[0])}."
+
+
+def compared_text(diagnosis: Diagnosis) -> str:
+    """What was compared, what was left out, and what these series could not show."""
+    kinds: dict[str, int] = {}
+    for view in diagnosis.compared.views:
+        kinds[view.session.series.kind] = kinds.get(view.session.series.kind, 0) + 1
+    told = ", ".join(f"{number} of kind {kind}" for kind, number in kinds.items())
+    text = f"{sum(kinds.values())} series were compared ({told})"
+    left_out = len(diagnosis.warnings) - len(diagnosis.mislabelled)
+    if left_out:
+        text += f", {left_out} could not be used"
+    if diagnosis.not_tested:
+        names = [title_of(effect) for effect in diagnosis.not_tested]
+        shown = ", ".join(names[:_NAMED_UNTESTED]) + (" and others" if len(names) > _NAMED_UNTESTED else "")
+        text += f"; {len(names)} of the catalogue's {len(EFFECTS)} effects would not show in them: {shown}"
+    return text + "."
+
+
+def strained_text(diagnosis: Diagnosis) -> str:
+    """Nuisances that the frames pull far from what is known of them; empty without any."""
+    if not diagnosis.strained:
+        return ""
+    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED_STRAINED])
+    more = len(diagnosis.strained) - _NAMED_STRAINED
+    shown += f" and {more} more" if more > 0 else ""
+    return f"Pulled far from what is known of it: {shown}. Check these maps, labels and positions."
+
+
+def paragraph(diagnosis: Diagnosis) -> str:
+    """Verdict, where, which, how far; labels in doubt come first, what the session could not show comes last."""
+    text = verdict_text(diagnosis)
+    if diagnosis.mislabelled:
+        doubts = [item.text for item in diagnosis.mislabelled]
+        shown = "; ".join(doubts[:_NAMED_DOUBTS])
+        more = f"; and {len(doubts) - _NAMED_DOUBTS} more" if len(doubts) > _NAMED_DOUBTS else ""
+        text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
+    if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
+        text += f" {compared_text(diagnosis)}"
+    if diagnosis.strained and diagnosis.verdict not in EXPLAINED:
+        text += f" {strained_text(diagnosis)}"
+    for note in diagnosis.notes:
+        text += f" {note[0].upper()}{note[1:]}."
+    return text
+
+
+def verdict_text(diagnosis: Diagnosis) -> str:
+    """Where, which and how far, without what the session could not show."""
+    gap = diagnosis.gap
+    figures = f"On data the fit did not see the gap is {gap.before:.2f} (1 is noise)"
+    if diagnosis.mislabelled:
+        return f"{_where_text(diagnosis.where)} {figures}."
+    if diagnosis.verdict == "no_gap":
+        return (
+            f"The session agrees with its twin (probability {diagnosis.probability_no_gap:.2f} that nothing is missing). "
+            f"{figures}."
+        )
+    where = _where_text(diagnosis.where)
+    if diagnosis.verdict == "unknown_effect":
+        return (
+            f"{where} No effect of the catalogue, and no pair of them, explains it (probability"
+            f" {diagnosis.probability_unknown:.2f} of an effect that is not in the catalogue).{_signature_text(diagnosis)}"
+            f" {figures}."
+        )
+    if diagnosis.verdict == "ambiguous":
+        named = ", ".join(f"{title_of(cause.effect)} ({cause.probability:.2f})" for cause in diagnosis.causes[:5])
+        text = f"{where} These data cannot tell apart what causes it: {named}. {figures}."
+        if diagnosis.next_measurement:
+            text += f" To tell them apart: {diagnosis.next_measurement['text']}."
+        return text
+    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
+    named = "; ".join(
+        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}" for cause in leading
+    )
+    text = f"{where} It is explained by: {named}. {figures}"
+    if gap.shrinks_by is not None:
+        value, low, high = (min(one, 1.0) for one in gap.shrinks_by)
+        text += f" and falls to {gap.after:.2f} once that is added, by {_percent((value, low, high))} of what is above noise."
+    else:
+        text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
+    return text + _rest_text(diagnosis, leading)
+
+
+def _rest_text(diagnosis: Diagnosis, leading: Sequence[Cause]) -> str:
+    """By how much laws of what is named are off here, and where they leave most; empty where they fit."""
+    if diagnosis.verdict != "explained_in_part":
+        return ""
+    off = [f"{title_of(cause.effect)} by some {100.0 * cause.level:.0f} %" for cause in leading if cause.level > 0.0]
+    told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
+    left = leading[0].left if leading else ()
+    place = f", most in the {_place_text(left[0])}" if left else ""
+    return f" The law leaves a rest that is no noise{place}{told}."
+
+
+def task_text(task: Mapping[str, Any]) -> str:
+    """What the gap means for detection: a90 as the twin had it, as the improved twin has it, as measured."""
+    unit = f" {task['unit']}" if task["unit"] else ""
+
+    def told(name: str) -> str:
+        value, interval = task[name], task[f"{name}_95"]
+        if value is None:
+            return "none that the data support"
+        low, high = ("?" if end is None else f"{end:.3g}" for end in (interval["low"], interval["high"]))
+        return f"{value:.3g}{unit} ({low} to {high})"
+
+    what = "the size" if task["size"] == "size_mm" else "the contrast"
+    start = f"In detection, {what} found in nine of ten cases (a90)"
+    if not task["effects"]:
+        return f"{start} is {told('a90_before')} by the twin; measured: {told('a90_real')}."
+    return f"{start} moves from {told('a90_before')} to {told('a90_after')}; measured: {told('a90_real')}."

@@ -1,0 +1,322 @@
+"""Pictures of a diagnosis: gap maps, curves by axis, before and after, hypotheses."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ...reports import AFTER, BEFORE, MEASURED, Band, Bars, Chart, Line, Picture, Points, Rule
+from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks
+from ..inference.inference import UNKNOWN
+from ..judgement.answer import Diagnosis
+from ..problem.problem import SeriesView
+from .explanation import axis_text
+
+# of -log transmission, evenly up to 2 and by its logarithm beyond
+_DEPTH_TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
+_EVEN_DEPTH, _EVEN_Z = 2.0, 5.0
+_WIDEST_LINEAR = 20.0  # times noise: beyond it bars are drawn on a logarithm
+_MOST_HYPOTHESES, _LEAST_PROBABILITY = 10, 1e-4
+
+
+def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Residual over noise after averaging over 5 x 5 pixels (row, column)."""
+    from scipy.ndimage import uniform_filter
+
+    inside = view.mask.astype(np.float64)
+    weight = uniform_filter(inside, 5)
+    value = uniform_filter(np.where(view.mask, residual, 0.0).astype(np.float64), 5) / np.maximum(weight, 1e-9)
+    noise = uniform_filter(np.where(view.mask, view.noise_DN, 0.0).astype(np.float64) ** 2, 5) / np.maximum(
+        weight, 1e-9
+    )
+    return np.asarray(np.where(weight > 0.2, value / np.sqrt(np.maximum(noise, 1e-30)), np.nan))
+
+
+def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, count: int = 4) -> list[Picture]:
+    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after, the series with most gap first.
+
+    Args:
+        diagnosis: with what was compared.
+        after: (series) residuals (row, column) with the effects added, DN.
+        count: of series.
+    """
+    views = diagnosis.compared.views
+    pictures = []
+    for index in _worst_views(diagnosis, count):
+        view = views[index]
+        before = _smoothed_z(view, view.residual_DN)
+        limit = max(3.0, float(np.nanquantile(np.abs(before), 0.98)))
+        parts = (("before", before), ("after", _smoothed_z(view, after[index])))
+        for word, values in parts if diagnosis.added else parts[:1]:
+            rms = math.sqrt(float(np.nanmean(values**2)))
+            told = {"before": "the twin", "after": "the twin with what was found"}[word]
+            pictures.append(
+                Picture(
+                    name=f"gap_{word}_{view.session.name}",
+                    title=f"{view.session.name}: {word}" if diagnosis.added else view.session.name,
+                    alt=f"Measured less {told}, in units of one pixel's noise: {rms:.3g} rms. Means of 5 x 5 pixels.",
+                    values=values,
+                    label="measured less twin, in noise",
+                    ends=(-limit, limit),
+                    height_px=290,
+                )
+            )
+    return pictures
+
+
+def _worst_views(diagnosis: Diagnosis, count: int) -> list[int]:
+    problem = diagnosis.compared
+    power = np.zeros(len(problem.views))
+    is_map = np.array([name.statistic == "mean frame" for name in problem.names])
+    for index in range(len(problem.views)):
+        chosen = (problem.series_of == index) & is_map
+        power[index] = float(np.mean(problem.residual[chosen] ** 2)) if chosen.any() else 0.0
+    seen: set[tuple[Any, ...]] = set()
+    result = []
+    for index in np.argsort(-power):
+        series = problem.views[index].session.series
+        key = (series.kind, series.scene, series.kV)
+        if key in seen:
+            continue
+        seen.add(key)
+        result.append(int(index))
+        if len(result) == count:
+            break
+    return result
+
+
+def transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]]) -> list[Chart]:
+    """Gap in percent of the open field against -log transmission, every scene with known thickness; before and after."""
+    lines: tuple[list[Line], list[Line]] = ([], [])
+    colours: dict[str, str] = {}  # of a sort of scene
+    deepest = 1.0
+    for index, view in enumerate(diagnosis.compared.views):
+        if view.session.series.kind != "object":
+            continue
+        open_DN = float(view.signal_DN.max())
+        depth = -np.log(np.clip(view.signal_DN / open_DN, 1e-6, None))
+        edges = np.unique(np.quantile(depth[view.mask], np.linspace(0, 1, 13)))
+        middle: list[float] = []
+        values: tuple[list[float], list[float]] = ([], [])
+        for low, high in pairwise(edges):
+            inside = view.mask & (depth >= low) & (depth <= high)
+            if inside.sum() < 16:
+                continue
+            middle.append(0.5 * (low + high))
+            for part, residual in zip(values, (view.residual_DN, after[index]), strict=True):
+                part.append(100.0 * float(np.mean(residual[inside])) / open_DN)
+        if len(middle) > 1:
+            sort = view.session.request.scene_kind or "object"
+            colour = colours.setdefault(sort, SERIES_COLOURS[len(colours) % len(SERIES_COLOURS)])
+            dashed = list(colours).index(sort) % 2 == 1
+            deepest = max(deepest, middle[-1])
+            for mine, part in zip(lines, values, strict=True):
+                mine.append(Line(x=middle, y=part, colour=colour, label=sort, dashed=dashed, thin=True))
+    if not colours:
+        return []
+    largest = max(float(np.max(np.abs(line.y))) for line in lines[0])
+    ticks = {tick: f"{tick:g}" for tick in _DEPTH_TICKS if tick <= max(1.05 * deepest, 0.5)}
+    shown = (("before", lines[0]), ("after", lines[1])) if diagnosis.added else (("before", lines[0]),)
+    return [
+        Chart(
+            name=f"gap_against_transmission_{word}",
+            title=word,
+            alt="Measured less twin against depth in the object, a line a series."
+            if word == "before"
+            else "The same with what was found added.",
+            marks=[Rule(at=0.0), *mine],
+            x_label="-log transmission of the twin",
+            y_label="measured less twin, % of open field",
+            x_scale="asinh",
+            linear_within=_EVEN_DEPTH,
+            x_ticks=ticks,
+            y_ends=(-1.1 * largest, 1.1 * largest),
+        )
+        for word, mine in shown
+    ]
+
+
+def held_out_chart(diagnosis: Diagnosis) -> Chart:
+    """Held-out gap as a whole and by axis, before and after, with the floor of measured against measured."""
+    gap = diagnosis.gap
+    rows = [
+        ("all", gap.before, gap.after, gap.floor),
+        *((axis_text(name), before, after, floor) for name, before, after, floor in diagnosis.held_out),
+    ]
+    y = np.arange(len(rows), dtype=float)
+    names = [row[0] for row in rows]
+    largest = max(max(row[1:]) for row in rows)
+    long = largest > _WIDEST_LINEAR
+    smallest = 0.7 * min(min(value for value in row[1:] if value > 0) for row in rows)
+    marks: list[Any] = [
+        Bars(
+            y=y - 0.19,
+            length=[row[1] for row in rows],
+            thickness=0.34,
+            colour=BEFORE,
+            label="before",
+            names=names,
+            numbers=True,
+        )
+    ]
+    if diagnosis.added:
+        after = [row[2] for row in rows]
+        marks.append(
+            Bars(y=y + 0.19, length=after, thickness=0.34, colour=AFTER, label="after", names=names, numbers=True)
+        )
+    marks.append(
+        Points(
+            x=[row[3] for row in rows],
+            y=y,
+            colour="#111111",
+            label="measured against measured",
+            shape="diamond",
+            names=names,
+        )
+    )
+    return Chart(
+        name="held_out_gap",
+        title="Gap on series that the fit did not use",
+        alt="Root mean square of measured less expected, in units of what noise and calibration allow (1: nothing but noise).",
+        marks=marks,
+        x_label="gap (1: noise alone)",
+        x_scale="log" if long else "linear",
+        x_ends=(smallest, 2.6 * largest) if long else (0.0, 1.15 * largest),
+        y_ticks=dict(zip(map(float, y), names, strict=True)),
+        y_ends=(-0.6, len(rows) - 0.4),
+        downwards=True,
+        height_px=110 + 42 * len(rows),
+    )
+
+
+def places_chart(diagnosis: Diagnosis) -> Chart:
+    """Every probe's z over the series in time order, by axis, with the threshold of chance."""
+    from ..inference.local_nuisances import LocalNuisances
+
+    problem = diagnosis.compared
+    z = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)
+    axes = list(dict.fromkeys(name.axis for name in problem.names))
+    series = [view.session.name for view in problem.views]
+    marks: list[Any] = [
+        Rule(at=sign * diagnosis.threshold_z, label="chance, 5 % of sessions" if sign > 0 else "") for sign in (1, -1)
+    ]
+    for number, axis in enumerate(axes):
+        chosen = np.flatnonzero([probe.axis == axis for probe in problem.names])
+        jitter = (number - len(axes) / 2) / (1.4 * len(axes))
+        named = [
+            f"{series[problem.series_of[one]]}: {problem.names[one].statistic} {problem.names[one].location}"
+            for one in chosen
+        ]
+        marks.append(
+            Points(
+                x=problem.series_of[chosen] + jitter,
+                y=z[chosen],
+                names=[text.strip() for text in named],
+                label=axis_text(axis),
+                colour=SERIES_COLOURS[number % len(SERIES_COLOURS)],
+                shape=_shape(number),
+                size_px=4.5,
+            )
+        )
+    largest = float(np.max(np.abs(z), initial=diagnosis.threshold_z))
+    step = math.ceil(len(series) / 12)
+    return Chart(
+        name="probes",
+        alt="Departure of every probe from the twin, series by series in time order. Beyond the dotted lines lies what chance"
+        " hardly gives.",
+        marks=marks,
+        x_label="series, by number",
+        y_label="z given all other probes",
+        y_scale="asinh",
+        linear_within=_EVEN_Z,
+        y_ticks=asinh_ticks(largest, linear_within=_EVEN_Z),
+        x_ticks={float(number): f"{number + 1}" for number in range(0, len(series), step)},
+        wide=True,
+        height_px=420,
+    )
+
+
+def _shape(number: int) -> Shape:
+    return SHAPES[number % len(SHAPES)]
+
+
+def hypothesis_text(effects: tuple[str, ...]) -> str:
+    """The effects of a hypothesis in words."""
+    if not effects:
+        return "no gap"
+    if effects == (UNKNOWN,):
+        return "an unknown effect"
+    return " + ".join(EFFECTS[one].title if one in EFFECTS else one for one in effects)
+
+
+def hypotheses_chart(diagnosis: Diagnosis) -> Chart:
+    """Probabilities of the leading hypotheses."""
+    shown = [item for item in diagnosis.hypotheses if item.probability > _LEAST_PROBABILITY][:_MOST_HYPOTHESES]
+    names = [hypothesis_text(item.effects) for item in shown]
+    y = np.arange(len(shown), dtype=float)
+    return Chart(
+        name="hypotheses",
+        title="What may cause the gap",
+        alt="Probability of each explanation that was weighed.",
+        marks=[Bars(y=y, length=[item.probability for item in shown], names=names, numbers=True)],
+        x_label="probability",
+        x_ends=(0.0, 1.12),
+        x_ticks={value: f"{value:g}" for value in (0.0, 0.25, 0.5, 0.75, 1.0)},
+        y_ticks=dict(zip(map(float, y), names, strict=True)),
+        y_ends=(-0.6, max(len(shown), 2) - 0.4),
+        downwards=True,
+        height_px=90 + 34 * max(len(shown), 2),
+    )
+
+
+def task_charts(task: Mapping[str, Any]) -> list[Chart]:
+    """Share of objects detected against their size: the two twins' networks on their own images, and measured ones."""
+    real = "measured_on_measured" if task["real_networks"] == "measured" else "after_on_measured"
+    left: tuple[tuple[str, str, str, Shape], ...] = (
+        ("before_on_before", "twin before", BEFORE, "square"),
+        ("after_on_after", "twin after", AFTER, "circle"),
+        (real, "measured", MEASURED, "triangle"),
+    )
+    right: tuple[tuple[str, str, str, Shape], ...] = (
+        ("before_on_measured", "learnt from the twin before", BEFORE, "square"),
+        ("after_on_measured", "learnt from the twin after", AFTER, "circle"),
+        ("measured_on_measured", "learnt from measured images", MEASURED, "triangle"),
+    )
+    charts = []
+    for name, which, title in (
+        ("expected", left, "As expected, and as measured"),
+        ("tried", right, "Tried on measured images"),
+    ):
+        marks: list[Any] = [Rule(at=0.9)]
+        for key, label, colour, shape in which:
+            curve = task["curves"].get(key)
+            if curve is None:
+                continue
+            points, line = curve["points"], curve["line"]
+            if line is not None:
+                marks.append(Band(x=line["size"], low=line["low"], high=line["high"], colour=colour))
+                marks.append(Line(x=line["size"], y=line["pod"], colour=colour, label=label))
+            share = [one["hits"] / one["n"] for one in points]
+            told = [f"{label}: {one['hits']} of {one['n']}" for one in points]
+            without = label if line is not None else f"{label} (no curve)"
+            marks.append(
+                Points(
+                    x=[one["size"] for one in points], y=share, colour=colour, shape=shape, label=without, names=told
+                )
+            )
+        charts.append(
+            Chart(
+                name=f"pod_{name}",
+                title=title,
+                alt="Share of foreign objects detected against their size, with 95 % bands; dotted: 90 %.",
+                marks=marks,
+                x_label="longest side, mm" if task["size"] == "size_mm" else "contrast",
+                y_label="share detected",
+                y_ends=(-0.03, 1.03),
+            )
+        )
+    return charts

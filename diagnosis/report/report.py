@@ -1,0 +1,277 @@
+"""The diagnosis as one self-contained HTML page."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import EFFECTS
+from ...reports import Figure, SortedTable, write_page
+from ..judgement.answer import Cause, Diagnosis
+from ..problem.assemble import map_changes
+from .explanation import (
+    axis_text,
+    compared_text,
+    location_text,
+    strained_text,
+    strength_text,
+    task_text,
+    title_of,
+    verdict_text,
+)
+from .figures import gap_maps, held_out_chart, hypotheses_chart, places_chart, task_charts, transmission_curves
+
+_MAPS = 4  # series whose maps are drawn
+_SINCE = {"calibration": "since the calibration"}
+
+
+def residuals_after(diagnosis: Diagnosis) -> list[NDArray[np.float32]]:
+    """Residual maps of each series with the leading hypothesis' effects added, DN."""
+    problem = diagnosis.compared
+    if not diagnosis.added:
+        return [view.residual_DN for view in problem.views]
+    changes = map_changes(problem, diagnosis.added)
+    return [
+        np.asarray(view.residual_DN - change, dtype=np.float32)
+        for view, change in zip(problem.views, changes, strict=True)
+    ]
+
+
+def write_report(
+    diagnosis: Diagnosis, answer: Mapping[str, Any], path: Path, *, version: str, interactive: bool | None = None
+) -> Path:
+    """Write the page; returns its path. interactive: figures that answer to the pointer; None: where Bokeh is installed."""
+    after = residuals_after(diagnosis)
+    task = answer.get("task")
+    maps = gap_maps(diagnosis, after, count=_MAPS)
+    first = 2 if diagnosis.added else 1  # of the series with most gap
+    groups: dict[str, list[Figure]] = {
+        "map": [*maps],
+        "curve": [*transmission_curves(diagnosis, after)],
+        "task": [] if task is None else [*task_charts(task)],
+    }
+    figures: dict[str, Figure] = {
+        "held_out": held_out_chart(diagnosis),
+        "places": places_chart(diagnosis),
+        "hypotheses": hypotheses_chart(diagnosis),
+    }
+    names = {group: [f"{group}_{number}" for number in range(len(items))] for group, items in groups.items()}
+    for group, items in groups.items():
+        figures |= dict(zip(names[group], items, strict=True))
+    return write_page(
+        path,
+        Path(__file__).parent / "report.html",
+        version=version,
+        figures=figures,
+        interactive=interactive,
+        headline=headline(diagnosis),
+        paragraph=lead_text(diagnosis),
+        whole_text=verdict_text(diagnosis),
+        doubts=[item.text for item in diagnosis.mislabelled],
+        key_figures=_key_figures(diagnosis),
+        proof=[*names["map"][:first], "held_out"],
+        maps=names["map"][first:],
+        curves=names["curve"],
+        steps=next_steps(diagnosis),
+        task=None if task is None else _task_rows(task),
+        task_text="" if task is None else task_text(task),
+        task_warnings=[] if task is None else task["warnings"],
+        task_setting="" if task is None else task["setting"],
+        task_figures=names["task"],
+        causes=_causes(diagnosis),
+        where=_where(answer),
+        threshold=f"{diagnosis.threshold_z:.1f}",
+        missing=SortedTable(
+            header=("effect that these series could not show", "why"),
+            rows=tuple((title_of(effect), reason) for effect, reason in diagnosis.not_tested.items()),
+            words=frozenset({0, 1}),
+        ),
+        compared=compared_text(diagnosis),
+        notes=diagnosis.notes,
+        strained=strained_text(diagnosis),
+        skipped=diagnosis.warnings[len(diagnosis.mislabelled) :],
+        probes=len(diagnosis.compared.residual),
+        nuisances=len(diagnosis.compared.factor_names),
+        inputs=answer["inputs"],
+    )
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The answer in one line."""
+    if diagnosis.mislabelled:
+        return "Labels look wrong"
+    if diagnosis.verdict == "no_gap":
+        return "No gap: the session agrees with its twin"
+    if diagnosis.verdict == "unknown_effect":
+        return "An effect that is not in the catalogue"
+    if diagnosis.verdict == "ambiguous":
+        names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
+        return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
+    named = _sentence(
+        " and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in _leading(diagnosis))
+    )
+    return f"{named}: a part of the gap" if diagnosis.verdict == "explained_in_part" else named
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def lead_text(diagnosis: Diagnosis) -> str:
+    """Where the gap is observed and what becomes of it, in two or three sentences."""
+    gap = diagnosis.gap
+    if diagnosis.mislabelled:
+        first = diagnosis.mislabelled[0].text
+        told = f"{_sentence(first)}. " if len(diagnosis.mislabelled) == 1 else ""
+        return f"{told}No effect is named until these labels are right or the series are left out."
+    if not diagnosis.added or not diagnosis.where:
+        return verdict_text(diagnosis)
+    place = diagnosis.where[0]
+    seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
+    ends = f"the gap on series that the fit did not use falls from {gap.before:.2f} to {gap.after:.2f} (1: noise alone)"
+    return f"{seen}. With what was found added to the twin, {ends}."
+
+
+def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    """What to do with the answer, most useful first: a sentence each, with a command where there is one."""
+
+    def step(text: str, command: str = "") -> dict[str, str]:
+        return {"text": text, "command": command}
+
+    measure = diagnosis.next_measurement
+    measured = (
+        [step(f"Measure: {measure['text']}.", "raytwin diagnose SESSION -o again --also NEW_SESSION")]
+        if measure and measure.get("text")
+        else []
+    )
+    if diagnosis.mislabelled:
+        return [
+            step(
+                "Check the labels named above against the log of the measurement, correct them in the sidecar and import again."
+            ),
+            step("Diagnose the session again.", "raytwin diagnose SESSION -o diagnosis"),
+        ]
+    if diagnosis.verdict == "no_gap":
+        return [
+            step(
+                "Use the twin as it is.",
+                "raytwin generate TWIN REFERENCES --low SETTING --high SETTING -n 80 -o images.h5",
+            ),
+            *measured,
+        ]
+    if diagnosis.verdict == "unknown_effect":
+        return [
+            *measured,
+            step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),
+            step("Describe the effect in a file of your own, if you know its equation (documentation: effects)."),
+        ]
+    if diagnosis.verdict == "ambiguous":
+        return [*measured, *_confirmed_by(diagnosis, diagnosis.causes[:3])]
+    use = step(
+        "Use the improved twin that lies beside this page; every command takes it.",
+        "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
+    )
+    return [use, *measured, *_confirmed_by(diagnosis, _leading(diagnosis))]
+
+
+def _confirmed_by(diagnosis: Diagnosis, causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
+    """The measurement that shows each cause by itself."""
+    known = [cause.effect for cause in causes if cause.effect in EFFECTS]
+    return [
+        {"text": f"To confirm {title_of(effect).lower()}: {EFFECTS[effect].isolated_by}.", "command": ""}
+        for effect in known
+    ]
+
+
+def _leading(diagnosis: Diagnosis) -> list[Cause]:
+    return [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
+
+
+def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
+    gap = diagnosis.gap
+    found = [
+        {"value": f"{cause.probability:.2f}", "text": f"probability of {title_of(cause.effect).lower()}"}
+        for cause in _leading(diagnosis)
+    ]
+    if diagnosis.mislabelled:
+        found = []
+    elif diagnosis.verdict == "no_gap":
+        found = [{"value": f"{diagnosis.probability_no_gap:.2f}", "text": "probability that nothing is missing"}]
+    elif diagnosis.verdict == "unknown_effect":
+        found = [
+            {"value": f"{diagnosis.probability_unknown:.2f}", "text": "probability of an effect outside the catalogue"}
+        ]
+    if diagnosis.added:
+        found.append(
+            {
+                "value": f"{gap.before:.2f} → {gap.after:.2f}",
+                "text": "gap on series that the fit did not use (1: noise alone)",
+            }
+        )
+    else:
+        found.append({"value": f"{gap.before:.2f}", "text": "gap (1: noise alone)"})
+    if diagnosis.added and gap.shrinks_by is not None:
+        value, low, high = (100.0 * min(one, 1.0) for one in gap.shrinks_by)
+        found.append(
+            {"value": f"{value:.0f} %", "text": f"of the gap above noise is removed (95 %: {low:.0f} to {high:.0f} %)"}
+        )
+    return found
+
+
+def _causes(diagnosis: Diagnosis) -> SortedTable:
+    rows = [
+        (
+            title_of(cause.effect),
+            cause.effect,
+            f"{cause.probability:.3f}",
+            strength_text(cause),
+            ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
+            _SINCE.get(cause.since, "always there"),
+            "" if cause.shrinks_by is None else f"{100.0 * min(cause.shrinks_by[0], 1.0):.0f} %",
+            f"{100.0 * cause.level:.0f} %",
+        )
+        for cause in diagnosis.causes
+    ]
+    header = ("effect", "id", "probability", "strength (95 %)", "inner parameters", "when", "gap removed", "law off by")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 4, 5}))
+
+
+def _where(answer: Mapping[str, Any]) -> SortedTable:
+    rows = [
+        (
+            axis_text(place["axis"]),
+            place["series"],
+            place["statistic"],
+            location_text(place["location"]),
+            f"{place['z']:+.1f}",
+        )
+        for place in answer["where"]
+    ]
+    header = ("axis", "series", "statistic", "location", "z")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 2, 3}))
+
+
+def _task_rows(task: Mapping[str, Any]) -> SortedTable:
+    """One line for each kind of networks and of images that they were tried on."""
+    names = {"before": "twin before", "after": "twin after", "measured": "measured images"}
+
+    def shown(value: float | None) -> str:
+        return "none" if value is None else f"{value:.3g}"
+
+    rows = []
+    for name, curve in task["curves"].items():
+        networks, _, images = name.partition("_on_")
+        interval, alarms = curve["a90_95_interval"], curve["false_alarms"]
+        rows.append(
+            (
+                names[networks],
+                names[images],
+                f"{curve['n_hits']} of {curve['n']} ({curve['objects']} objects)",
+                f"{shown(curve['a90'])} ({shown(interval['low'])} to {shown(interval['high'])})",
+                "" if alarms is None else f"{alarms['false_alarms']} of {alarms['n']}",
+            )
+        )
+    header = ("networks learnt from", "tried on", "hits", "a90 (95 %)", "false alarms")
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1}))

@@ -1,0 +1,33 @@
+"""Maps that are the same everywhere stand as (1, 1), which is quicker to add and to project; to that form, to full size, means."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+
+Map = NDArray[np.float32]
+NOWHERE: Map = np.zeros((1, 1), np.float32)
+NOWHERE.setflags(write=False)
+
+
+def compact(image: NDArray[np.floating], scale: float) -> Map:
+    """The map as float32, or (1, 1) where it is the same everywhere to 1e-7 of `scale`."""
+    first = float(image.flat[0])
+    if float(np.max(image)) - float(np.min(image)) <= 1e-7 * max(scale, 1e-12):
+        return np.full((1, 1), first, np.float32)
+    return np.asarray(image, dtype=np.float32)
+
+
+def full_size(image: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """The map (row, column), to be read only."""
+    return np.broadcast_to(np.asarray(image, dtype=np.float64), shape)
+
+
+def signal_map(expected: ExpectedSeries, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Expected signal (row, column), DN, to be read only."""
+    return full_size(expected.signal_DN, shape)
+
+
+def mean_over(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:
+    """Mean of a map over the pixels of a mask (row, column)."""
+    return float(np.mean(full_size(image, mask.shape)[mask]))

@@ -1,0 +1,78 @@
+"""Whether a twin was calibrated from the very series that it is to be compared with."""
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.acquisition_io import Series
+from ...generator.line.twin import Twin
+
+_MOST_SERIES = 12  # of each kind that are looked at
+_SURE = 10.0  # standard deviations of a variance of independent pixels; light spreads over a few
+_LEAST_SHARE = 0.05  # of a map's frames that a series must bring to be found
+_NO_NOISE = 1e-9  # DN^2
+_MOST_PAIRS = 8  # of frames that a series' noise is taken from
+
+
+def made_of(twin: Twin, series: Sequence[Series]) -> bool:
+    """Whether darks or flats among the series are in a twin's maps.
+
+    The mean frame of a series lies closer to a map that it is a part of than its own noise allows; to any other map it lies
+    further away, by that map's noise as well.
+
+    Args:
+        twin: calibrated from some session.
+        series: of a session with frames of the twin's shape.
+    """
+    good = twin.maps.bad_pixels == 0
+    sure = max(_SURE * math.sqrt(2.0 / max(int(np.count_nonzero(good)), 1)), _LEAST_SHARE)
+    return any(ratio < 1.0 - sure for ratio in chain(_darks(twin, series, good), _flats(twin, series, good)))
+
+
+def _darks(twin: Twin, series: Sequence[Series], good: NDArray[np.bool_]) -> Iterator[float]:
+    """Variance of each dark's distance from the twin's dark over that of its own noise."""
+    for item in [one for one in series if one.kind == "dark"][:_MOST_SERIES]:
+        mean_DN, noise_DN2 = _mean_and_noise(item, good)
+        if noise_DN2 > _NO_NOISE:
+            yield _variance(mean_DN - twin.maps.dark_at(item.exposure_ms), good) / noise_DN2
+
+
+def _flats(twin: Twin, series: Sequence[Series], good: NDArray[np.bool_]) -> Iterator[float]:
+    """The same of each flat's shape and the twin's for its kV and filters."""
+    for item in [one for one in series if one.kind == "flat" and "gain" not in one.corrected][:_MOST_SERIES]:
+        layers = sorted(map(str, item.filters))
+        known = [level for level in twin.levels if level.kV == item.kV and sorted(map(str, level.filters)) == layers]
+        mean_DN, noise_DN2 = _mean_and_noise(item, good)
+        if "offset" not in item.corrected:
+            mean_DN = mean_DN - twin.maps.dark_at(item.exposure_ms)
+        level_DN = float(np.median(mean_DN[good]))
+        if level_DN <= 0.0 or noise_DN2 <= _NO_NOISE:
+            continue
+        for level in known:
+            yield _variance(mean_DN / level_DN - level.flat_shape, good) * level_DN**2 / noise_DN2
+
+
+def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+    """Mean frame (row, column), DN, and variance of its noise, DN^2; 0 for a single frame, which shows none."""
+    total, noise_DN2, last = np.zeros(item.shape), [], None
+    for piece in item.iter_frames():
+        for frame in np.asarray(piece, dtype=np.float64):
+            total += frame
+            if last is not None and len(noise_DN2) < _MOST_PAIRS:
+                noise_DN2.append(_variance(frame - last, good) / 2.0)
+            last = frame
+    return total / item.n_frames, float(np.mean(noise_DN2)) / item.n_frames if noise_DN2 else 0.0
+
+
+def _variance(image: NDArray[np.float64], good: NDArray[np.bool_]) -> float:
+    """Variance of what pixels in use have of their own, without the few that a fading ghost's outline or a hot pixel shifts.
+
+    The picture that a lag left fades from frame to frame: counted as noise, it had let another day's darks pass for those of the map.
+    """
+    from scipy.stats import sigmaclip
+
+    steps = np.diff(image, axis=1)[good[:, 1:] & good[:, :-1]]
+    return float(np.var(sigmaclip(steps).clipped)) / 2.0 if steps.size else 0.0

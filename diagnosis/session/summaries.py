@@ -1,0 +1,372 @@
+"""What the frames of one series say, in one pass: the raw material of every probe.
+
+The common factor of each frame (tube output, global offset) is taken out before anything is said of single pixels, and is
+kept beside it. Noise is judged from differences of successive frames, so that slow drift stays out of it.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+
+LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
+BLOCK_PX = 8  # side of the blocks whose means show slow texture
+LEAST_NOISE_DN2 = 1e-4  # of a pixel: noise below the ADC's step can vanish, and a simulated dark may have none
+TIME_TILES = 4  # tiles a side whose means are kept frame by frame
+PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
+_QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
+_CODES_FRAMES = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesSummary:
+    """Statistics of the n frames of one series; DN throughout.
+
+    Fields: frames; mean_DN (row, column); pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
+    label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS: averages over the pixels of each noise
+    label, of which there are label_pixels (label,), and over its label_pairs (label, lag) of neighbours;
+    row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the means of rows, columns and blocks
+    of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
+    kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); tile_mean_DN (n, TIME_TILES,
+    TIME_TILES); distinct_codes, code_range: how many whole numbers occur between the 1st and 99th percentile, and how
+    many there are from the first to the last of them; highest_DN, saturated_share.
+    """
+
+    frames: int
+    mean_DN: NDArray[np.float64]
+    pair_variance_DN2: NDArray[np.float64]
+    stack_variance_DN2: NDArray[np.float64]
+    label_variance_DN2: NDArray[np.float64]
+    label_autocovariance_DN2: NDArray[np.float64]
+    label_pixels: NDArray[np.int64]
+    label_pairs: NDArray[np.int64]
+    row_variance_DN2: float
+    column_variance_DN2: float
+    block_variance_DN2: float
+    temporal_covariance_DN2: NDArray[np.float64]
+    kurtosis_excess: float
+    frame_mean_DN: NDArray[np.float64]
+    tile_mean_DN: NDArray[np.float64]
+    distinct_codes: int
+    code_range: int
+    highest_DN: float
+    saturated_share: float
+
+    def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
+        """What the frames would say without offsets of rows and columns of these variances (DN^2), new in every frame.
+
+        The variance of pixels keeps them: calibration counts them as read noise.
+        """
+        covariance = self.label_autocovariance_DN2.copy()
+        for index, (down, across) in enumerate(LAGS):
+            covariance[:, index] -= (rows_DN2 if down == 0 else 0.0) + (columns_DN2 if across == 0 else 0.0)
+        rows, columns = self.mean_DN.shape
+        return replace(
+            self,
+            label_autocovariance_DN2=covariance,
+            row_variance_DN2=max(self.row_variance_DN2 - rows_DN2 * (1.0 - 1.0 / columns), 0.0),
+            column_variance_DN2=max(self.column_variance_DN2 - columns_DN2 * (1.0 - 1.0 / rows), 0.0),
+            block_variance_DN2=max(self.block_variance_DN2 - (rows_DN2 + columns_DN2) / BLOCK_PX, 0.0),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstLook:
+    """What says which pixels and series can be used; fields as those of `SeriesSummary`."""
+
+    frames: int
+    mean_DN: NDArray[np.float64]
+    pair_variance_DN2: NDArray[np.float64]
+    stack_variance_DN2: NDArray[np.float64]
+    saturated_share: float
+
+
+_Piece = tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
+def _pieces(
+    pieces: Iterable[NDArray[Any]], good: NDArray[np.bool_], pattern: NDArray[np.floating[Any]] | None, name: str
+) -> Iterator[_Piece]:
+    """Frames as they are, in single precision, less the first one and their common factor, and steps between these."""
+    use = good.astype(np.float32)
+    n_good = int(good.sum())
+    if n_good < 16:
+        raise InputError(name, received=f"{n_good} usable pixels", expected="at least 16")
+    shape_of_one = np.ones(good.shape, np.float32) if pattern is None else np.asarray(pattern, dtype=np.float32)
+    reference: NDArray[np.float32] | None = None
+    last: NDArray[np.float32] | None = None
+    for piece in pieces:
+        for start in range(0, len(piece), PIECE_FRAMES):
+            raw = piece[start : start + PIECE_FRAMES]
+            if raw.ndim != 3 or raw.shape[1:] != good.shape:
+                raise InputError(name, received=f"frames of {raw.shape[1:]}", expected=f"frames of {good.shape}")
+            if raw.dtype.kind == "f" and not np.all(np.isfinite(raw)):
+                raise InputError(name, received="NaN or infinite detector numbers", expected="finite values")
+            x = raw.astype(np.float32)
+            if reference is None:
+                reference = x[0].copy()
+            cleaned = x - reference
+            own = np.tensordot(cleaned, use, axes=2) / n_good
+            cleaned -= own[:, None, None].astype(np.float32) * shape_of_one
+            cleaned *= use
+            steps = np.diff(cleaned if last is None else np.concatenate([last, cleaned]), axis=0)
+            last = cleaned[-1:].copy()
+            yield raw, x, cleaned, steps
+    if reference is None:
+        raise InputError(name, received="no frames", expected="at least one frame")
+
+
+class _Variances:
+    """Mean frame, and variances of pixels from steps and from whole stacks, piece by piece."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.frames = self.n_steps = 0
+        self._total, self._sum, self._square, self._steps = (np.zeros(shape) for _ in range(4))
+
+    def add(
+        self, x: NDArray[np.float32], cleaned: NDArray[np.float32], steps: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Sums of a piece taken in; returns that of the squares of its steps."""
+        self.frames += len(x)
+        self.n_steps += len(steps)
+        self._total += x.sum(axis=0, dtype=np.float64)
+        self._sum += cleaned.sum(axis=0, dtype=np.float64)
+        self._square += np.einsum("nrc,nrc->rc", cleaned, cleaned)
+        squares: NDArray[np.float32] = np.einsum("nrc,nrc->rc", steps, steps)
+        self._steps += squares
+        return squares
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        return np.asarray(self._total / self.frames)
+
+    @property
+    def of_pairs(self) -> NDArray[np.float64]:
+        return self._steps / (2 * self.n_steps) if self.n_steps else np.full(self._steps.shape, np.nan)
+
+    @property
+    def of_stack(self) -> NDArray[np.float64]:
+        if self.frames < 2:
+            return np.full(self._sum.shape, np.nan)
+        return np.clip(self._square - self._sum**2 / self.frames, 0.0, None) / (self.frames - 1)
+
+
+def look_at_series(
+    pieces: Iterable[NDArray[Any]],
+    *,
+    good: NDArray[np.bool_],
+    pattern: NDArray[np.floating[Any]] | None = None,
+    name: str = "frames",
+    saturation_DN: float | None = None,
+) -> FirstLook:
+    """Mean, variances and saturation of a series; arguments and errors as those of `summarise_series`."""
+    found = _Variances(good.shape)
+    saturated = 0
+    for raw, x, cleaned, steps in _pieces(pieces, good, pattern, name):
+        found.add(x, cleaned, steps)
+        if saturation_DN is not None and float(raw.max()) >= saturation_DN:
+            saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
+    return FirstLook(
+        frames=found.frames,
+        mean_DN=found.mean,
+        pair_variance_DN2=found.of_pairs,
+        stack_variance_DN2=found.of_stack,
+        saturated_share=saturated / (found.frames * int(good.sum())),
+    )
+
+
+def _tiles(frames: NDArray[np.float32], good: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
+    """Means of good pixels in count x count tiles (n, count, count)."""
+    rows, columns = good.shape
+    row_edges = np.linspace(0, rows, count + 1).astype(int)[:-1]
+    column_edges = np.linspace(0, columns, count + 1).astype(int)[:-1]
+    weight = good.astype(np.float32)
+
+    def add(array: NDArray[np.float32]) -> NDArray[np.float64]:
+        return np.asarray(
+            np.add.reduceat(np.add.reduceat(array, row_edges, axis=-2), column_edges, axis=-1), dtype=np.float64
+        )
+
+    return np.asarray(add(frames * weight) / np.maximum(add(weight), 1e-9))
+
+
+def summarise_series(
+    pieces: Iterable[NDArray[Any]],
+    *,
+    good: NDArray[np.bool_],
+    labels: NDArray[np.integer[Any]],
+    pattern: NDArray[np.floating[Any]] | None = None,
+    name: str = "frames",
+    saturation_DN: float | None = None,
+) -> SeriesSummary:
+    """Statistics of a series, from pieces (m, row, column) in time order, DN.
+
+    Args:
+        pieces: frames in time order.
+        good: pixels to use (row, column).
+        labels: noise label of each pixel (row, column), -1 for none; labels count from 0.
+        pattern: how one unit of the common factor looks (row, column), mean 1 over good pixels: the signal's shape with
+            the beam on, None (1 everywhere) without.
+        name: for errors.
+        saturation_DN: full scale, where known.
+
+    Raises:
+        InputError: no frames, frames of another shape than `good`, or values that are not finite.
+    """
+    shape = good.shape
+    use = good.astype(np.float32)
+    n_good = int(good.sum())
+    n_labels = max(int(labels.max()) + 1, 1)
+    flat_labels = np.where(good, labels, -1)
+    masks = [flat_labels == label for label in range(n_labels)]
+    pairs_of_lag = []
+    for dr, dc in LAGS:
+        first, second = _shifted(shape, dr, dc)
+        pairs_of_lag.append((first, second, [mask[first] & (mask[second]) for mask in masks]))
+
+    variances = _Variances(shape)
+    pair_fourth = 0.0
+    pair_second = 0.0
+    label_covariance = np.zeros((n_labels, len(LAGS)))
+    row_sum = column_sum = block_sum = 0.0
+    temporal = np.zeros(2)
+    temporal_pairs = np.zeros(2)
+    frame_means, tiles = [], []
+    codes: NDArray[np.int64] | None = np.zeros(0, dtype=np.int64)
+    highest, saturated = -np.inf, 0
+    blocks = _block_weights(good)
+    row_count = np.maximum(use.sum(axis=1), 1.0)
+    column_count = np.maximum(use.sum(axis=0), 1.0)
+    code_parts: list[NDArray[Any]] = []
+    coded = 0
+    for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
+        if codes is not None:
+            if raw.dtype.kind in "ui":
+                if coded < _CODES_FRAMES:
+                    code_parts.append(raw[: _CODES_FRAMES - coded][:, good].ravel())
+                    coded += min(len(raw), _CODES_FRAMES - coded)
+            else:
+                codes = None
+        highest = max(highest, float(raw[:, good].max()))
+        if saturation_DN is not None:
+            saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
+        means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
+        frame_means.append(means)
+        tiles.append(_tiles(x, good, TIME_TILES))
+        d2 = variances.add(x, cleaned, d)
+        if len(d):
+            if len(d) > 3:
+                inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
+                inside[:, _standing_still(raw, d2, good)] = 0.0
+                pair_fourth += float(np.sum(inside * inside))
+                pair_second += inside.size * (1.0 + 0.0)
+            for index, (first, second, selected) in enumerate(pairs_of_lag):
+                product = np.einsum("nrc,nrc->rc", d[(slice(None), *first)], d[(slice(None), *second)])
+                for label, mask in enumerate(selected):
+                    label_covariance[label, index] += float(product[mask].sum()) / 2.0
+            # each line counts as it has pixels: of a dead one few are left, whose mean is as noisy as a pixel
+            row_sum += float(np.mean(d.sum(axis=2) ** 2 / row_count)) / shape[1] / 2.0 * len(d)
+            column_sum += float(np.mean(d.sum(axis=1) ** 2 / column_count)) / shape[0] / 2.0 * len(d)
+            block = _block_means(d, good, blocks)
+            block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
+        if len(x) > 3:
+            centred = cleaned - cleaned.mean(axis=0)
+            for step in (1, 2):
+                temporal[step - 1] += float(np.sum(centred[:-step] * centred[step:])) / n_good
+                temporal_pairs[step - 1] += len(x) - step
+                # a stack's own mean takes a share of the variance out of each product
+                share = float(np.sum(centred * centred)) / n_good / max(len(x) - 1, 1)
+                temporal[step - 1] += share * (len(x) - step) / len(x)
+    frames, n_pairs, pair_variance = variances.frames, variances.n_steps, variances.of_pairs
+    counts = np.array([mask.sum() for mask in masks])
+    of_labels = np.array([pair_variance[mask].mean() if mask.any() else np.nan for mask in masks])
+    pixel_pairs = np.array([[selected[label].sum() for _, _, selected in pairs_of_lag] for label in range(n_labels)])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        covariance = label_covariance / max(n_pairs, 1) / pixel_pairs
+    distinct = span = 0
+    if codes is not None and code_parts:
+        distinct, span = _codes(np.concatenate(code_parts))
+    one = max(n_pairs, 1)
+    return SeriesSummary(
+        frames=frames,
+        mean_DN=variances.mean,
+        pair_variance_DN2=pair_variance,
+        stack_variance_DN2=variances.of_stack,
+        label_variance_DN2=of_labels,
+        label_autocovariance_DN2=covariance,
+        label_pixels=counts,
+        label_pairs=pixel_pairs,
+        row_variance_DN2=row_sum / one,
+        column_variance_DN2=column_sum / one,
+        block_variance_DN2=block_sum / one,
+        temporal_covariance_DN2=temporal / np.maximum(temporal_pairs, 1),
+        kurtosis_excess=kurtosis_excess(pair_fourth, pair_second, min(n_pairs, PIECE_FRAMES)),
+        frame_mean_DN=np.concatenate(frame_means),
+        tile_mean_DN=np.concatenate(tiles),
+        distinct_codes=distinct,
+        code_range=span,
+        highest_DN=highest,
+        saturated_share=saturated / (frames * n_good),
+    )
+
+
+def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
+    """How many whole numbers occur between the 1st and 99th percentile, and how many there are from first to last of them."""
+    least = int(values.min())
+    counts = np.bincount((values - values.min()).astype(np.intp))
+    below = np.cumsum(counts)
+
+    def percentile(share: float) -> float:
+        place = share * (values.size - 1)
+        first, second = np.searchsorted(below, [math.floor(place), math.ceil(place)], side="right")
+        return float(first + (second - first) * (place - math.floor(place)))
+
+    low, high = int(percentile(0.01) + least) - least, int(percentile(0.99) + least) - least
+    there = np.flatnonzero(counts[max(low, 0) : high + 1])
+    return there.size, int(there[-1] - there[0]) + 1
+
+
+def _standing_still(raw: NDArray[Any], d2: NDArray[np.float32], good: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Good pixels (numbers among them) whose code never changes: the common factor that was taken out is no noise of theirs."""
+    squares = d2[good]
+    quiet = np.flatnonzero(squares < _QUIET * float(squares.mean()))
+    codes = raw.reshape(len(raw), -1)[:, np.flatnonzero(good)[quiet]]
+    # at the end of the range a pixel stands still because it is saturated
+    return np.asarray(quiet[np.all(codes == codes[:1], axis=0) & (codes[0] < raw.max())])
+
+
+def kurtosis_excess(fourth: float, count: float, pairs: int) -> float:
+    """Excess kurtosis of standardised differences; each pixel was scaled by its own variance of `pairs` differences."""
+    if count == 0:
+        return 0.0
+    # Gaussian: E[d^4] / E[s^4] with s^2 of m differences that share frames (about 2 m / 3 degrees of freedom)
+    freedom = 2.0 * pairs / 3.0
+    return fourth / count * (1.0 + 2.0 / freedom) - 3.0
+
+
+def _shifted(shape: tuple[int, int], dr: int, dc: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    rows, columns = shape
+    first = (slice(0, rows - dr), slice(max(0, -dc), columns - max(0, dc)))
+    second = (slice(dr, rows), slice(max(0, dc), columns - max(0, -dc)))
+    return first, second
+
+
+def _block_weights(good: NDArray[np.bool_]) -> NDArray[np.float32]:
+    rows, columns = (side - side % BLOCK_PX for side in good.shape)
+    part = good[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+    return np.asarray(part.sum(axis=(1, 3)), dtype=np.float32)
+
+
+def _block_means(d: NDArray[np.float32], good: NDArray[np.bool_], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means over blocks (n, block): only blocks with three good pixels in four."""
+    rows, columns = (side - side % BLOCK_PX for side in good.shape)
+    if rows == 0 or columns == 0:
+        return np.zeros((len(d), 0), np.float32)
+    part = d[:, :rows, :columns].reshape(len(d), rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+    keep = weights >= 0.75 * BLOCK_PX**2
+    return np.asarray((part.sum(axis=(2, 4)) / np.maximum(weights, 1.0))[:, keep], dtype=np.float32)

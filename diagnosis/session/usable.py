@@ -1,0 +1,218 @@
+"""Which series of a session can be compared with the model, and what passes over their frames show."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.acquisition_io import AcquisitionFile
+from ...errors import InputError
+from ...generator.frames.series import ExpectedSeries
+from .even_maps import full_size, signal_map
+from .session import SessionSeries
+from .summaries import LEAST_NOISE_DN2, FirstLook, SeriesSummary, look_at_series, summarise_series
+
+_ABOVE_NOISE = 4.0  # standard deviations of one exposure of one pixel
+_LABEL_PIXELS = 150  # that a noise label needs
+_MOST_SATURATED = 1e-3  # share of the pixels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenSeries:
+    """Series that can be compared, in order of time, and what a first pass over their frames shows, by name.
+
+    Fields: kept; expected: by the base twin; looks; readable (row, column): pixels whose noise is not cut off at 0; labels (row,
+    column): noise label of each pixel, -1: none; label_names;
+    saturation_DN: end of the ADC's range, None: unknown; skipped: what is said of series that are left out.
+    """
+
+    kept: tuple[SessionSeries, ...]
+    expected: dict[str, ExpectedSeries]
+    looks: dict[str, FirstLook]
+    readable: dict[str, NDArray[np.bool_]]
+    labels: dict[str, NDArray[np.int64]]
+    label_names: dict[str, tuple[str, ...]]
+    saturation_DN: float | None
+    skipped: tuple[str, ...]
+
+
+def stated_series(
+    session: Sequence[SessionSeries], acquisition: AcquisitionFile, shape: tuple[int, int]
+) -> tuple[list[SessionSeries], list[str]]:
+    """Series that say what the model must know, and why each of the others cannot be used.
+
+    Raises:
+        InputError: a series of another detector than the twin's (shape: its rows and columns).
+    """
+    usable: list[SessionSeries] = []
+    skipped: list[str] = []
+    for item in session:
+        series = item.series
+        if series.shape != shape:
+            raise InputError(
+                f"series {series.name}",
+                received=f"frames of {series.shape}",
+                expected=f"the twin's detector of {shape}",
+                remedy="diagnose sessions of the detector that the twin was calibrated from",
+            )
+        reason = _why_not(item, acquisition)
+        if reason:
+            skipped.append(f"{series.name}: {reason}")
+        else:
+            usable.append(item)
+    return usable, skipped
+
+
+def _why_not(item: SessionSeries, acquisition: AcquisitionFile) -> str:
+    series = item.series
+    if series.kind in ("dark", "afterglow"):
+        if "log" in series.corrected:
+            return f"logarithms of a series of kind {series.kind}"
+        return "exposure unknown" if series.kind == "dark" and series.exposure_ms is None else ""
+    load_stated = series.setting is not None and series.setting.tube_load_mAs is not None
+    if not load_stated and item.request.open_signal_DN is None:
+        return "kV, exposure or tube load unknown"
+    if series.kind == "object":
+        scene = acquisition.scenes.get(series.scene)
+        if scene is None or not len(scene.thickness_mm):
+            return "object of unknown thickness"
+    return ""
+
+
+def look_at_all(
+    items: Sequence[SessionSeries],
+    expected: dict[str, ExpectedSeries],
+    *,
+    good: NDArray[np.bool_],
+    bits: int | None,
+    dark_at: Callable[[float | None], NDArray[np.floating]],
+    side: int,
+    skipped: Sequence[str],
+    tell: Callable[[str], None],
+) -> SeenSeries:
+    """First pass over the frames; series that are saturated, or nearly all cut off at 0, are left out.
+
+    Args:
+        items: series to look at.
+        expected: by the base twin, by name.
+        good: pixels in use (row, column).
+        bits: of the ADC; None: unknown.
+        dark_at: dark (row, column) of an exposure time, ms.
+        side: of the squares of the panel's pixels that stand for pixels.
+        skipped: what is said of series that were left out before.
+        tell: called with the name of each stage.
+    """
+    saturation_DN = None if bits is None else 2.0**bits - 1
+    looks: dict[str, FirstLook] = {}
+    labels: dict[str, NDArray[np.int64]] = {}
+    label_names: dict[str, tuple[str, ...]] = {}
+    readable: dict[str, NDArray[np.bool_]] = {}
+    left_out: dict[str, str] = {}
+    for item in items:
+        model = expected[item.name]
+        signal = signal_map(model, good.shape)
+        readable[item.name] = np.ones(good.shape, dtype=bool)
+        if item.ends_at_zero and item.request.beam_on:
+            readable[item.name] = _above_noise(item, model, signal, dark_at=dark_at, side=side)
+            if (readable[item.name] & good).sum() < min(_LABEL_PIXELS, good.sum() / 2):
+                left_out[item.name] = f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels"
+                continue
+        labels[item.name], label_names[item.name] = _labels(
+            signal, float(signal.max()), item.series.kind, good & readable[item.name]
+        )
+        tell(f"frames of {item.name}")
+        looks[item.name] = look_at_series(
+            item.series.iter_frames(),
+            good=good,
+            pattern=_pattern(item, signal, good),
+            name=f"series {item.name}",
+            saturation_DN=saturation_DN,
+        )
+        full = looks[item.name].saturated_share
+        if full > _MOST_SATURATED and item.series.kind != "dark":
+            left_out[item.name] = f"{item.name}: saturated in {100 * full:.2g} % of the pixels"
+    return SeenSeries(
+        kept=tuple(item for item in items if item.name not in left_out),
+        expected=expected,
+        looks=looks,
+        readable=readable,
+        labels=labels,
+        label_names=label_names,
+        saturation_DN=saturation_DN,
+        skipped=(*skipped, *left_out.values()),
+    )
+
+
+def summarise_all(
+    seen: SeenSeries, clean: NDArray[np.bool_], *, tell: Callable[[str], None]
+) -> Mapping[str, SeriesSummary]:
+    """What the frames' noise says in pixels that do not stand out (`clean`, (row, column)), by name of series."""
+    summaries: dict[str, SeriesSummary] = {}
+    for item in seen.kept:
+        tell(f"frames of {item.name} without outliers")
+        good = clean & seen.readable[item.name]
+        summaries[item.name] = summarise_series(
+            item.series.iter_frames(),
+            good=good,
+            labels=seen.labels[item.name],
+            pattern=_pattern(item, signal_map(seen.expected[item.name], good.shape), good),
+            name=f"series {item.name}",
+            saturation_DN=seen.saturation_DN,
+        )
+    return summaries
+
+
+def _above_noise(
+    item: SessionSeries,
+    expected: ExpectedSeries,
+    signal_DN: NDArray[np.float64],
+    *,
+    dark_at: Callable[[float | None], NDArray[np.floating]],
+    side: int,
+) -> NDArray[np.bool_]:
+    """Pixels (row, column) whose numbers lie so far above 0 that no noise was cut off there."""
+    subtracted = item.shares or "offset" in item.series.corrected
+    number_DN = signal_DN if subtracted else signal_DN + dark_at(item.series.exposure_ms)
+    variance = full_size(expected.quantum_variance_DN2, signal_DN.shape) + full_size(
+        expected.white_variance_DN2, signal_DN.shape
+    )
+    # it was cut off before pixels or exposures were averaged
+    one_DN = side * np.sqrt(item.request.exposures_per_frame * np.maximum(variance, LEAST_NOISE_DN2))
+    return np.asarray(number_DN > _ABOVE_NOISE * one_DN)
+
+
+def _pattern(item: SessionSeries, signal: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """How one unit of a frame's common factor looks."""
+    mean = float(signal[usable].mean())
+    return signal / mean if item.request.beam_on and mean > 0 else None
+
+
+def _labels(
+    signal: NDArray[np.float64], open_DN: float, kind: str, good: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Noise labels: the whole field, or quartiles of signal away from edges."""
+    if kind != "object":
+        return np.where(good, 0, -1).astype(np.int64), ("field",)
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    flatness = (maximum_filter(signal, 5) - minimum_filter(signal, 5)) / np.maximum(signal, 1e-9)
+    usable = good & (flatness < 0.15) & (signal > 0.01 * open_DN)
+    if usable.sum() < 64:
+        usable = good
+    covered = usable & (signal < 0.97 * open_DN)
+    labels = np.full(signal.shape, -1, dtype=np.int64)
+    names: list[str] = []
+    if (usable & ~covered).sum() >= 64:
+        labels[usable & ~covered] = 0
+        names.append("open field")
+    if covered.sum() >= 3 * _LABEL_PIXELS:
+        edges = np.quantile(signal[covered], [0.0, 1 / 3, 2 / 3, 1.0])
+        for low, high, name in zip(edges[:-1], edges[1:], ("dark third", "middle third", "bright third"), strict=True):
+            inside = covered & (signal >= low) & (signal <= high) & (labels < 0)
+            if inside.sum() >= _LABEL_PIXELS:
+                labels[inside] = len(names)
+                names.append(name)
+    if not names:
+        return np.where(good, 0, -1).astype(np.int64), ("field",)
+    return labels, tuple(names)

@@ -1,0 +1,10 @@
+"""Dual-energy images with masks, from references, descriptions or known path lengths.
+
+Files:
+    generate             images from references
+    generate_described   images from a description
+    known_scenes         images of objects whose path lengths are known
+    render               transmission and quantum variance of a scene
+    image_effects        effects in single images
+    fresh                images with new noise at every look
+"""

@@ -1,0 +1,214 @@
+"""What the forward model of a series knows of the line, from the beam to the ADC; effects change it stage by stage.
+
+The stages follow the order in which a real line works:
+
+    beam         tube voltage, filtration, compositions: before anything is projected
+    arrivals     the field that reaches the scintillator: heel, displaced objects, scatter
+    object_blur  focal spot, motion: they blur what stands in the beam, not the noise
+    quanta       statistics of the photons
+    optics       spread of light: blurs the picture and correlates the noise
+    exposure     one factor for a whole frame
+    lag          charge trapped and released later
+    response     nonlinearity, per-pixel gain
+    electronics  offsets and noise of the readout
+    readout      ADC and bad pixels
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from ..spread._fine_picture import FineCells
+    from .series_request import SeriesRequest
+    from .spectral_signal import SpectralModel
+    from .twin import Twin
+
+STAGES = (
+    "beam",
+    "arrivals",
+    "object_blur",
+    "quanta",
+    "optics",
+    "exposure",
+    "lag",
+    "response",
+    "electronics",
+    "readout",
+)
+
+FloatArray = NDArray[np.float64]
+# (cycles per pixel along rows (n, 1), along columns (1, m)) -> factor that broadcasts to (n, m); even in both
+Transfer = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LagLaw:
+    """Traps: of each exposure the shares `trapped` (trap,) go into traps that empty with `time_s` (trap,).
+
+    pause_share: of what is released in a pause between series, the share that the next series' first exposure reads. idle_s: length
+    of the pauses that a session does not state. before_share: of what exposures before the lag set in would have left, the share that
+    is there.
+    """
+
+    trapped: tuple[float, ...]
+    time_s: tuple[float, ...]
+    pause_share: float
+    idle_s: float
+    before_share: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixedPattern:
+    """A fixed relative pattern over the pixels, white, of standard deviation `rms`, drawn from `seed`."""
+
+    rms: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinePicture:
+    """A picture with sharp borders: cells finer than pixels, see `_fine_picture`.
+
+    Fields: fine; scale: DN a unit of it; signal_DN (row, column): its pixel means.
+    """
+
+    fine: "FineCells"
+    scale: float
+    signal_DN: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineState:
+    """One series on its way through the line; maps are (row, column), or (1, 1) where all pixels are alike.
+
+    Fields:
+        parameters: (parameter,) of the spectral model, or None where the twin has none.
+        kV_factor: on the tube voltage, beyond what the parameters say of it.
+        attenuation_scale: material of the scene -> factor on its attenuation.
+        signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
+            even illumination, before any spread.
+        secondary_DN: of the variance, what secondary quanta add for each DN of signal.
+        picture: the signal as it was projected, finer than pixels, where it has sharp borders; what effects have made of
+            `signal_DN` since is their difference.
+        shift_px: of the object against its thickness maps, along rows and columns.
+        distortion_px: rms displacement of an enlargement and of a counter-clockwise turn of the picture.
+        object_transfers: blur of what stands in the beam.
+        optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
+        tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
+        power_transfers: factors on the noise power that are not the square of a transfer function.
+        flat_factor: change of the illumination against the calibrated flat, map or (1, 1).
+        output_rms, output_correlation_s, output_jitter_share: common random factor of each exposure, its rms, correlation
+            time, and the share of its variance that is new in every exposure.
+        lag: traps, or None.
+        bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
+        gain_pattern: fixed pattern of the gain that calibration does not know.
+        offsets: (DN, profile over the time in the session in s) added with or without beam.
+        row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
+        read_variance_taken_DN2: of the calibrated electronic variance, what effects that the calibration saw account for.
+        step_DN: of the ADC; 0: none.
+        bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
+            rest being dead; bad_seed draws them.
+    """
+
+    parameters: FloatArray | None
+    kV_factor: float = 1.0
+    attenuation_scale: Mapping[str, float] = field(default_factory=dict)
+    signal_DN: FloatArray
+    variance_DN2: FloatArray
+    secondary_DN: float = 0.0
+    picture: FinePicture | None = None
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    distortion_px: tuple[float, float] = (0.0, 0.0)
+    object_transfers: tuple[Transfer, ...] = ()
+    optical_transfers: tuple[Transfer, ...] = ()
+    tails: tuple[tuple[float, Transfer], ...] = ()
+    power_transfers: tuple[Transfer, ...] = ()
+    flat_factor: FloatArray
+    output_rms: float = 0.0
+    output_correlation_s: float = 0.0
+    output_jitter_share: float = 0.0
+    lag: LagLaw | None = None
+    bend_per_DN: float = 0.0
+    gain_pattern: FixedPattern | None = None
+    offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
+    row_variance_DN2: float = 0.0
+    column_variance_DN2: float = 0.0
+    read_variance_taken_DN2: float = 0.0
+    step_DN: float = 0.0
+    bad_share: float = 0.0
+    bad_hot_share: float = 0.5
+    bad_seed: int = 0
+
+
+def _made_anew(owner: object, name: object, make: Callable[[], Any]) -> Any:
+    """Where nothing is kept."""
+    return make()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineContext:
+    """What an effect may know besides the state.
+
+    Fields: twin; request; model (spectral, or None); since (`always` or `calibration`); weights (2, energy): what each
+    energy of the open beam adds to signal and to quantum variance, any scale; energies_keV (energy,); project:
+    (name, weights (k, energy)) -> maps (k, row, column) behind the scene, or (k, 1, 1) in the open field; open_signal_DN
+    of one exposure; options of the effect that are words; made_of: (thing, name, make) -> what is made of a thing once, kept under
+    the name for as long as others ask for it (small results alone).
+    """
+
+    twin: "Twin"
+    request: "SeriesRequest"
+    model: "SpectralModel | None"
+    since: str
+    weights: FloatArray | None
+    energies_keV: FloatArray | None
+    project: Callable[[str, FloatArray], FloatArray] | None
+    open_signal_DN: float
+    options: Mapping[str, str]
+    made_of: Callable[[object, object, Callable[[], Any]], Any] = _made_anew
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the detector."""
+        return self.twin.maps.shape
+
+    @property
+    def source_detector_mm(self) -> float | None:
+        """Distance from source to detector in this series, or None."""
+        request = self.request
+        stated = request.source_detector_mm
+        if stated is None and request.setting is not None:
+            stated = request.setting.source_detector_mm
+        return self.twin.instrument.source_detector_mm if stated is None else stated
+
+    @property
+    def source_object_mm(self) -> float | None:
+        """Distance from source to object in this series, or None."""
+        stated = self.request.source_object_mm
+        return self.twin.instrument.source_object_mm if stated is None else stated
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether something of known thickness stands in the beam."""
+        return bool(self.request.thickness_mm)
+
+
+def needed(value: float | None, name: str, effect: str) -> float:
+    """The value, or an InputError that says which effect needs it."""
+    from ...errors import InputError
+
+    if value is None:
+        raise InputError(
+            name,
+            received="unknown",
+            expected=f"a number, because the effect {effect} depends on it",
+            remedy="state it in the acquisition's instrument or series",
+        )
+    return float(value)
+
+
+Change = Callable[[LineState, Mapping[str, float], LineContext], LineState]

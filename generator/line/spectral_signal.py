@@ -1,0 +1,855 @@
+"""Signal, gain and photon number of an open beam from tube, filters and scintillator, for many parameter sets at once.
+
+Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting
+fraction D(E)):
+
+    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (Phi' / Phi)^s exp(-sum mu t) (1000 / d)^2 a^2
+    signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1    absorbed = sum N c D
+
+for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, Phi' the
+other of SpekPy's models, e = kV_error + kV_tilt ln(kV / 60), and mu that of xraylib moved by shares of its differences to two
+other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)). The layers t are those in the beam, the inherent
+filtration, and micrometres of the anode's own metal (a rough or worn anode). A tube voltage that varies during an exposure, by
+a relative variance v about its mean, adds v / 2 kV^2 d2 Phi / d kV2.
+
+c(E) is what covers, glue and dead layers let through, l(E) the light for each keV that stays, over that at 50 keV: the
+scintillator's own (`spectra.light_per_keV`), a power of energy, and the depth at which photons of each energy are stopped
+(light made nearer to the diodes is less dimmed). w is how the Swank factor goes with energy. K photons that leave take
+(1 + escape_scale) of what `spectra.detector_response` says: none at -1.
+"""
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acquisition.setting import Filter
+from ...errors import InputError
+from ...materials import material_from_name, mu_per_mm, transmission
+from ...spectra import (
+    BIN_WIDTH_KEV,
+    MAXIMUM_KV,
+    MAXIMUM_KV_OF_ANODE,
+    MINIMUM_KV,
+    MODELS,
+    detector_response,
+    energy_grid_keV,
+    light_per_keV,
+    tube_fluence_interpolated,
+)
+
+REFERENCE_KV = 60.0
+REFERENCE_KEV = 50.0
+FIXED_PARAMETERS = (
+    "inherent_filtration_mm_Al",
+    "log_scintillator_thickness",
+    "kV_error",
+    "log_output",
+    "log_DN_per_keV",
+    "log_swank",
+    "yield_exponent",
+    "hardness_exponent",
+    "kV_tilt",
+    "spectrum_model",
+    "escape_scale",
+    "scintillator_table",
+    "anode_roughness_um",
+    "kV_variance",
+    "hardness_tilt",
+)
+# what a detector does to photons of each energy beside absorbing them: the powers of exp(parameter x row) in the first and
+# second moment of the deposit and in the absorbed share
+RESPONSE_PARAMETERS: dict[str, tuple[float, float, float]] = {
+    "cover_mm_C": (1.0, 1.0, 1.0),
+    "dead_layer_um": (1.0, 1.0, 1.0),
+    "light_nonproportionality": (1.0, 2.0, 0.0),
+    "light_exponent": (1.0, 2.0, 0.0),
+    "light_depth_slope": (1.0, 2.0, 0.0),
+    "swank_exponent": (0.0, -1.0, 0.0),
+}
+_RESPONSE_OF_COUNTERS = ("cover_mm_C", "dead_layer_um")
+ALTERNATIVE_SCINTILLATOR = "scintillator_alternative"
+# of a tube whose kerma was measured: its output over the flux that the flats saw (fill factor, distances), logarithm
+KERMA_OUTPUT = "log_kerma_over_flats"
+OTHER_TABLES = ("chantler", "penelope")
+# parameters that say nothing of the tube: a dosimeter does not notice them
+_OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
+_ABSORBER = "absorber_mm:"
+_KV_ERRORS = np.linspace(-0.09, 0.06, 31)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
+_ALL_NODES = slice(None)
+_LOWEST_KEV = (
+    5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
+)
+_KV_STEP = 0.02  # relative, of the second difference that a varying voltage takes
+_TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of a node
+_LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
+_LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
+_LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
+
+
+def attenuation_scale_name(material: str) -> str:
+    """Name of the parameter that scales a filter material's attenuation table."""
+    return f"log_mu_{material}"
+
+
+def table_share_name(table: str, material: str) -> str:
+    """Name of the parameter that moves a material's attenuation towards another table."""
+    return f"{table}_{material}"
+
+
+def absorber_thickness_name(absorber: str, material: str) -> str:
+    """Name of the parameter that holds how much (mm) of a material an absorber of unknown composition amounts to."""
+    return f"{_ABSORBER}{absorber}:{material}"
+
+
+def absorber_of_parameter(name: str) -> tuple[str, str] | None:
+    """The absorber and the material whose thickness a parameter is (`absorber_thickness_name`), or None."""
+    if not name.startswith(_ABSORBER):
+        return None
+    absorber, _, material = name.removeprefix(_ABSORBER).rpartition(":")
+    return absorber, material
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenBeam:
+    """One open-beam setting as the spectrum sees it: kV and filters; rates are per mAs at 1 m and 1 mm2 of pixel.
+
+    absorber: name of an absorber of unknown composition behind the filters, whose thicknesses are parameters; empty: none.
+    """
+
+    kV: float
+    filters: tuple[Filter, ...]
+    absorber: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpectrumCorrection:
+    """Measured spectra over the model's at the same tube voltages: kV (spectrum,), rising, and log_ratio (spectrum, energy).
+
+    The ratio holds at fixed photon energy, as what filters and anodes do; between the measured voltages it is
+    interpolated linearly in kV, outside the nearest is kept. relative: the spectra have no absolute scale.
+    """
+
+    kV: tuple[float, ...]
+    log_ratio: NDArray[np.float64]
+    relative: bool
+
+    def at(self, kV: float, bins: int) -> NDArray[np.float64]:
+        """Logarithm of the correction on the first `bins` of the common grid (energy,)."""
+        below, share = (
+            _brackets(np.array(self.kV), np.array([kV])) if len(self.kV) > 1 else (np.array([0]), np.zeros(1))
+        )
+        first = self.log_ratio[below[0]]
+        last = self.log_ratio[min(int(below[0]) + 1, len(self.kV) - 1)]
+        row = first + share[0] * (last - first)
+        if bins > row.size:
+            row = np.concatenate([row, np.full(bins - row.size, row[-1])])
+        return np.asarray(row[:bins])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeamSignal:
+    """What a beam gives (draw,): rate_DN_per_mAs, gain_DN (variance per signal), absorbed_per_mAs, kerma_uGy_per_mAs,
+    mean_square_energy ratio folded into the gain; all at 1 m and 1 mm2."""
+
+    rate_DN_per_mAs: NDArray[np.float64]
+    gain_DN: NDArray[np.float64]
+    absorbed_per_mAs: NDArray[np.float64]
+    kerma_uGy_per_mAs: NDArray[np.float64]
+
+
+class SpectralModel:
+    """Tables of one tube and scintillator, from which signals of many parameter sets follow by sums over energy.
+
+    `names` are the parameters, in the order of a parameter set; a set of fewer names (an older twin's) can be given, and
+    what it lacks counts as 0. `correction` brings the tube model to measured spectra. `alternative` is another
+    scintillator, which a parameter of value 1 puts in place of the first where the sheet does not say. The state is a
+    cache: what each kV and material looks like on the common grid.
+    """
+
+    def __init__(
+        self,
+        *,
+        anode: str = "W",
+        anode_angle_deg: float = 12.0,
+        model: str = "casim",
+        inherent: Sequence[Filter] = (),
+        scintillator: Sequence[Filter] = (Filter(material="CsI", thickness_mm=0.5),),
+        alternative: Sequence[Filter] = (),
+        cover: Sequence[Filter] = (),
+        counting: bool = False,
+        filter_materials: Sequence[str] = (),
+        highest_kV: float = 160.0,
+        names: Sequence[str] | None = None,
+        correction: SpectrumCorrection | None = None,
+    ) -> None:
+        self.anode = anode
+        self.anode_angle_deg = anode_angle_deg
+        self.model = model
+        self.inherent = tuple(inherent)
+        self.scintillator = tuple(scintillator)
+        self.alternative = tuple(alternative)
+        self.cover = tuple(cover)
+        self.counting = counting
+        self.filter_materials = tuple(filter_materials)
+        self.correction = correction
+        every = [*FIXED_PARAMETERS, *(_RESPONSE_OF_COUNTERS if counting else RESPONSE_PARAMETERS)]
+        every += [ALTERNATIVE_SCINTILLATOR] if self.alternative else []
+        for material in self.filter_materials:
+            every.append(attenuation_scale_name(material))
+            every += [table_share_name(table, material) for table in OTHER_TABLES]
+        self._named(every if names is None else names)
+        self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
+        self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
+        self._mu: dict[str, NDArray[np.float64]] = {}
+        self._departures: dict[tuple[str, str], NDArray[np.float64]] = {}
+        self._fluence: dict[float, NDArray[np.float64]] = {}
+        self._other_model: dict[float, NDArray[np.float64]] = {}
+        self._responses = [
+            _response_tables(layers, self.cover, self.counting, self.energies_keV.size)
+            for layers in (self.scintillator, self.alternative)
+            if layers
+        ]
+        self._response_names = tuple(name for name in RESPONSE_PARAMETERS if name in self._index)
+        self._response_rows = [
+            _response_rows(layers[0], self.energies_keV.size)
+            for layers in (self.scintillator, self.alternative)
+            if layers
+        ]
+        energies = self.energies_keV
+        air = material_from_name("air")
+        from ...materials import mass_energy_absorption_cm2_g
+
+        # keV / cm2 -> uGy: 1.602e-16 J / 1e-3 kg; fluence is per cm2
+        self._kerma = energies * mass_energy_absorption_cm2_g(air, energies) * 1.602176634e-13 * 1e6
+        self._inherent = transmission(self.inherent, energies, bin_width_keV=BIN_WIDTH_KEV)
+        self._depth: dict[Filter, NDArray[np.float64]] = {}
+
+    def _departure(self, material: str, table: str) -> NDArray[np.float64]:
+        """Another table's attenuation over xraylib's, less 1 (energy,)."""
+        key = (material, table)
+        if key not in self._departures:
+            self._departures[key] = _table_departure(material, table, self.energies_keV)
+        return self._departures[key]
+
+    def with_parameters(self, names: Sequence[str]) -> "SpectralModel":
+        """The same model with more parameters, behind its own; the tables are shared."""
+        result = copy(self)
+        result._named((*self.names, *(name for name in names if name not in self._index)))
+        return result
+
+    def _named(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self._index = {name: position for position, name in enumerate(self.names)}
+        self._absorbers: dict[str, dict[str, str]] = {}
+        for name in self.names:
+            found = absorber_of_parameter(name)
+            if found is not None:
+                self._absorbers.setdefault(found[0], {})[name] = found[1]
+
+    @property
+    def kerma_weights(self) -> NDArray[np.float64]:
+        """Air kerma of a photon per cm2 (energy,), uGy cm2."""
+        return self._kerma
+
+    def mu(self, material: str) -> NDArray[np.float64]:
+        """Linear attenuation (energy,), 1/mm."""
+        if material not in self._mu:
+            self._mu[material] = mu_per_mm(material_from_name(material), self.energies_keV)
+        return self._mu[material]
+
+    def depth(self, layer: Filter) -> NDArray[np.float64]:
+        """Optical depth of a layer (energy,); a bin that an absorption edge cuts has that of its mean transmission."""
+        if layer not in self._depth:
+            passed = transmission([layer], self.energies_keV, bin_width_keV=BIN_WIDTH_KEV)
+            self._depth[layer] = -np.log(np.maximum(passed, 1e-300))
+        return self._depth[layer]
+
+    def fluence(self, kV: float, nodes: slice = _ALL_NODES) -> NDArray[np.float64]:
+        """Unfiltered fluence at the nodes of the kV error (node, energy), photons / keV / cm2 / mAs at 1 m.
+
+        Only the nodes asked for are sure to be filled: each may cost spectra that nobody has computed yet.
+        """
+        if kV not in self._fluence:
+            if kV > self.highest_kV:
+                raise InputError(
+                    "kV", received=f"{kV:g} kV", expected=f"at most {self.highest_kV:g} kV, this model's range"
+                )
+            self._fluence[kV] = np.full((_KV_ERRORS.size, self.energies_keV.size), np.nan)
+        table = self._fluence[kV]
+        # beyond the tube's table the nodes stand still; a kV outside it is refused at the node without error
+        lowest, highest = MINIMUM_KV, MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
+        if kV < lowest:
+            lowest = 0.0
+        for node in range(*nodes.indices(_KV_ERRORS.size)):
+            if np.isnan(table[node, 0]):
+                table[node] = tube_fluence_interpolated(
+                    min(max(kV * (1.0 + float(_KV_ERRORS[node])), lowest), highest),
+                    energies_keV=self.energies_keV,
+                    anode=self.anode,
+                    anode_angle_deg=self.anode_angle_deg,
+                    model=self.model,
+                    for_sums=True,
+                )
+        return table
+
+    def _towards_other_model(self, kV: float) -> NDArray[np.float64]:
+        """Logarithm of the other of SpekPy's models over this one (energy,), held constant beyond the end point."""
+        if kV not in self._other_model:
+            lowest = MINIMUM_KV
+            ratio = np.zeros(self.energies_keV.size)
+            if kV >= lowest:
+                both = [
+                    tube_fluence_interpolated(
+                        kV,
+                        energies_keV=self.energies_keV,
+                        anode=self.anode,
+                        anode_angle_deg=self.anode_angle_deg,
+                        model=name,
+                    )
+                    for name in (self.model, next(name for name in MODELS if name != self.model))
+                ]
+                seen = (both[0] > 1e-9 * both[0].max()) & (both[1] > 0)
+                if np.any(seen):
+                    ratio[seen] = np.log(both[1][seen] / both[0][seen])
+                    last = int(np.flatnonzero(seen)[-1])
+                    ratio[last + 1 :] = ratio[last]
+            self._other_model[kV] = np.clip(ratio, -_LARGEST_MODEL_RATIO, _LARGEST_MODEL_RATIO)
+        return self._other_model[kV]
+
+    def default_parameters(self) -> NDArray[np.float64]:
+        """The parameter set of an uncalibrated line (parameter,): no error, 1 DN a keV, Swank factor 1."""
+        return np.zeros(len(self.names))
+
+    def _kV_error(self, samples: NDArray[np.float64], kV: float) -> NDArray[np.float64]:
+        return self._column(samples, "kV_error") + self._column(samples, "kV_tilt") * math.log(kV / REFERENCE_KV)
+
+    def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
+        """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
+        behind = self._behind_the_anode(samples, beam)
+        kV_error = self._kV_error(samples, beam.kV)
+        variance = self._column(samples, "kV_variance")
+        shares = _node_shares(_KV_ERRORS, kV_error)
+        if np.any(variance):
+            # spectra at the voltage and a step to both sides are shares of the same nodes
+            shares += variance[:, None] * _second_difference_shares(kV_error)
+        behind *= self._fluence_of_nodes(beam.kV, shares, behind.shape[1])
+        return np.maximum(behind, 0.0, out=behind)
+
+    def _fluence_of_nodes(self, kV: float, shares: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy) as shares (draw, node) of the nodes of the voltage error, on the first `top` energies."""
+        used = np.flatnonzero(np.any(shares != 0.0, axis=0))
+        span = slice(int(used[0]), int(used[-1]) + 1)
+        return np.asarray(shares[:, span] @ self.fluence(kV, span)[span, :top])
+
+    def _fluence_at(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy) at errors (draw,) of the tube voltage, on the first `top` energies."""
+        return self._fluence_of_nodes(kV, _node_shares(_KV_ERRORS, kV_error), top)
+
+    def _second_difference(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
+        """Half of kV^2 d2 Phi / d kV2 (draw, energy), over a step on both sides."""
+        return self._fluence_of_nodes(kV, _second_difference_shares(kV_error), top)
+
+    def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
+        """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
+        top = min(int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1, self.energies_keV.size)
+        energies = self.energies_keV[:top]
+        factors, rows = [], []
+        for layer, thickness in (
+            (Filter(material="Al", thickness_mm=1.0), self._column(samples, "inherent_filtration_mm_Al")),
+            *((layer, None) for layer in beam.filters),
+        ):
+            material = layer.material
+            if thickness is None:
+                depth = self.depth(layer)[:top]
+                amount = np.exp(self._column(samples, attenuation_scale_name(material)))
+            else:
+                depth, amount = self.mu(material)[:top], thickness
+            factors.append(amount)
+            rows.append(-depth)
+            for table in OTHER_TABLES:
+                name = table_share_name(table, material)
+                if name in self._index:
+                    factors.append(amount * self._column(samples, name))
+                    rows.append(-depth * self._departure(material, table)[:top])
+        for name in ("hardness_exponent", "hardness_tilt", "spectrum_model", "anode_roughness_um"):
+            row = self._row_of(name, beam, top) if name in self._index else None
+            if row is not None:
+                factors.append(self._column(samples, name))
+                rows.append(row)
+        for name, material in self._absorbers.get(beam.absorber, {}).items():
+            factors.append(self._column(samples, name))
+            rows.append(-self.mu(material)[:top])
+        width = energies[1] - energies[0]
+        factors.append(
+            self._column(samples, "log_output")
+            + self._column(samples, "yield_exponent") * np.log(beam.kV / REFERENCE_KV)
+            + np.log(width / 100.0)
+        )
+        rows.append(np.ones(top))
+        photons = np.exp(np.stack(factors, axis=1) @ np.stack(rows))
+        photons *= self._inherent[:top]
+        if self.correction is not None:
+            photons *= np.exp(self.correction.at(beam.kV, top))
+        return np.asarray(photons)
+
+    def signal(
+        self, samples: NDArray[np.float64], beam: OpenBeam, through: NDArray[np.float64] | None = None
+    ) -> BeamSignal:
+        """Rate, gain and photons of a beam for parameter sets (draw, parameter).
+
+        Args:
+            samples: (draw, parameter) in the order of `names`.
+            beam: kV and filters.
+            through: transmission of an object (energy,) on `energies_keV`, or None.
+        """
+        photons = self.weights(samples, beam)
+        top = photons.shape[1]
+        if through is not None:
+            photons = photons * through[:top]
+        return self.signal_of_photons(samples, photons)
+
+    def depth_of_parameters(self, layer: Filter, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Optical depth of a layer (energy,) with the scale and the table shares of one parameter set (parameter,)."""
+
+        def value(name: str) -> float:
+            return float(parameters[self._index[name]]) if name in self._index else 0.0
+
+        moved = np.ones(self.energies_keV.size)
+        for table in OTHER_TABLES:
+            share = value(table_share_name(table, layer.material))
+            if share != 0.0:
+                moved = moved + share * self._departure(layer.material, table)
+        return np.asarray(self.depth(layer) * moved * math.exp(value(attenuation_scale_name(layer.material))))
+
+    def signal_of_stacks(
+        self, parameters: NDArray[np.float64], *, kV: float, stacks: Sequence[Sequence[Filter]]
+    ) -> BeamSignal:
+        """Rate, gain and photons (stack,) behind many filter stacks at one kV, for one parameter set (parameter,).
+
+        The same numbers as `signal` gives one by one; the tube's part is made once.
+        """
+        photons = self.weights(parameters[None, :], OpenBeam(kV=kV, filters=()))
+        top = photons.shape[1]
+        layers = {layer: row for row, layer in enumerate(dict.fromkeys(layer for one in stacks for layer in one))}
+        if layers:
+            crossed = np.zeros((len(stacks), len(layers)))
+            for row, stack in enumerate(stacks):
+                for layer in stack:
+                    crossed[row, layers[layer]] += 1.0
+            depths = np.array([self.depth_of_parameters(layer, parameters)[:top] for layer in layers])
+            photons = photons * np.exp(-crossed @ depths)
+        else:
+            photons = np.repeat(photons, len(stacks), axis=0)
+        return self.signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
+
+    def moment_weights(self, parameters: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
+        """What each energy of an open beam adds to signal (DN), quantum variance (DN^2) and photons absorbed.
+
+        Returns:
+            (3, energy) a mAs and mm2 of pixel at 1 m, on the first of `energies_keV`, for one parameter set (parameter,).
+            Behind an object of transmission T(E) the three sums are those of the rows times T.
+        """
+        samples = parameters[None, :]
+        photons = self.weights(samples, beam)[0]
+        first, second = self.deposit_tables(samples)[:2, 0, : len(photons)]
+        other = bool(self._column(samples, ALTERNATIVE_SCINTILLATOR)[0] > 0.5)
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        share = _interpolate(_LOG_THICKNESS, self._responses[int(other)][2, :, : len(photons)], log_thickness)[0]
+        powers = self._response_powers(samples, len(photons))
+        if powers is not None:
+            share = share * powers[2][0]
+        log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
+        log_swank = float(self._column(samples, "log_swank")[0])
+        return np.stack(
+            [photons * first * np.exp(log_gamma), photons * second * np.exp(2 * log_gamma - log_swank), photons * share]
+        )
+
+    def deposit_tables(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What each draw's scintillator does at each energy (6, draw, energy): see `_response_tables`, the share left out.
+
+        The first two hold the draw's own table and escape parameters; the next ones are the derivatives by these.
+        """
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        found = np.empty((6, len(samples), self.energies_keV.size))
+        for chosen, tables in zip((~other, other), self._responses, strict=False):
+            if chosen.any():
+                for row, table in enumerate((*tables[:2], *tables[3:])):
+                    found[row, chosen] = _interpolate(_LOG_THICKNESS, table, log_thickness[chosen])
+        by_table, by_escape = (self._column(samples, name)[:, None] for name in ("scintillator_table", "escape_scale"))
+        found[0] += by_table * found[2] + by_escape * found[4]
+        found[1] += by_table * found[3] + by_escape * found[5]
+        powers = self._response_powers(samples, self.energies_keV.size)
+        if powers is not None:
+            found[::2] *= powers[0]
+            found[1::2] *= powers[1]
+        return found
+
+    def _response_powers(
+        self, samples: NDArray[np.float64], top: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:
+        """What covers and light do to first and second moment and to the absorbed share (draw, energy) each; None: nothing."""
+        names = [name for name in self._response_names if np.any(self._column(samples, name))]
+        if not names:
+            return None
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        factors: list[NDArray[np.float64] | None] = []  # of each kind of parameter, as its powers have it
+        for kind in ((1.0, 1.0, 1.0), (1.0, 2.0, 0.0), (0.0, -1.0, 0.0)):
+            own = [name for name in names if RESPONSE_PARAMETERS[name] == kind]
+            if not own:
+                factors.append(None)
+                continue
+            columns = np.stack([self._column(samples, name) for name in own], axis=1)
+            logarithm = columns @ np.stack([self._response_rows[0][name][:top] for name in own])
+            if np.any(other):
+                rows = np.stack([self._response_rows[1][name][:top] for name in own])
+                logarithm[other] = columns[other] @ rows
+            factors.append(np.exp(logarithm, out=logarithm))
+        passed, light, swank = factors
+        share = np.ones((len(samples), top)) if passed is None else passed
+        first = share if light is None else share * light
+        second = first if light is None else first * light
+        return first, second if swank is None else second / swank, share
+
+    def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
+        top = photons.shape[1]
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
+        powers = self._response_powers(samples, top)
+        sums = np.empty((3, len(samples)))
+        for chosen, tables in zip((~other, other), self._responses, strict=False):
+            if not chosen.any():
+                continue
+            part, thickness = photons if chosen.all() else photons[chosen], log_thickness[chosen]
+            if powers is None:
+                every = _sums_interpolated(_LOG_THICKNESS, tables[:, :, :top], thickness, part)
+            else:
+                every = np.empty((7, len(part)))
+                for rows, power in (((0, 3, 5), powers[0]), ((1, 4, 6), powers[1]), ((2,), powers[2])):
+                    weight = part * (power if chosen.all() else power[chosen])
+                    every[list(rows)] = _sums_interpolated(
+                        _LOG_THICKNESS, tables[list(rows), :, :top], thickness, weight
+                    )
+            by_table = self._column(samples, "scintillator_table")[chosen]
+            by_escape = self._column(samples, "escape_scale")[chosen]
+            sums[:2, chosen] = every[:2] + by_table * every[3:5] + by_escape * every[5:7]
+            sums[2, chosen] = every[2]
+        return sums
+
+    def signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
+        """What photons (draw, energy), as `weights` gives them, leave behind an object or without one.
+
+        Args:
+            samples: (draw, parameter) in the order of `names`: scintillator and gains.
+            photons: (draw, energy) on the first of `energies_keV`, a bin, mAs and mm2 of pixel at 1 m.
+        """
+        top = photons.shape[1]
+        first, second, absorbed = self._moment_sums(samples, photons)
+        log_gamma = self._column(samples, "log_DN_per_keV")
+        gamma = np.exp(log_gamma)
+        excess = np.exp(log_gamma - self._column(samples, "log_swank"))
+        return BeamSignal(
+            rate_DN_per_mAs=gamma * first,
+            gain_DN=excess * second / first,
+            absorbed_per_mAs=absorbed,
+            # photons are per mm2, kerma counts per cm2
+            kerma_uGy_per_mAs=100.0 * (photons @ self._kerma[:top]) * np.exp(self._column(samples, KERMA_OUTPUT)),
+        )
+
+    def log_kerma_derivatives(
+        self, samples: NDArray[np.float64], beam: OpenBeam, names: Sequence[str]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithm of the air kerma of a beam (draw,), uGy per mAs at 1 m, and how each of `names` moves it (draw, name).
+
+        The third is the mean of ln(E / 50 keV) over the kerma (draw,): the derivative by the exponent of a dosimeter whose
+        response goes as a power of the energy. Arguments as in `log_derivatives`.
+        """
+        weight = np.zeros((6, self.energies_keV.size))
+        weight[:2] = 100.0 * self._kerma
+        deposits = np.broadcast_to(weight[:, None, :], (6, len(samples), self.energies_keV.size))
+        asked = list(dict.fromkeys([*names, "hardness_exponent"]))
+        logs, found, _ = self.log_derivatives(samples, beam, asked, deposits=deposits)
+        hardness, slope = found[:, asked.index("hardness_exponent")].copy(), found[:, : len(names)].copy()
+        for column, name in enumerate(names):
+            if name in _OF_DETECTOR:
+                slope[:, column] = 0.0
+            elif name == KERMA_OUTPUT:
+                slope[:, column] = 1.0
+        value = logs[0] - self._column(samples, "log_DN_per_keV") + self._column(samples, KERMA_OUTPUT)
+        return value, slope, hardness
+
+    def log_derivatives(
+        self,
+        samples: NDArray[np.float64],
+        beam: OpenBeam,
+        names: Sequence[str],
+        deposits: NDArray[np.float64] | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Logarithms of rate and gain (2, draw) of a beam, and how each of `names` moves them (draw, name) each.
+
+        The derivatives of ln(sum N m1) and ln(sum N m2 / sum N m1): means over the spectrum of what the parameter does
+        at each energy. They hold for parameters that act a little: tables, models, exponents, escape, scales, voltage.
+
+        Args:
+            samples: (draw, parameter), the point at which the derivatives are taken.
+            beam: kV and filters.
+            names: parameters, not the filtration or the scintillator's thickness.
+            deposits: `deposit_tables` of the same samples, where several beams share them.
+
+        Returns:
+            (rate and gain) (2, draw), derivatives of the rate (draw, name), derivatives of the gain (draw, name).
+        """
+        behind = self._behind_the_anode(samples, beam)
+        top = behind.shape[1]
+        kV_error, variance = self._kV_error(samples, beam.kV), self._column(samples, "kV_variance")[:, None]
+        photons = behind * self._fluence_at(beam.kV, kV_error, top)
+        varied = np.zeros_like(photons)
+        if "kV_variance" in names or np.any(variance):
+            varied = behind * self._second_difference(beam.kV, kV_error, top)
+            photons = np.maximum(photons + variance * varied, 0.0)
+        tables = (self.deposit_tables(samples) if deposits is None else deposits)[:, :, :top]
+        first, second = tables[:2]
+        by_first, by_second = photons * first, photons * second
+        sums = np.stack([by_first.sum(axis=1), by_second.sum(axis=1)])
+        gamma = self._column(samples, "log_DN_per_keV")
+        logs = np.stack(
+            [gamma + np.log(sums[0]), gamma - self._column(samples, "log_swank") + np.log(sums[1] / sums[0])]
+        )
+        rate = np.zeros((len(samples), len(names)))
+        gain = np.zeros((len(samples), len(names)))
+        # parameters of one row over energy, the same for all draws
+        rows = {name: row for name, row in ((name, self._row_of(name, beam, top)) for name in names) if row is not None}
+        if rows:
+            acts = np.stack(list(rows.values()), axis=1)
+            columns = [list(names).index(name) for name in rows]
+            means = by_first @ acts / sums[0][:, None]
+            rate[:, columns] = means
+            gain[:, columns] = by_second @ acts / sums[1][:, None] - means
+        filtration = self._column(samples, "inherent_filtration_mm_Al")
+        for column, name in enumerate(names):
+            for table_name in OTHER_TABLES:
+                if name == table_share_name(table_name, "Al"):
+                    row = -self.mu("Al")[:top] * self._departure("Al", table_name)[:top]
+                    mean = by_first @ row / sums[0]
+                    rate[:, column] += filtration * mean
+                    gain[:, column] += filtration * (by_second @ row / sums[1] - mean)
+            if name in {"log_output", "log_DN_per_keV"}:
+                rate[:, column] = 1.0
+                gain[:, column] = float(name == "log_DN_per_keV")
+            elif name == "log_swank":
+                gain[:, column] = -1.0
+            elif name == "yield_exponent":
+                rate[:, column] = np.log(beam.kV / REFERENCE_KV)
+            elif name in {"scintillator_table", "escape_scale"}:
+                moved = tables[2:4] if name == "scintillator_table" else tables[4:6]
+                mean = np.einsum("de,de->d", photons, moved[0]) / sums[0]
+                rate[:, column] = mean
+                gain[:, column] = np.einsum("de,de->d", photons, moved[1]) / sums[1] - mean
+            elif name in {"kV_tilt", "kV_variance"}:
+                if name == "kV_tilt":
+                    above, below = (
+                        self._fluence_at(beam.kV, kV_error + step, top) for step in (_TILT_STEP, -_TILT_STEP)
+                    )
+                    moved_photons = behind * (above - below)
+                    scale = math.log(beam.kV / REFERENCE_KV) / (2.0 * _TILT_STEP)
+                else:
+                    moved_photons, scale = varied, 1.0
+                mean = np.einsum("de,de->d", moved_photons, first) / sums[0] * scale
+                rate[:, column] = mean
+                gain[:, column] = np.einsum("de,de->d", moved_photons, second) / sums[1] * scale - mean
+            elif name in self._response_names:
+                powers = RESPONSE_PARAMETERS[name]
+                mean = powers[0] * self._mean_of_row(name, by_first, samples) / sums[0] if powers[0] else 0.0
+                rate[:, column] = mean
+                gain[:, column] = powers[1] * self._mean_of_row(name, by_second, samples) / sums[1] - mean
+        return logs, rate, gain
+
+    def _mean_of_row(self, name: str, weight: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum over energy of a response parameter's row times weights (draw, energy), each draw's own scintillator (draw,)."""
+        rows = np.stack([found[name][: weight.shape[1]] for found in self._response_rows], axis=1)
+        sums = weight @ rows
+        if rows.shape[1] == 1:
+            return np.asarray(sums[:, 0])
+        return np.where(self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5, sums[:, 1], sums[:, 0])
+
+    def _row_of(self, name: str, beam: OpenBeam, top: int) -> NDArray[np.float64] | None:
+        """What a unit of a parameter adds to the logarithm of the photons at each energy (energy,)."""
+        if name == "hardness_exponent":
+            return np.log(self.energies_keV[:top] / REFERENCE_KEV)
+        if name == "hardness_tilt":
+            return math.log(beam.kV / REFERENCE_KV) * np.log(self.energies_keV[:top] / REFERENCE_KEV)
+        if name == "spectrum_model":
+            return self._towards_other_model(beam.kV)[:top]
+        if name == "anode_roughness_um":
+            return -1e-3 * _levelled(self.mu(self.anode), self.energies_keV)[:top]
+        row = None
+        for layer in beam.filters:
+            if name == attenuation_scale_name(layer.material):
+                row = (0.0 if row is None else row) - self.depth(layer)[:top]
+            for table in OTHER_TABLES:
+                if name == table_share_name(table, layer.material):
+                    departure = self._departure(layer.material, table)[:top]
+                    row = (0.0 if row is None else row) - self.depth(layer)[:top] * departure
+        return row
+
+    def _column(self, samples: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+        if name not in self._index:
+            return np.zeros(len(samples))
+        return np.asarray(samples[:, self._index[name]])
+
+
+def _table_departure(material: str, table: str, energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Another table's attenuation over xraylib's, less 1 (energy,)."""
+    known = material_from_name(material)
+    ratio = mu_per_mm(known, energies_keV, table=table) / mu_per_mm(known, energies_keV)
+    # the tables' edges lie a few eV apart: a bin between them says nothing of the tables
+    return np.clip(ratio - 1.0, -_LARGEST_DEPARTURE, _LARGEST_DEPARTURE)
+
+
+def _levelled(values: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (energy,) with those below the lowest energy that matters replaced by the value there."""
+    first = min(int(np.searchsorted(energies_keV, _LOWEST_KEV)), len(values) - 1)
+    return np.concatenate([np.full(first, values[first]), values[first:]])
+
+
+@lru_cache(maxsize=16)
+def _response_rows(layer: Filter, bins: int) -> dict[str, NDArray[np.float64]]:
+    """What a unit of each response parameter adds to the logarithms at each energy (energy,), for a scintillator's first layer.
+
+    The depth slope is the loss of light from the diode's side of the layer to the other, as a share: row <z> / L - 1 / 2,
+    with z the depth at which photons of an energy are stopped.
+    """
+    energies = energy_grid_keV(500.0)[:bins]
+    absorber = mu_per_mm(material_from_name(layer.material), energies)
+    depth = np.maximum(absorber * layer.thickness_mm, 1e-6)
+    logarithm = np.log(energies / REFERENCE_KEV)
+    rows = {
+        "cover_mm_C": -_levelled(mu_per_mm(material_from_name("C"), energies), energies),
+        "dead_layer_um": -1e-3 * _levelled(absorber, energies),
+        "light_nonproportionality": light_per_keV(layer.material, energies),
+        "light_exponent": logarithm,
+        "light_depth_slope": 1.0 / depth - 1.0 / np.expm1(np.minimum(depth, 500.0)) - 0.5,
+        "swank_exponent": logarithm,
+    }
+    for row in rows.values():
+        row.setflags(write=False)
+    return rows
+
+
+@lru_cache(maxsize=16)
+def _response_tables(
+    scintillator: tuple[Filter, ...], cover: tuple[Filter, ...], counting: bool, bins: int
+) -> NDArray[np.float64]:
+    """What a photon leaves in a scintillator (quantity, node of thickness, energy), on the first bins of the grid.
+
+    Quantities: mean deposit, mean square deposit, interacting share; what the other attenuation tables add to the first
+    two; what full escape of K photons takes from the first two.
+    """
+    energies = energy_grid_keV(500.0)[:bins]
+
+    def tables(escape: bool) -> NDArray[np.float64]:
+        rows = []
+        for log_scale in _LOG_THICKNESS:
+            layers = tuple(
+                Filter(material=layer.material, thickness_mm=layer.thickness_mm * float(np.exp(log_scale)))
+                for layer in scintillator
+            )
+            found = detector_response(
+                scintillator=layers, cover=cover, counting=counting, energies_keV=energies, escape=escape
+            )
+            rows.append((found.mean_deposited_keV, found.mean_square_deposited_keV2, found.interacting_fraction))
+        return np.array(rows).transpose(1, 0, 2)
+
+    escaping, kept = tables(True), tables(False)
+    departure = np.mean([_table_departure(scintillator[0].material, name, energies) for name in OTHER_TABLES], axis=0)
+    # a larger coefficient at one energy is a thicker layer at that energy
+    by_table = np.gradient(escaping[:2], _LOG_THICKNESS, axis=1) * departure
+    result = np.concatenate([escaping, by_table, escaping[:2] - kept[:2]])
+    result.setflags(write=False)
+    return np.asarray(result)
+
+
+def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    clipped = np.clip(at, nodes[0], nodes[-1])
+    below = np.clip(np.searchsorted(nodes, clipped, side="right") - 1, 0, len(nodes) - 2)
+    share = (clipped - nodes[below]) / (nodes[below + 1] - nodes[below])
+    return below, share
+
+
+def _node_shares(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the nodes in a linear interpolation at positions `at` (draw,)."""
+    below, share = _brackets(nodes, at)
+    shares = np.zeros((len(at), len(nodes)))
+    rows = np.arange(len(at))
+    shares[rows, below] = 1.0 - share
+    shares[rows, below + 1] = share
+    return shares
+
+
+def _second_difference_shares(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (draw, node) of the fluence's nodes in half of its second derivative by the logarithm of the voltage."""
+    inside = np.clip(kV_error, _KV_ERRORS[0] + _KV_STEP, _KV_ERRORS[-1] - _KV_STEP)
+    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-_KV_STEP, 0.0, _KV_STEP))
+    return np.asarray((above + below - 2.0 * middle) / (2.0 * _KV_STEP**2))
+
+
+def _interpolate(
+    nodes: NDArray[np.float64], table: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rows of `table` (node, energy) at positions `at` (draw,), linear between nodes."""
+    below, share = _brackets(nodes, at)
+    lowest, highest = int(below.min()), int(below.max()) + 2
+    if len(at) < 2 * (highest - lowest):
+        return np.asarray(table[below] * (1.0 - share)[:, None] + table[below + 1] * share[:, None])
+    weights = np.zeros((len(at), highest - lowest))
+    rows = np.arange(len(at))
+    weights[rows, below - lowest] = 1.0 - share
+    weights[rows, below - lowest + 1] = share
+    return np.asarray(weights @ table[lowest:highest])
+
+
+def _sums_interpolated(
+    nodes: NDArray[np.float64], tables: NDArray[np.float64], at: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """sum over energy of weight (draw, energy) times each of `tables` (table, node, energy) at `at`: (table, draw)."""
+    below, share = _brackets(nodes, at)
+    lowest = int(below.min())
+    used = tables[:, lowest : int(below.max()) + 2]  # the nodes in use: draws lie close together
+    every = (weight @ used.reshape(-1, used.shape[2]).T).reshape(len(at), used.shape[0], used.shape[1])
+    rows = np.arange(len(at))
+    column = below - lowest
+    return np.asarray((every[rows, :, column] * (1.0 - share)[:, None] + every[rows, :, column + 1] * share[:, None]).T)
+
+
+def gain_behind_object(
+    model: SpectralModel,
+    parameters: NDArray[np.float64],
+    beam: OpenBeam,
+    *,
+    material: str,
+    thickness_mm: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Transmission of the signal and gain over that of the open beam (thickness,), behind a slab of `material`.
+
+    The gain follows <E^2>/<E> of what is absorbed, which rises as the object hardens the beam.
+    """
+    samples = parameters[None, :]
+    open_beam = model.signal(samples, beam)
+    mu = model.mu(material)
+    rates, gains = [], []
+    for thickness in thickness_mm:
+        behind = model.signal(samples, beam, through=np.exp(-mu * thickness))
+        rates.append(float(behind.rate_DN_per_mAs[0] / open_beam.rate_DN_per_mAs[0]))
+        gains.append(float(behind.gain_DN[0] / open_beam.gain_DN[0]))
+    return np.array(rates), np.array(gains)
+
+
+def mean_signal_energy_keV(weights: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> float:
+    """Mean energy of a beam's signal, keV; weights (energy,) of the signal."""
+    return float(weights @ energies_keV[: weights.size] / weights.sum())

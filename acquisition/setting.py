@@ -150,7 +150,10 @@ class Setting:
         load = self.tube_load_mAs
         if load is None:
             raise InputError(
-                "setting", received=str(self), expected="a tube load", remedy="give power_w=... or current_ma=..."
+                "setting",
+                received=str(self),
+                expected="a tube load",
+                remedy="give power_w or current_ma (--power-w or --current-ma)",
             )
         return load
 

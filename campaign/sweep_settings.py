@@ -25,7 +25,7 @@ from ..generator.effects import AppliedEffect
 from ..generator.effects.motion_blur import MOTION_BLUR, STATED_MS
 from ..generator.line.line_limits import frames_per_s
 from ..generator.line.twin import Twin
-from ..generator.predictions.predict import Prediction, predict_flatfield
+from ..generator.predictions.predict import Prediction, predict_flatfield, saturation_text
 from .sweep_file import Campaign, Limits, Pair, Requirement, Timing, text_of_pair
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ class Scout:
                 found += images.counts(place, np.random.default_rng(0))[1]
         return tuple(found)
 
-    def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float]:
+    def _contrast(self, pair: Pair, warnings: list[str]) -> dict[str, float | None]:
         from ..generator.predictions.contrast import SlabContrasts
 
         slabs = self.campaign.slabs
@@ -170,7 +170,7 @@ class Scout:
             )
         found = self._contrasts.contrast(*pair, intervals=False)
         warnings += [line for line in found.warnings if line not in warnings]
-        return {"delta_R": found.delta_R.value, "cnr_object": found.cnr_object}
+        return {"delta_R": None if found.delta_R is None else found.delta_R.value, "cnr_object": found.cnr_object}
 
 
 def open_references(path: Path, word: str) -> Dataset:
@@ -295,15 +295,10 @@ def _check(
     timing: Timing,
 ) -> None:
     """Raise where the campaign's limits or the detector's range rule a setting out."""
-    bits = twin.instrument.bits
     for setting, found in zip(pair, predictions, strict=True):
-        if bits is not None:
-            room = 2.0**bits - 1.0 - twin.dark_DN.value
-            if found.mean_DN.value > room:
-                raise _Refused(
-                    f"the detector saturates at {setting.kV:g} kV: {found.mean_DN.value:.0f} DN above dark in the open beam,"
-                    f" room for {room:.0f} DN"
-                )
+        saturated = saturation_text(twin, setting, found.mean_DN.value)
+        if saturated:
+            raise _Refused(f"open field at {setting.kV:g} kV: {saturated}")
     if known["extrapolated"] and not limits.extrapolation:
         raise _Refused("outside the calibrated range, and extrapolation = false")
     speed, motion = known["belt_speed_mm_s"], known["motion_px"]

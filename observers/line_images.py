@@ -31,7 +31,7 @@ from ..generator.line.line_limits import broken_limits
 from ..generator.line.spectral_signal import OpenBeam, SpectralModel
 from ..generator.line.twin import Twin
 from ..generator.line.twin_spectrum import spectral_model_of, white_gain_DN
-from ..generator.predictions.predict import full_scale
+from ..generator.predictions.predict import saturation_text
 from ..generator.predictions.predict_many import Levels, predict_levels
 from ..generator.spread.psf import whole_spectrum
 from ..materials import material_from_name, mu_per_mm
@@ -254,13 +254,11 @@ class LineImages:
             settings = [pair[side] for pair in pairs]
             for number, (one, mean_DN) in enumerate(zip(settings, self._levels(settings).mean_DN, strict=True)):
                 broken = broken_limits(self.twin.instrument, one)
-                held = full_scale(self.twin, one, float(mean_DN))
+                saturated = saturation_text(self.twin, one, float(mean_DN))
                 if broken:
                     reasons[number] = reasons[number] or str(broken[0])
-                elif held is not None and held[0] > held[1]:
-                    reasons[number] = reasons[number] or (
-                        f"the open field saturates at {one}: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN"
-                    )
+                elif saturated:
+                    reasons[number] = reasons[number] or f"open field at {one}: {saturated}"
         return tuple(reasons)
 
     def pair_images(self, pairs: Sequence[Pair], objects: ForeignObjects, *, image: str = "residual") -> PairImages:

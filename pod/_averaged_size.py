@@ -16,37 +16,66 @@ Source: DiCiccio & Martin, J. R. Stat. Soc. B 55 (1993) 305.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ._laplace import Laplace
-from .few_groups import levels_of, size_from_test, student_quantile
+from .few_groups import Levels, levels_of, size_from_test, student_quantile
 from .links import Link
-from .mixed import Codes, MixedFit, averaged_eta, minimise, second_differences
+from .mixed import Codes, MixedFit, averaged_eta, fit_mixed, minimise, second_differences
 from .trials import Trials
 
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CrossedTrials:
+    """Trials of crossed factors as a regression asks for them: design (row, 2), 1 and x; codes (row,) of each factor; link."""
+
+    table: Trials
+    design: Array
+    factors: list[Codes]
+    link: Link
+
+    def laplace(self, *, expected: bool) -> Laplace:
+        """Their deviance by Laplace's method, with the expected or the observed curvature."""
+        return Laplace.of(self.table, factors=self.factors, link=self.link, expected=expected)
+
+    def fit(self, start: Array, *, expected: bool = True) -> MixedFit:
+        """The most likely regression.
+
+        Raises:
+            FitError: the search did not converge.
+        """
+        return fit_mixed(
+            self.design,
+            self.table.hits,
+            self.table.misses,
+            factors=self.factors,
+            link=self.link,
+            start=start,
+            expected=expected,
+        )
+
+    def levels_of(self, mixed: MixedFit, laplace: Laplace) -> Levels:
+        """What the levels of the factors say of the spreads of a fit."""
+        looks = self.table.hits + self.table.misses
+        shares = [np.bincount(codes, weights=looks) / self.table.n for codes in self.factors]
+        return levels_of(mixed.sd, shares, laplace.information(self.design @ mixed.coefficients, mixed.sd))
+
+
 class AveragedSize:
     """The averaged a90 on the scale of x: its estimate, standard error (delta method) and bounds."""
 
-    def __init__(
-        self,
-        *,
-        mixed: MixedFit,
-        design: Array,
-        table: Trials,
-        factors: list[Codes],
-        shares: list[Array],
-        link: Link,
-    ) -> None:
+    def __init__(self, mixed: MixedFit, trials: CrossedTrials) -> None:
+        link = trials.link
         self._link = link
-        self._x = design[:, 1]
+        self._x = trials.design[:, 1]
         self._least = mixed.deviance
         # under logit the two curvatures are the same
-        self._laplace = Laplace.of(table, factors=factors, link=link, expected=link.name == "logit")
+        self._laplace = trials.laplace(expected=link.name == "logit")
         parameters = np.concatenate((mixed.coefficients, mixed.sd))
         self.estimate = self._size(parameters)
         rise = np.array(
@@ -69,8 +98,7 @@ class AveragedSize:
         self._information_at_estimate: float | None = None
         self._likelihood: dict[tuple[float, float], float | None] = {}
         self._mixed = mixed
-        looks = self._laplace.information(design @ mixed.coefficients, mixed.sd)
-        self._levels = levels_of(mixed.sd, shares, looks)
+        self._levels = trials.levels_of(mixed, self._laplace)
         self._eta_rise = self._rise_of_eta(mixed.sd)
         variance, freedom = self._levels.spread(self.error**2, 1 / float(mixed.coefficients[1]))
         self.degrees_of_freedom = float(freedom)

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError, InputError
-from ._averaged_size import AveragedSize
-from ._laplace import Laplace
-from .few_groups import ONE_SIDED, TWO_SIDED, levels_of, not_short_of_likelihood
+from ._averaged_size import AveragedSize, CrossedTrials
+from .few_groups import ONE_SIDED, TWO_SIDED, not_short_of_likelihood
 from .hit_miss import (
     NO_BOUNDS,
     Bounds,
@@ -36,7 +35,7 @@ from .hit_miss import (
     size_in_range,
 )
 from .links import Link
-from .mixed import LARGEST_SD, Codes, MixedFit, averaged_eta, averaged_pod, fit_mixed
+from .mixed import LARGEST_SD, Codes, MixedFit, averaged_eta, averaged_pod
 from .trials import Trials
 
 Array = NDArray[np.float64]
@@ -103,9 +102,8 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
         return without_bounds(replace(plain, warnings=(*kept, SEPARATED)))
     x = np.log(table.size) if log_size else table.size
     design = np.stack((np.ones_like(x), x), axis=1)
-    mixed = fit_mixed(
-        design, table.hits, table.misses, factors=factors, link=link, start=np.array(naive.curve.coefficients)
-    )
+    trials = CrossedTrials(table=table, design=design, factors=factors, link=link)
+    mixed = trials.fit(np.array(naive.curve.coefficients))
     sd = dict(zip(names, mixed.sd, strict=True))
     total = math.hypot(*mixed.sd)
     for name, value in sd.items():
@@ -119,9 +117,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
     conditional: dict[int, float | None] = {50: None, 90: None}
     one = two = low = NO_BOUNDS
     freedom: float | None = None
-    shares = [np.bincount(codes, weights=table.hits + table.misses) / table.n for codes in factors]
-    looks = Laplace.of(table, factors=factors, link=link, expected=True)
-    levels = levels_of(mixed.sd, shares, looks.information(design @ mixed.coefficients, mixed.sd))
+    levels = trials.levels_of(mixed, trials.laplace(expected=True))
     reaches_90 = bool(averaged_pod(np.array(c0 + c1 * largest), total, link=link) >= 0.9)
     if not c1 > 0:
         notes.append("POD does not rise with size in these data: no a50 and no a90")
@@ -139,9 +135,7 @@ def fit_crossed(table: Trials, *, link: Link, log_size: bool, method: str) -> Po
             )[0]
         # along a likelihood that rises without end there is nothing to bound
         if sizes[90] is not None and float(mixed.sd.max()) <= LARGEST_SD:
-            one, two, low, freedom = _bounds(
-                mixed, design, table, factors=factors, shares=shares, link=link, log_size=log_size, notes=notes
-            )
+            one, two, low, freedom = _bounds(mixed, trials, log_size=log_size, notes=notes)
     return PodFit(
         link=link.name,
         method="ml",
@@ -189,33 +183,17 @@ def _error(variance: float) -> float | None:
 
 
 def _bounds(
-    mixed: MixedFit,
-    design: Array,
-    table: Trials,
-    *,
-    factors: list[Codes],
-    shares: list[Array],
-    link: Link,
-    log_size: bool,
-    notes: list[str],
+    mixed: MixedFit, trials: CrossedTrials, *, log_size: bool, notes: list[str]
 ) -> tuple[Bounds, Bounds, Bounds, float | None]:
     """One-sided upper, two-sided upper and lower bounds on the averaged a90, in the data's unit; degrees of freedom."""
     refit = mixed
-    if link.name != "logit":
+    if trials.link.name != "logit":
         try:
-            refit = fit_mixed(
-                design,
-                table.hits,
-                table.misses,
-                factors=factors,
-                link=link,
-                start=mixed.coefficients,
-                expected=False,
-            )
+            refit = trials.fit(mixed.coefficients, expected=False)
         except FitError:
             notes.append("the likelihood with its observed curvature did not converge: no bounds on a90")
             return NO_BOUNDS, NO_BOUNDS, NO_BOUNDS, None
-    size = AveragedSize(mixed=refit, design=design, table=table, factors=factors, shares=shares, link=link)
+    size = AveragedSize(refit, trials)
     asked = ((ONE_SIDED, 1.0), (TWO_SIDED, 1.0), (TWO_SIDED, -1.0))
     results = [
         Bounds(
@@ -231,7 +209,7 @@ def _bounds(
         notes.append(
             "the likelihood gives no upper bound on a90: more images, networks or a wider range of sizes would"
         )
-    largest_size = float(table.size.max())
+    largest_size = float(trials.table.size.max())
     given = [v for v in (results[0].likelihood_ratio, results[0].wald, results[0].modified) if v is not None]
     if given and max(given) > largest_size:
         notes.append(f"a 95 % bound on a90 lies beyond the largest size tested ({largest_size:g}): extrapolated")

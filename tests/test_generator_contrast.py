@@ -298,3 +298,37 @@ def test_the_command_refuses_in_one_line(capsys, words, message):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_saturated_open_field_gives_no_contrast_and_says_why(capsys, tmp_path):
+    import raytwin as rt
+
+    path = str(tmp_path / "twin.h5")
+    write_twin(path, hand_made_twin())
+    long = {"low": str(replace(LOW, exposure_ms=20.0)), "high": str(replace(HIGH, exposure_ms=2000.0, power_W=90.0))}
+    slabs = {"product": str(PRODUCT), "foreign_object": str(BONE), "twin": path}
+    fine = rt.contrast(low=str(LOW), high=str(HIGH), **slabs).contrast
+    assert fine.delta_R is not None and fine.cnr_object > 0
+    found = rt.contrast(**long, **slabs)
+    answer = found.to_dict()
+    assert [answer[name] for name in ("delta_R", "sd_pixel", "sd_object", "cnr_pixel", "cnr_object")] == [None] * 5
+    assert answer["delta_R_by_table"] == {}
+    assert sum("saturates" in text for text in answer["warnings"]) == 1
+    # what beam and slabs have of themselves stays
+    assert answer["low"]["M_product"] == pytest.approx(fine.low.M_product)
+    assert "not known" in repr(found)
+    words = ["--twin", path, "--product", str(PRODUCT), "--object", str(BONE)]
+    assert main(["contrast", *words, "--low", long["low"], "--high", long["high"]]) == 0
+    assert "none: the detector saturates" in capsys.readouterr().out
+
+    grid = rt.contrast(low=str(LOW), high=long["high"], kV_low=[39, 40], kV_high=[90], **slabs)
+    assert grid.to_dict()["cnr_object"] == [[None], [None]]
+    assert grid.best is None and grid.to_dict()["best"] is None
+    assert grid.to_dataframe()["cnr_object"].isna().all()
+    mixed = rt.contrast(low=str(LOW), high=long["high"], kV_low=[40], kV_high=[50, 90], **slabs)
+    (row,) = mixed.to_dict()["delta_R"]
+    assert row[0] is not None and row[1] is None
+    assert mixed.best.high.setting.kV == 50
+    assert "saturates" in " ".join(mixed.warnings)
+    words += ["--low", str(LOW), "--high", str(HIGH), "--map-kv-low", "40:40:1", "--map-kv-high", "80:90:10"]
+    assert main(["contrast", *words, "--plot", str(tmp_path / "map.png")]) == 0

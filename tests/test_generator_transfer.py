@@ -230,7 +230,7 @@ def test_another_magnification_is_refused(twin):
 def test_an_unknown_tube_load_is_refused(twin):
     transfer = PairTransfer(twin, low=TARGETS["other kV"][0], high=TARGETS["other kV"][1])
     bare = tuple(replace(one, power_W=None) for one in REFERENCE)
-    with pytest.raises(InputError, match="give the tube load"):
+    with pytest.raises(InputError, match="expected a tube load"):
         transfer.transfer(np.zeros((2, *SHAPE)), bare)
 
 

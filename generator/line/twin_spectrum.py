@@ -36,21 +36,29 @@ def _cached_model(key: tuple[Any, ...], highest_kV: float) -> SpectralModel:
     )
 
 
-def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel:
-    """The twin's spectral model; its tables are kept for the next call.
+def spectral_posterior_of(twin: Twin) -> SpectralPosterior:
+    """The twin's spectral part.
 
     Raises:
-        InputError: the twin has no spectral part.
+        InputError: it has none.
     """
-    posterior = twin.spectral
-    if posterior is None:
+    if twin.spectral is None:
         raise InputError(
             "twin",
             received="a twin without spectral part",
             expected="a twin calibrated from flats that state kV and tube load",
             remedy="calibrate from series with kV, current_mA or power_W, and exposure_ms",
         )
-    return model_of_posterior(posterior, highest_kV=highest_kV)
+    return twin.spectral
+
+
+def spectral_model_of(twin: Twin, *, highest_kV: float = 160.0) -> SpectralModel:
+    """The twin's spectral model; its tables are kept for the next call.
+
+    Raises:
+        InputError: the twin has no spectral part.
+    """
+    return model_of_posterior(spectral_posterior_of(twin), highest_kV=highest_kV)
 
 
 def model_of_posterior(posterior: SpectralPosterior, *, highest_kV: float = 160.0) -> SpectralModel:

@@ -39,7 +39,7 @@ from ..line.spectral_signal import OpenBeam
 from ..line.twin import Estimate, SpectralPosterior, Twin, estimate_from_sd
 from ..line.twin_spectrum import model_of_posterior, spectral_model_of, white_gain_DN
 from ..spread.psf import PSF_MODELS, Spread
-from .predict import Prediction, predict_flatfield, spectrum_outside
+from .predict import Prediction, predict_flatfield, saturation_text, spectrum_outside
 from .tube_twin import TubeTwin
 
 FloatArray = NDArray[np.float64]
@@ -132,22 +132,24 @@ class Contrast:
 
     Fields: delta_R (value; interval from the twin's posterior and the attenuation tables, without a twin from the tables
     alone; of zero width where no interval was asked for); delta_R_as_published: the paper's equation with coefficients
-    of thin objects (Eq. 4); R_product: the product's quotient; sd_pixel: noise of the quotient in one pixel of the
-    object; sd_object: noise of the mean over object_pixels (a disc) less the mean over the ring around it, with the
-    spread's correlation; cnr_pixel, cnr_object: |delta_R| over these.
+    of thin objects (Eq. 4); delta_R_by_table; R_product: the product's quotient; sd_pixel: noise of the quotient in one
+    pixel of the object; sd_object: noise of the mean over object_pixels (a disc) less the mean over the ring around it,
+    with the spread's correlation; cnr_pixel, cnr_object: |delta_R| over these.
+    Where the open field of a beam saturates, images show no contrast: delta_R, noise and ratios are None, and warnings
+    say so. What stays are properties of beams and slabs.
     """
 
     low: ContrastChannel
     high: ContrastChannel
-    delta_R: Estimate
+    delta_R: Estimate | None
     delta_R_as_published: float
     delta_R_by_table: Mapping[str, float]
     R_product: float
     object_pixels: int
-    sd_pixel: float
-    sd_object: float
-    cnr_pixel: float
-    cnr_object: float
+    sd_pixel: float | None
+    sd_object: float | None
+    cnr_pixel: float | None
+    cnr_object: float | None
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -155,7 +157,7 @@ class Contrast:
         return {
             "low": self.low.as_dict(),
             "high": self.high.as_dict(),
-            "delta_R": self.delta_R.as_dict(),
+            "delta_R": None if self.delta_R is None else self.delta_R.as_dict(),
             "delta_R_as_published": self.delta_R_as_published,
             "delta_R_by_table": dict(self.delta_R_by_table),
             "R_product": self.R_product,
@@ -182,7 +184,7 @@ class _Beam:
     """A setting as a function: transmission of an object (energy,) -> rate and gain (draw,), row 0 the best values.
 
     signal: takes besides whether all draws are wanted or the best values alone; secondary_DN: of the gain, what secondary
-    quanta add, the same behind any object.
+    quanta add, the same behind any object; saturated: the open field is more than the converter holds.
     """
 
     signal: Callable[[FloatArray, bool], tuple[FloatArray, FloatArray]]
@@ -190,6 +192,7 @@ class _Beam:
     open_signal_DN: float
     open_gain_DN: float
     secondary_DN: float
+    saturated: bool
     warnings: tuple[str, ...]
 
 
@@ -224,6 +227,7 @@ class _Slabs:
     thin_mu_product_per_mm: float
     thin_mu_object_per_mm: float
     few_photons: bool
+    saturated: bool
     warnings: tuple[str, ...]
 
 
@@ -259,6 +263,7 @@ def _beam_of_twin(
         open_signal_DN=predicted.mean_DN.value,
         open_gain_DN=predicted.gain_DN.value,
         secondary_DN=white_gain_DN(twin, predicted.gain_DN.value),
+        saturated=bool(saturation_text(twin, setting, predicted.mean_DN.value)),
         warnings=(*predicted.warnings, *told),
     )
 
@@ -297,6 +302,7 @@ def _beam_of_line(line: UncalibratedLine, setting: Setting, library: Library | N
         open_signal_DN=float(rate[0]) * load * (1000.0 / distance) ** 2 * line.pixel_mm**2,
         open_gain_DN=float(gain[0]),
         secondary_DN=0.0,
+        saturated=False,
         warnings=warnings,
     )
 
@@ -461,6 +467,7 @@ def _slabs(
         thin_mu_product_per_mm=crossed.thin_mu_product_per_mm,
         thin_mu_object_per_mm=crossed.thin_mu_object_per_mm,
         few_photons=math.sqrt(max(spreads) * setting.averaged) > _FEW_PHOTONS,
+        saturated=beam.saturated,
         warnings=beam.warnings,
     )
 
@@ -579,7 +586,7 @@ def _combined(
             f"the product is thin: M_low = {low.channel.M_product:.3g}, and the ring of Delta R asks for more than"
             f" {PRODUCT_THRESHOLD:g}"
         )
-    return Contrast(
+    found = Contrast(
         low=low.channel,
         high=high.channel,
         delta_R=estimate_from_sd(best, sd),
@@ -598,6 +605,11 @@ def _combined(
         cnr_pixel=abs(best) / sd_pixel,
         cnr_object=abs(best) / sd_object,
         warnings=tuple(warnings),
+    )
+    if not (low.saturated or high.saturated):
+        return found
+    return replace(
+        found, delta_R=None, delta_R_by_table={}, sd_pixel=None, sd_object=None, cnr_pixel=None, cnr_object=None
     )
 
 

@@ -12,7 +12,7 @@ from ...spectra import BIN_WIDTH_KEV, detector_response
 from ..frames.present_line import present_line
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import Estimate, Twin, estimate_from_log_draws
-from ..line.twin_spectrum import spectral_model_of
+from ..line.twin_spectrum import model_of_posterior, spectral_posterior_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,11 +57,9 @@ def predict_back_layer(twin: Twin, setting: Setting) -> BackLayer:
             "twin", received="an instrument with one sensitive layer", expected="a declared back_scintillator"
         )
     twin = present_line(twin).twin  # effects on the beam reach the back layer too
-    posterior = twin.spectral
-    model = spectral_model_of(twin, highest_kV=setting.kV)  # raises where there is no spectral part
-    load = setting.tube_load_mAs
-    if load is None or posterior is None:
-        raise InputError("setting", received=str(setting), expected="a tube load", remedy="give current or power")
+    posterior = spectral_posterior_of(twin)
+    model = model_of_posterior(posterior, highest_kV=setting.kV)
+    load = setting.stated_load_mAs()
     beam = OpenBeam(kV=setting.kV, filters=setting.filters)
     photons = model.weights(posterior.samples, beam)
     top = photons.shape[1]

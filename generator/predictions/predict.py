@@ -310,11 +310,7 @@ class _Flat:
 
 def _without_effects(twin: Twin, setting: Setting) -> Prediction:
     warnings = list(check_limits(twin.instrument, setting))
-    load_mAs = setting.tube_load_mAs
-    if load_mAs is None:
-        raise InputError(
-            "setting", received=str(setting), expected="a tube load", remedy="give --current-ma or --power-w"
-        )
+    load_mAs = setting.stated_load_mAs()
     level, posterior = twin.level_at(setting), twin.spectral
     distance_mm = _distance_mm(twin, setting, level, warnings)
     flat = None
@@ -454,9 +450,9 @@ def _of_frames(twin: Twin, setting: Setting, flat: _Flat, warnings: list[str]) -
     of_quanta = max(variance - read_DN2, 0.0) * flat.quantum_sd
     of_reading = 2.0 * read.value * (read.high - read.low) / (2 * 1.959964) * binned.electronic
     relative_sd = 0.5 * math.hypot(of_quanta, of_reading) / variance
-    held = full_scale(twin, setting, mean_DN.value)
-    if held is not None and held[0] > held[1]:
-        warnings.append(f"the detector saturates: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN")
+    saturated = saturation_text(twin, setting, mean_DN.value)
+    if saturated:
+        warnings.append(saturated)
     if photons is not None and instrument.counting:
         check_count_rate(instrument, setting, photons.value)
     return Prediction(
@@ -485,6 +481,14 @@ def full_scale(twin: Twin, setting: Setting, mean_DN: float) -> tuple[float, flo
         return None
     binned = binned_pixel(setting.binning, twin.instrument.binning_adds)
     return mean_DN / binned.signal * binned.at_the_adc, 2.0**bits - 1 - twin.dark_DN.value
+
+
+def saturation_text(twin: Twin, setting: Setting, mean_DN: float) -> str:
+    """By how much a flatfield is more than the converter holds; empty: it is not, or its bits are not known. As `full_scale`."""
+    held = full_scale(twin, setting, mean_DN)
+    if held is None or held[0] <= held[1]:
+        return ""
+    return f"the detector saturates: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN"
 
 
 def _log_sd(estimate: Estimate) -> float:

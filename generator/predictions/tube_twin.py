@@ -141,11 +141,7 @@ def predict_tube(twin: TubeTwin, setting: Setting) -> TubePrediction:
         InputError: no tube load, a setting beyond the tube's limits, a kV without spectra, or no photons behind the filters.
     """
     warnings = [NO_DETECTOR, *check_limits(twin.instrument, setting)]
-    load_mAs = setting.tube_load_mAs
-    if load_mAs is None:
-        raise InputError(
-            "setting", received=str(setting), expected="a tube load", remedy="give --current-ma or --power-w"
-        )
+    load_mAs = setting.stated_load_mAs()
     kerma, outside = _kerma_per_mAs(twin.spectral, setting.kV, setting.filters)
     distance_mm = setting.source_detector_mm or twin.instrument.source_object_mm
     if distance_mm is None:

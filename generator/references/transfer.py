@@ -256,13 +256,7 @@ def check_geometry(references: Sequence[Setting], targets: Sequence[Setting]) ->
                 remedy="another distance is another magnification; measure references there",
             )
         for setting in (reference, target):
-            if setting.tube_load_mAs is None:
-                raise InputError(
-                    "setting",
-                    received=str(setting),
-                    expected="power_w or current_ma",
-                    remedy="give the tube load, for example power_w=40",
-                )
+            setting.stated_load_mAs()
 
 
 def sample_transferred(

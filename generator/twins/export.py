@@ -67,7 +67,7 @@ class _Line:
 
     def load_mAs(self, number: int) -> float:
         """Charge of one frame of a setting."""
-        return self.settings[number].tube_load_mAs or 0.0
+        return self.settings[number].stated_load_mAs()
 
 
 def export_twin(
@@ -90,9 +90,8 @@ def export_twin(
     if to not in FORMATS:
         raise InputError("to", received=repr(to), expected="one of " + ", ".join(FORMATS))
     line = _line_of(twin, _settings_of(twin, settings))
-    for number, setting in enumerate(line.settings):
-        if not line.load_mAs(number) > 0:
-            raise InputError("settings", received=str(setting), expected="a tube load", remedy="give current or power")
+    for setting in line.settings:
+        setting.stated_load_mAs()  # said before anything is written
     warnings = []
     if twin.effects:
         warnings.append("effects of the twin are left out: " + ", ".join(item.id for item in twin.effects))

@@ -1,5 +1,6 @@
 """Beams before any calibration: tube spectrum, effective attenuation, contrast of a foreign object."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -200,10 +201,10 @@ class ObjectContrast(Result):
 
     def _table(self) -> Table:
         found = self.contrast
-        rows = [("Delta R", f"{found.delta_R.value:.5f}", f"{found.delta_R.low:.5f} to {found.delta_R.high:.5f}")]
-        rows.append(("  as published", f"{found.delta_R_as_published:.5f}", ""))
-        rows.append(("contrast to noise, one pixel", f"{found.cnr_pixel:.3f}", ""))
-        rows.append(("contrast to noise, the object", f"{found.cnr_object:.3f}", ""))
+        rows = [("Delta R", *interval_text(None if found.delta_R is None else found.delta_R.as_dict()))]
+        rows.append(("  as published", number_text(found.delta_R_as_published), ""))
+        rows.append(("contrast to noise, one pixel", number_text(found.cnr_pixel), ""))
+        rows.append(("contrast to noise, the object", number_text(found.cnr_object), ""))
         title = f"{self.foreign_object} mm in {self.product} mm, {found.object_pixels} pixels"
         notes = (str(found.low.setting), str(found.high.setting), *(f"warning: {text}" for text in self.warnings))
         return Table(title=title, header=("", "value", "95 % interval"), rows=tuple(rows), notes=notes)
@@ -233,9 +234,10 @@ class ContrastMap(Result):
         return tuple(dict.fromkeys(text for row in self.grid for one in row for text in one.warnings))
 
     @property
-    def best(self) -> "Contrast":
-        """The pair of settings with the largest contrast-to-noise ratio of the object."""
-        return max((one for row in self.grid for one in row), key=lambda one: one.cnr_object)
+    def best(self) -> "Contrast | None":
+        """The pair of settings with the largest contrast-to-noise ratio of the object; None: the detector saturates at all."""
+        shown = [one for row in self.grid for one in row if one.cnr_object is not None]
+        return max(shown, key=lambda one: one.cnr_object or 0.0, default=None)
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin contrast --json` prints for a map."""
@@ -246,18 +248,19 @@ class ContrastMap(Result):
         )
         found: dict[str, Any] = plain(
             {
-                **_slabs_answer(self, best.object_pixels),
+                **_slabs_answer(self, self.grid[0][0].object_pixels),
                 **{
                     place: {"axis": axis.lower(), "values": [_label(axis, value) for value in values]}
                     for place, axis, values in axes
                 },
-                "delta_R": [[one.delta_R.value for one in row] for row in self.grid],
+                "delta_R": [[_delta_R(one) for one in row] for row in self.grid],
                 "cnr_pixel": [[one.cnr_pixel for one in row] for row in self.grid],
                 "cnr_object": [[one.cnr_object for one in row] for row in self.grid],
-                "best": {
+                "best": best
+                and {
                     "low": str(best.low.setting),
                     "high": str(best.high.setting),
-                    "delta_R": best.delta_R.value,
+                    "delta_R": _delta_R(best),
                     "cnr_object": best.cnr_object,
                 },
                 "warnings": self.warnings,
@@ -272,7 +275,7 @@ class ContrastMap(Result):
                 {
                     self.row_axis: _label(self.row_axis, row_value),
                     self.column_axis: _label(self.column_axis, column_value),
-                    "delta_R": one.delta_R.value,
+                    "delta_R": _delta_R(one),
                     "cnr_pixel": one.cnr_pixel,
                     "cnr_object": one.cnr_object,
                 }
@@ -295,7 +298,8 @@ class ContrastMap(Result):
         if what not in names:
             raise InputError("what", received=repr(what), expected="one of " + ", ".join(names))
         axes = axes_or_new(ax)
-        image = axes.imshow(self.to_dict()[what], origin="lower", aspect="auto", cmap="viridis")
+        numbers = [[math.nan if one is None else one for one in row] for row in self.to_dict()[what]]
+        image = axes.imshow(numbers, origin="lower", aspect="auto", cmap="viridis")
         axes.figure.colorbar(image, ax=axes)
         sides = ((axes.xaxis, self.column_axis, self.column_values), (axes.yaxis, self.row_axis, self.row_values))
         for side, axis, values in sides:
@@ -306,15 +310,21 @@ class ContrastMap(Result):
 
     def _table(self) -> Table:
         best = self.best
-        rows = (
-            ("Delta R", f"{best.delta_R.value:.5g}"),
-            ("contrast to noise of the object", f"{best.cnr_object:.4g}"),
-            ("low", str(best.low.setting)),
-            ("high", str(best.high.setting)),
-        )
+        rows: tuple[tuple[str, str], ...] = (("contrast to noise of the object", number_text(None)),)
+        if best is not None:
+            rows = (
+                ("Delta R", number_text(_delta_R(best))),
+                ("contrast to noise of the object", number_text(best.cnr_object)),
+                ("low", str(best.low.setting)),
+                ("high", str(best.high.setting)),
+            )
         size = f"{len(self.row_values)} {self.row_axis} x {len(self.column_values)} {self.column_axis}"
         title = f"{self.foreign_object} mm in {self.product} mm over {size}: best"
         return Table(title=title, rows=rows, notes=tuple(f"warning: {text}" for text in self.warnings))
+
+
+def _delta_R(found: "Contrast") -> float | None:
+    return None if found.delta_R is None else found.delta_R.value
 
 
 def _slabs_answer(found: "ObjectContrast | ContrastMap", object_pixels: int) -> dict[str, Any]:

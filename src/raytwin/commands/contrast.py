@@ -146,10 +146,13 @@ def _text(found: Any, result: dict[str, Any]) -> str:
             f"      mu_eff product {channel.mu_eff_product_per_mm:.5g} /mm, object {channel.mu_eff_object_per_mm:.5g} /mm"
         )
     delta = found.delta_R
-    lines.append(f"Delta R            {delta.value:.5f} ({delta.low:.5f} to {delta.high:.5f})")
-    lines.append(f"  as published     {found.delta_R_as_published:.5f} (coefficients of thin objects)")
-    lines.append(f"noise, one pixel   {found.sd_pixel:.5f}    contrast to noise {found.cnr_pixel:.3f}")
-    lines.append(f"noise, the object  {found.sd_object:.5f}    contrast to noise {found.cnr_object:.3f}")
+    if delta is not None:
+        lines.append(f"Delta R            {delta.value:.5f} ({delta.low:.5f} to {delta.high:.5f})")
+        lines.append(f"  as published     {found.delta_R_as_published:.5f} (coefficients of thin objects)")
+        lines.append(f"noise, one pixel   {found.sd_pixel:.5f}    contrast to noise {found.cnr_pixel:.3f}")
+        lines.append(f"noise, the object  {found.sd_object:.5f}    contrast to noise {found.cnr_object:.3f}")
+    else:
+        lines.append("Delta R and noise  none: the detector saturates")
     return "\n".join(lines)
 
 
@@ -160,9 +163,13 @@ def _map_text(result: dict[str, Any]) -> str:
         lines.append(f"{title}: {rows['axis']} down, {columns['axis']} across")
         lines.append(" " * 14 + "".join(f"{value!s:>12}" for value in columns["values"]))
         for label, row in zip(rows["values"], result[name], strict=True):
-            lines.append(f"{label!s:>14}" + "".join(f"{value:>12.4g}" for value in row))
+            cells = ("none" if value is None else f"{value:.4g}" for value in row)
+            lines.append(f"{label!s:>14}" + "".join(f"{cell:>12}" for cell in cells))
     best = result["best"]
-    lines.append(f"best contrast to noise {best['cnr_object']:.4g}: {best['low']} with {best['high']}")
+    if best is None:
+        lines.append("no contrast to noise: the detector saturates at every pair")
+    else:
+        lines.append(f"best contrast to noise {best['cnr_object']:.4g}: {best['low']} with {best['high']}")
     return "\n".join(lines)
 
 
@@ -174,6 +181,6 @@ def _figure(found: ContrastMap) -> Any:
     FigureCanvasAgg(figure)
     for axes, what in zip(figure.subplots(1, 2), ("delta_R", "cnr_object"), strict=True):
         found.plot(ax=axes, what=what)
-    pixels = found.best.object_pixels
+    pixels = found.grid[0][0].object_pixels
     figure.suptitle(f"{found.foreign_object} mm in {found.product} mm, {pixels} pixels", fontsize=10)
     return figure

@@ -453,7 +453,7 @@ def numbers_text(view: ExplorerView, explorer: Explorer) -> str:
         rows.append(("−ln(I/I₀) of the product", f"{found.low.M_product:.4f}", f"{found.high.M_product:.4f}"))
         rows.append(("−ln(I/I₀) with the object", f"{found.low.M_object:.4f}", f"{found.high.M_object:.4f}"))
     both: list[tuple[str, str]] = []
-    if found is not None:
+    if found is not None and found.cnr_pixel is not None:
         both.append(("contrast to noise of one pixel", f"{found.cnr_pixel:.3g}"))
     pixel_mm = explorer.instrument.pixel_mm
     if pixel_mm is not None and explorer.instrument.magnification is not None:
@@ -486,8 +486,11 @@ def tiles_text(view: ExplorerView) -> str:
     """The answer at a glance: what the pair of images is worth, as HTML."""
     found = view.contrast
     tiles = [
-        ("contrast to noise of the object", "none" if found is None else f"{found.cnr_object:.3g}"),
-        ("contrast Delta R", "none" if found is None else _interval(found.delta_R, 3)),
+        (
+            "contrast to noise of the object",
+            "none" if found is None or found.cnr_object is None else f"{found.cnr_object:.3g}",
+        ),
+        ("contrast Delta R", "none" if found is None or found.delta_R is None else _interval(found.delta_R, 3)),
         ("air kerma of the pair, µGy", "not known" if view.dose_uGy is None else _interval(view.dose_uGy, 3)),
         ("pairs a second", f"{view.pairs_per_s:.3g}"),
     ]
@@ -597,7 +600,7 @@ def _map_note(found: MapView) -> str:
     kV_low, kV_high, ratio = found.best
     return _note(
         f"Ring: what is set. Star: best on the map, {ratio:.3g} at {kV_low:g} and {kV_high:g} kV. Hatched: beyond the limits"
-        " of the line. Empty: no pair. Powers stay as set."
+        " of the line. Empty: no pair, or a saturated image. Powers stay as set."
     )
 
 
@@ -716,7 +719,7 @@ class _Figures:
             "here": {"data": {"x": [view.state.kV_low], "y": [view.state.kV_high]}},
         }
         pair, contrast = view.images, view.contrast
-        if pair is None or contrast is None:
+        if pair is None or contrast is None or contrast.delta_R is None or contrast.sd_pixel is None:
             found["pictures"] = {"data": {name: [] for name in (*_PICTURES, "side")}}
             return found
         found["pictures"] = {

@@ -19,8 +19,8 @@ from ..generator.line.line_limits import broken_limits, check_count_rate, frames
 from ..generator.line.spectral_signal import OpenBeam
 from ..generator.line.twin import Estimate, Twin
 from ..generator.line.twin_spectrum import spectral_model_of
-from ..generator.predictions.contrast import Contrast, ContrastChannel, SlabContrasts
-from ..generator.predictions.predict import Prediction, full_scale, predict_flatfield
+from ..generator.predictions.contrast import Contrast, SlabContrasts
+from ..generator.predictions.predict import Prediction, full_scale, predict_flatfield, saturation_text
 from ..materials import transmission
 from .known_pod import KnownPod
 from .picture import ImagePair, draw_pair
@@ -92,8 +92,8 @@ class ExplorerView:
 class MapView:
     """Contrast-to-noise ratio of the object over both voltages.
 
-    Fields: kV_low, kV_high (axis values); cnr (low, high), NaN where the pair is none or cannot be; allowed (low, high): within the
-    declared limits of the line and without saturation; best (kV low, kV high, ratio) among the allowed; None where none is.
+    Fields: kV_low, kV_high (axis values); cnr (low, high), NaN where the pair is none, cannot be or saturates; allowed (low, high):
+    within the declared limits of the line and without saturation; best (kV low, kV high, ratio) among the allowed; None where none is.
     """
 
     kV_low: tuple[float, ...]
@@ -193,9 +193,10 @@ class Explorer:
                 low, high = pair.setting("low"), pair.setting("high")
                 allowed[row, column] = not any(broken_limits(self.instrument, setting) for setting in (low, high))
                 one = _or_told(lambda low=low, high=high: slabs.contrast(low, high, intervals=False), [])  # type: ignore[misc]
-                if one is not None:
+                if one is not None and one.cnr_object is not None:
                     cnr[row, column] = one.cnr_object
-                    allowed[row, column] &= not any(self._saturated(channel) for channel in (one.low, one.high))
+                else:
+                    allowed[row, column] = False
                 if row == 0:
                     yield None  # each of these is a beam of its own
             yield None
@@ -213,11 +214,6 @@ class Explorer:
         quarter = lowest + 0.25 * (highest - lowest)
         lows, highs = np.linspace(lowest + 5.0, middle, steps[0]), np.linspace(quarter, highest, steps[1])
         return tuple(float(round(one)) for one in lows), tuple(float(round(one)) for one in highs)
-
-    def _saturated(self, channel: ContrastChannel) -> bool:
-        """Whether the open field of one image is more than the converter holds."""
-        held = full_scale(self.twin, channel.setting, channel.open_signal_DN)
-        return held is not None and held[0] > held[1]
 
     def _limits(self, state: ExplorerState) -> tuple[list[str], list[str]]:
         limits, cautions = [], []
@@ -238,10 +234,9 @@ class Explorer:
             held = full_scale(self.twin, setting, predicted.mean_DN.value)
             if held is not None:
                 share = held[0] / held[1]
-                if share > 1.0:
-                    limits.append(
-                        f"{_short(setting)}: the detector saturates: {held[0]:.0f} DN above dark, room for {held[1]:.0f} DN"
-                    )
+            saturated = saturation_text(self.twin, setting, predicted.mean_DN.value)
+            if saturated:
+                limits.append(f"{_short(setting)}: {saturated}")
             if self.instrument.counting and predicted.photons_absorbed is not None:
                 photons = predicted.photons_absorbed.value
                 _or_told(lambda: check_count_rate(self.instrument, setting, photons), limits)
@@ -334,7 +329,7 @@ def _dose(low: Prediction | None, high: Prediction | None) -> Estimate | None:
 
 
 def _pod_view(known: KnownPod, contrast: Contrast | None) -> PodView:
-    if contrast is None or not known.of_contrast:
+    if contrast is None or contrast.delta_R is None or not known.of_contrast:
         return PodView(known=known, times_a90=None, pod=None)
     seen = abs(contrast.delta_R.value)
     return PodView(

@@ -12,6 +12,7 @@ from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_
 from raytwin.errors import InputError
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter, effect_of, in_order
 from raytwin.generator.effects._light_spread import spread_transfer
+from raytwin.generator.effects.crosstalk import leaving_share
 from raytwin.generator.effects.effect import Grid, Shows, Variation
 from raytwin.generator.effects.focal_spot import _transfer_of_spot
 from raytwin.generator.effects.k_fluorescence import line_energy_keV
@@ -59,6 +60,7 @@ CATALOGUE = {
     "misregistration": ("px", 0.1, 3),
     "gain_map_error": ("%", 0.1, 3),
     "composition_error": ("%", 0.5, 5),
+    "crosstalk": ("%", 3, 40),
 }
 CACHE = ModelCache()
 
@@ -1109,6 +1111,37 @@ def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(ser
         )
         known = share * found.noise_autocovariance[lag]
         assert abs(seen - known) < 4 * math.sqrt(max(known, 1e-6) / count), lag
+
+
+def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise_and_flats_alone(series_line):
+    """Quanta are drawn on both sides of an edge, moved and spread by light; no transfer function is used."""
+    strength, reach_px, count = 30.0, 1.2, 4_000_000
+    effect = applied("crosstalk", strength, reach_px=reach_px)
+    plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
+    asked = request("object", thickness_mm=plate)
+    found, sharp = expect(series_line, asked, effect), expect(series_line, asked)
+    even = series_line.level_nearest(asked.setting).flat_shape
+    known, plain = ((one.signal_DN / even).mean(axis=0)[12:28] for one in (found, sharp))
+    rng = np.random.default_rng(3)
+    # it is the same all along the edge: of a place only the column counts
+    column = rng.uniform(8.0, 32.0, count)
+    column = column[rng.random(count) < np.where(column < 20.0, plain.min() / plain.max(), 1.0)]
+    distance, angle = rng.exponential(reach_px, column.size), rng.uniform(0.0, 2.0 * math.pi, column.size)
+    step = distance * np.stack([np.sin(angle), np.cos(angle)])
+    left = np.any(np.floor(np.stack([rng.random(column.size), column % 1.0]) + step) != 0.0, axis=0)
+    assert np.mean(left) == pytest.approx(leaving_share(reach_px), abs=1e-3)
+    moves = rng.random(column.size) < strength / 100.0 / np.mean(left)
+    assert np.mean(left & moves) == pytest.approx(0.30, abs=1.5e-3)
+    light = series_line.noise.spread.value.sigma_px * rng.standard_normal(column.size)
+    counts = np.histogram(column + np.where(moves, step[1], 0.0) + light, bins=np.arange(12, 29))[0]
+    full = count / 24.0
+    away = [(counts - full * image / plain.max()) / np.sqrt(full * image / plain.max()) for image in (known, plain)]
+    assert np.abs(away[0]).max() < 4.5 and np.abs(away[1]).max() > 15.0
+    # moved quanta are counts as the others: their noise is as correlated as before, and flats do not change
+    np.testing.assert_array_equal(found.noise_autocovariance, sharp.noise_autocovariance)
+    np.testing.assert_array_equal(
+        numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
+    )
 
 
 def test_a_share_of_an_output_s_drift_may_be_new_in_every_exposure(series_line):

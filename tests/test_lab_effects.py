@@ -287,6 +287,40 @@ def test_k_fluorescence_leaves_the_level_and_takes_variance_from_the_pixel_above
     assert binned(with_it) / binned(without) == pytest.approx(1.0 - 0.02, abs=5 * math.sqrt(2) * error)
 
 
+def test_crosstalk_moves_its_share_of_the_quanta_out_of_their_pixel_and_loses_none():
+    system = system_on("fine")
+    line, bare = line_with("crosstalk=20", "fine", system=system), line_with(None, "fine", system=system)
+    setting = setting_of(line, 60.0, geometry="fine")
+    # one pixel in an opaque plate lets light through
+    lengths = {"W": np.full(thickness_on_fine_grid(system, Edge(angle=0.0))["W"].shape, 5.0, dtype=np.float32)}
+    fine = lengths["W"].shape[0]
+    first = (fine // SUBPIXELS // 2) * SUBPIXELS
+    lengths["W"][first : first + SUBPIXELS, first : first + SUBPIXELS] = 0.0
+    both = []
+    for one in (line, bare):
+        arrivals = one.arrivals(setting, scene="hole", thickness_mm=lengths)
+        both.append(arrivals.sums[:, 0][arrivals.cell].astype(float))
+    moved, still = (image.reshape(fine // SUBPIXELS, SUBPIXELS, -1, SUBPIXELS).sum(axis=(1, 3)) for image in both)
+    at = first // SUBPIXELS
+    assert moved.sum() == pytest.approx(still.sum(), rel=1e-4)
+    assert 1.0 - moved[at, at] / still[at, at] == pytest.approx(0.20, abs=1e-3)
+    beside = [moved[at - 1, at], moved[at + 1, at], moved[at, at - 1], moved[at, at + 1]]
+    assert np.ptp(beside) < 0.01 * np.mean(beside) and min(beside) > 0.01 * still[at, at]
+
+
+def test_quanta_that_moved_stay_independent():
+    system = system_on("fine", psf_sigma_px=0.35)
+    line, bare = line_with("crosstalk=30", "fine", system=system), line_with(None, "fine", system=system)
+    setting = setting_of(line, 60.0, geometry="fine")
+    lengths = thickness_on_fine_grid(system, Slab(layers_mm={"pmma": 10.0}))
+    with_it, without = (frames_of(one, setting, 40, scene="slab", thickness_mm=lengths) for one in (line, bare))
+    error = math.sqrt(2.0 / 40.0) / SIZE
+    assert covariance(with_it, 0, 0) / covariance(without, 0, 0) == pytest.approx(1.0, abs=5 * math.sqrt(2) * error)
+    for lag in ((0, 1), (1, 0), (1, 1)):
+        correlations = [covariance(one, *lag) / covariance(one, 0, 0) for one in (with_it, without)]
+        assert correlations[0] == pytest.approx(correlations[1], abs=5 * error)
+
+
 @pytest.mark.parametrize("since", ["always", "calibration"])
 def test_lag_leaves_its_strength_in_the_first_frame_without_beam(since):
     line = line_with(f"image_lag=2@{since}", seed=4)

@@ -13,6 +13,7 @@ from ..line.line_state import STAGES
 from .bad_pixels import BAD_PIXELS
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
+from .crosstalk import CROSSTALK
 from .dark_drift import DARK_DRIFT
 from .effect import (
     EVERY_SERIES,
@@ -70,6 +71,7 @@ OURS: dict[str, Effect] = {
         MOTION_BLUR,
         GAIN_MAP_ERROR,
         COMPOSITION_ERROR,
+        CROSSTALK,
     )
 }
 EFFECTS = Catalogue(OURS)

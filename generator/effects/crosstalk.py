@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..line_state import FloatArray, LineContext, LineState
+from ..line.line_state import FloatArray, LineContext, LineState
 from ._light_spread import spread_transfer
 from .effect import Effect, Grid, Parameter, Shows
 

@@ -134,7 +134,14 @@ def numbers(found):
         found.quantum_variance_DN2 / 100,
         found.white_variance_DN2 / 100,
         found.noise_autocovariance,
-        np.array([found.row_variance_DN2, found.column_variance_DN2, found.bad_pixel_share, found.fixed_pattern_rms]),
+        np.array(
+            [
+                found.row_variance_DN2,
+                found.column_variance_DN2,
+                found.bad_pixel_share,
+                0.0 if found.gain_pattern is None else found.gain_pattern.rms,
+            ]
+        ),
         np.array([0.0 if found.tile_pattern is None else found.tile_pattern.rms]),
         np.zeros(3)
         if found.flicker is None
@@ -228,7 +235,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         assert abs(share - expected.bad_pixel_share) < 4 * math.sqrt(8 * expected.bad_pixel_share / good.size)
     if name == "gain_map_error":
         pattern = residual.mean(axis=0) / expected.signal_DN
-        assert pattern.std() == pytest.approx(expected.fixed_pattern_rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
+        assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
         residual = residual - residual.mean(axis=0)
     if name == "tile_gain":
         gains = (residual.mean(axis=0) / expected.signal_DN)[:32, :32].reshape(2, 16, 2, 16).mean(axis=(1, 3))

@@ -99,21 +99,21 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
         none = shadow < 0.5 * float(np.ptp(np.quantile(depth[maps.good], ends)))
         return f"the thickness maps of {scene} hold an object, but its frames show no shadow" if none else ""
     stride = maps.stride
-    own = _correlation(picture, depth, maps.good, stride)
+    own = _correlation(picture, depth, stride)
     if not own < _FITS:
         return ""
     best, name = own, ""
     for turn, change in _TURNS.items():
         turned = change(depth)
         if turned.shape == depth.shape:
-            value = _correlation(picture, turned, maps.good, stride)
+            value = _correlation(picture, turned, stride)
             if value > best:
                 best, name = value, f"the same maps {turn}"
     for other in others:
         if other != scene:
             candidate = maps.depth(other, item.label)
             if candidate is not None and float(np.std(np.clip(candidate, 0.0, DEEPEST))) > 0.03:
-                value = _correlation(picture, candidate, maps.good, stride)
+                value = _correlation(picture, candidate, stride)
                 if value > best:
                     best, name = value, f"the maps of {other}"
     if name and 1.0 - best < _FITS_BETTER * (1.0 - own) and best > 0.9:
@@ -123,7 +123,7 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
     return ""
 
 
-def _correlation(picture: FloatArray, depth: FloatArray, good: NDArray[np.bool_], stride: int) -> float:
+def _correlation(picture: FloatArray, depth: FloatArray, stride: int) -> float:
     """Largest correlation of a picture's and a map's -log T, smoothed, over displacements of some pixels."""
     from scipy.ndimage import gaussian_filter, median_filter
 

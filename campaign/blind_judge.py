@@ -67,11 +67,10 @@ def judge_session(
     import numpy as np
 
     from ..acquisition import open_acquisition
-    from ..diagnosis.checks.preparation import calibrated_twin
+    from ..diagnosis.checks.preparation import prepare_session
     from ..diagnosis.diagnose_session import diagnose
     from ..diagnosis.judgement.answer import diagnosis_answer
-    from ..diagnosis.model.changes import catalogue_variants
-    from ..diagnosis.problem.assemble import build_problem
+    from ..diagnosis.problem.assemble import problem_of
     from .blind_code import code_digest
     from .blind_second_day import second_day_shrinkage
     from .blind_statistics import session_features, session_statistics, write_statistics
@@ -81,7 +80,8 @@ def judge_session(
     with open_acquisition(path) as acquisition:
         rng = np.random.default_rng(_SEED)
         if features_only:
-            problem = build_problem(acquisition, calibrated_twin(acquisition, rng=rng), variants=catalogue_variants())
+            prepared = prepare_session(acquisition, twin=None, rng=rng)
+            problem = problem_of(prepared, prepared.twin)
         else:
             found = diagnose(acquisition, rng=rng, without=without)
             problem = found.compared
@@ -92,7 +92,8 @@ def judge_session(
         try:
             if without and not features_only:
                 # what was withheld must have a response too, to say afterwards how far it lay from all the others
-                problem = build_problem(acquisition, replace(found.twin, effects=()), variants=catalogue_variants())
+                prepared = prepare_session(acquisition, twin=replace(found.twin, effects=()), rng=rng)
+                problem = problem_of(prepared, prepared.twin)
             result["features"] = session_features(problem)
             write_statistics(statistics_path, session_statistics(problem))
             if second is not None and not features_only:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import open_acquisition
 from ..diagnosis.checks.preparation import prepare_session
-from ..diagnosis.problem.assemble import build_problem
+from ..diagnosis.problem.assemble import problem_of
 from ..diagnosis.report.explanation import title_of
 from ..generator.line.twin import Twin
 from ..generator.twins.twin_io import read_twin
@@ -124,16 +124,7 @@ def compare_products(acquisition: Path, *, before: Twin, after: Twin, seed: int)
         views = []
         for twin in (before, after):
             ready = prepare_session(session, twin=twin, rng=np.random.default_rng(seed))
-            problem = build_problem(
-                ready.acquisition,
-                ready.twin,
-                variants=(),
-                calibrated_elsewhere=ready.calibrated_elsewhere,
-                exposed=ready.exposed,
-                ends_at_zero=ready.ends_at_zero,
-                spectral_point=ready.spectral_point,
-                side=ready.factor,
-            )
+            problem = problem_of(ready, ready.twin, variants=())
             views.append({view.session.name: view for view in problem.views})
         found = []
         for name, plain in views[0].items():

@@ -8,16 +8,12 @@ import numpy as np
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.line.twin import Twin
-from .checks.preparation import PreparedSession, calibrated_twin, mislabelled, prepare_session
+from .checks.preparation import calibrated_twin, mislabelled, prepare_session
 from .checks.readings import Suspect
 from .inference.inference import UNKNOWN, Hypothesis, Priors
 from .judgement.answer import EXPLAINED, Diagnosis, in_pixels
 from .judgement.judgement import judge
-from .judgement.sought_anew import is_to_be_asked, with_sought_anew
-from .model.changes import catalogue_variants
-from .problem.assemble import build_problem
-from .problem.known_effects import already_there, lasting
-from .problem.problem import Problem
+from .problem.assemble import problem_of
 from .session.coarse import unseen_in_squares
 
 
@@ -36,7 +32,7 @@ def diagnose(
         acquisition: open acquisition file, anything from two flats with darks to the full protocol; frames of more than
             LARGEST_PIXELS are compared as means of squares of pixels.
         twin: calibrated elsewhere; absent, the session's own calibrating series make it. Effects that it has are part of what is
-            expected: the gap is what they leave.
+            expected: the gap is what they leave. One that the session shows at another strength is named with that strength.
         rng: source of randomness.
         without: effects to leave out of the catalogue.
         priors: probabilities of the kinds of hypothesis before looking.
@@ -46,28 +42,15 @@ def diagnose(
         InputError: nothing in the session can be judged.
     """
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
-    had = {} if twin is None else already_there(twin.effects)
     unseen = unseen_in_squares() if session.factor > 1 else {}
-
-    def judged(with_effects: Twin, left_out: Sequence[str]) -> Diagnosis:
-        problem = problem_of(session, with_effects, without=left_out, progress=progress)
-        return judge(problem, with_effects, rng=rng, priors=priors, progress=progress)
-
     try:
-        result = judged(session.twin, (*without, *had, *unseen))
+        problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+        result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
     except InputError as error:
         if session.suspects:
             raise mislabelled(acquisition, session.suspects) from error
         raise
-    if had and not session.suspects and is_to_be_asked(result, session.twin.effects):
-        if progress is not None:
-            progress("effects of the twin sought anew")
-        rest = tuple(item for item in session.twin.effects if item not in lasting(session.twin.effects))
-        anew = judged(replace(session.twin, effects=rest), (*without, *unseen))
-        result = with_sought_anew(result, anew, session.twin.effects)
     result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
-    still = {effect: why for effect, why in had.items() if effect not in result.named}
-    result = replace(result, not_tested={**still, **result.not_tested})
     cleared = [item for item in session.suspects if _clears(result, item)]
     notes = tuple(
         f"{item.text}, or with {' and '.join(result.named)}, which explains the rest as well" for item in cleared
@@ -83,27 +66,6 @@ def diagnose(
             progress("calibration with all pixels")
         twin = calibrated_twin(session.all_pixels, rng=rng)
     return in_pixels(result, twin=twin, factor=session.factor)
-
-
-def problem_of(
-    session: PreparedSession,
-    twin: Twin,
-    *,
-    without: Sequence[str] = (),
-    progress: Callable[[str], None] | None = None,
-) -> Problem:
-    """What inference is asked about a prepared session, with a twin and the catalogue less the effects `without`."""
-    return build_problem(
-        session.acquisition,
-        twin,
-        variants=catalogue_variants(without=without, side=session.factor),
-        calibrated_elsewhere=session.calibrated_elsewhere,
-        exposed=session.exposed,
-        ends_at_zero=session.ends_at_zero,
-        spectral_point=session.spectral_point,
-        side=session.factor,
-        progress=progress,
-    )
 
 
 def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:

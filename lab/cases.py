@@ -24,7 +24,7 @@ MAY_COME_LATER = ("veiling_glare", "image_lag", "nonlinearity", "row_noise", "qu
 SETS: Mapping[str, tuple[str, ...]] = {
     "A": ("object_scatter", "veiling_glare", "dark_drift", "nonlinearity"),
     "B": ("kv_error", "filtration_error", "heel", "composition_error"),
-    "C": ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistration"),
+    "C": ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistration", "crosstalk"),
     "D": ("image_lag", "dark_drift", "output_drift"),
     "E": ("excess_noise", "mtf_tail", "nonlinearity"),
 }

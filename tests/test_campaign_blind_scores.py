@@ -47,8 +47,9 @@ from raytwin.campaign.blind_statistics import (
     session_statistics,
     write_statistics,
 )
-from raytwin.diagnosis.inference.observed import Point
+from raytwin.diagnosis.inference.inference.observed import Point
 from raytwin.diagnosis.model.curves import Curve
+from raytwin.diagnosis.problem.problem.problem import Problem
 from raytwin.generator.effects import EFFECTS
 
 
@@ -524,6 +525,14 @@ def test_a_session_that_lacks_every_feature_is_judged_by_the_rest_of_the_trainin
 # ---- a second day
 
 
+class Bare(SimpleNamespace):
+    """The fields of a problem that are asked for; its twin has no effects."""
+
+    given = ()
+    residual_without = Problem.residual_without
+    left_by = Problem.left_by
+
+
 def second_day_problem(rng, *, series=24, each=40, factors=3):
     """Flats of equal beams in time order; a factor that all share."""
     views = tuple(
@@ -536,7 +545,7 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
         for _ in range(series)
     )
     size = series * each
-    return SimpleNamespace(
+    return Bare(
         residual=rng.standard_normal(size),
         factors=0.5 * rng.standard_normal((size, factors)),
         series_of=np.repeat(np.arange(series), each),

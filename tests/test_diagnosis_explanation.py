@@ -93,15 +93,6 @@ def test_the_place_of_an_unknown_effect_names_scenes_and_kinds(location, words):
     assert f"It is seen most in the {words}." in paragraph(diagnosis("unknown_effect", unknown_location=location))
 
 
-def test_another_strength_of_what_the_twin_has_is_said_in_words():
-    location = "strength of motion_blur, which the twin has"
-    text = paragraph(diagnosis("unknown_effect", unknown_location=location))
-    assert (
-        "object moves during the exposure, which the twin has, is of another strength here (probability 0.91)" in text
-    )
-    assert "No effect of the catalogue" not in text
-
-
 def test_an_explanation_states_strength_interval_probability_and_what_is_left():
     found = cause("object_scatter", 0.94, (12.3, 9.9, 14.8))
     text = paragraph(diagnosis("explained", causes=(found,), named=("object_scatter",)))

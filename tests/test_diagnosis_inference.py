@@ -6,22 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
-from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
-from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
-from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
-from raytwin.diagnosis.inference.nuisances import Nuisances
-from raytwin.diagnosis.inference.observed import Observed, Point
-from raytwin.diagnosis.inference.pairs import Single, weigh_pairs
-from raytwin.diagnosis.inference.refine_tasks import tasks_of
-from raytwin.diagnosis.inference.search import _in_turn, _Slopes, searched
-from raytwin.diagnosis.inference.seen import Blocks, Seen
-from raytwin.diagnosis.inference.unknown import CHANCE, beyond
-from raytwin.diagnosis.inference.whitening import Whitening
-from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
-from raytwin.diagnosis.judgement.strengths import _outright
+from raytwin.diagnosis.inference.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
+from raytwin.diagnosis.inference.inference.discrepancy import LEVELS, group_factors
+from raytwin.diagnosis.inference.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.inference.inference.local_nuisances import LocalNuisances, local_columns
+from raytwin.diagnosis.inference.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.inference.observed import Observed, Point
+from raytwin.diagnosis.inference.inference.pairs import Single, weigh_pairs
+from raytwin.diagnosis.inference.inference.refine_tasks import tasks_of
+from raytwin.diagnosis.inference.inference.search import _in_turn, _Slopes, searched
+from raytwin.diagnosis.inference.inference.seen import Blocks, Seen
+from raytwin.diagnosis.inference.inference.unknown import CHANCE, beyond
+from raytwin.diagnosis.inference.inference.whitening import Whitening
+from raytwin.diagnosis.judgement.judgement.judgement import _beyond_plausible, _strained
+from raytwin.diagnosis.judgement.judgement.strengths import _outright
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
+from raytwin.diagnosis.problem.problem.problem import Problem
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)
@@ -77,6 +78,14 @@ def one_node(effect, response, *, variant="", low=0.5, high=50.0, **more):
     )
 
 
+class Bare(SimpleNamespace):
+    """The fields of a problem that are asked for; its twin has no effects."""
+
+    given = ()
+    residual_without = Problem.residual_without
+    left_by = Problem.left_by
+
+
 @pytest.fixture
 def setup():
     rng = np.random.default_rng(5)
@@ -96,7 +105,7 @@ def seen(residual, factors=None, *, places=GROUPS):
 
 def weigh(residual, factors, chosen, **options):
     observed = seen(residual, factors)
-    return weigh_hypotheses(observed, fit_effects(observed, chosen), parts=GROUPS, part_names=NAMES, **options)
+    return weigh_hypotheses([(observed, fit_effects(observed, chosen))], parts=GROUPS, part_names=NAMES, **options)
 
 
 def test_projection_gives_the_inner_product_of_the_inverse_covariance(setup):
@@ -289,7 +298,7 @@ def test_nuisances_pulled_far_are_told_but_for_those_of_rendering():
     factors = rng.standard_normal((PROBES, 4))
     names = ("thickness of PMMA in wedge", "level of flat", "rough edge 3 of disc at 900", "tilt x of flat")
     residual = factors @ np.array([-12.0, 2.0, 20.0, 6.0]) + rng.standard_normal(PROBES)
-    problem = SimpleNamespace(residual=residual, factor_names=names)
+    problem = Bare(residual=residual, factor_names=names)
     nothing = Hypothesis(effects=(), probability=1.0, log_evidence=0.0)
     found = _strained(problem, nothing, LocalNuisances(factors, np.zeros(PROBES, dtype=int)))
     assert [name for name, _ in found] == ["thickness of PMMA in wedge", "tilt x of flat"]
@@ -318,7 +327,7 @@ def test_a_strength_is_read_from_the_probes_that_define_it_whatever_the_rest_of_
     everything = Hypothesis(
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (2.1, 2.0, 2.2)}, variants={"a": curve}
     )
-    value, low, high = _outright(SimpleNamespace(residual=residual), everything, "a")
+    value, low, high = _outright(Bare(residual=residual), everything, "a")
     assert value == pytest.approx(3.0, rel=0.03)
     assert low <= value <= high
 
@@ -331,7 +340,7 @@ def test_a_refined_curve_is_not_believed_far_from_the_strengths_that_were_asked(
     named = Hypothesis(
         effects=("a",), probability=1.0, log_evidence=0.0, strengths={"a": (6.0, 5.9, 6.1)}, variants={"a": curve}
     )
-    value, low, high = _outright(SimpleNamespace(residual=np.array([30.0 * (6.0 - 36.0 / 26.0), 0.2])), named, "a")
+    value, low, high = _outright(Bare(residual=np.array([30.0 * (6.0 - 36.0 / 26.0), 0.2])), named, "a")
     assert value == pytest.approx(6.0, rel=0.01)
     assert 5.5 < low < high < 6.5
 

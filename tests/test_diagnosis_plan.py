@@ -142,7 +142,7 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
     curves = [item.curve(answer([item])[0]) for item in variants]
     groups = np.zeros(PROBES, dtype=np.intp)
     observed = Observed(residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups)
-    hypotheses = weigh_hypotheses(observed, fit_effects(observed, curves), parts=groups, part_names=("all",))
+    hypotheses = weigh_hypotheses([(observed, fit_effects(observed, curves))], parts=groups, part_names=("all",))
     return refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in variants},
@@ -274,7 +274,15 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
     for variant in catalogue_variants():
         onsets.setdefault(variant.effect, set()).add(variant.since)
     # a tail that was always there is a part of the spread
-    taken_in_whole = {"kv_error", "filtration_error", "gain_map_error", "excess_noise", "bad_pixels", "mtf_tail"}
+    taken_in_whole = {
+        "kv_error",
+        "filtration_error",
+        "gain_map_error",
+        "tile_gain",
+        "excess_noise",
+        "bad_pixels",
+        "mtf_tail",
+    }
     for name, effect in EFFECTS.items():
         if "flat" not in effect.shows.series:
             assert onsets[name] == {"always"}  # objects alone: they calibrate nothing

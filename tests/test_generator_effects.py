@@ -12,6 +12,7 @@ from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_
 from raytwin.errors import InputError
 from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter, effect_of, in_order
 from raytwin.generator.effects._light_spread import spread_transfer
+from raytwin.generator.effects.crosstalk import leaving_share
 from raytwin.generator.effects.effect import Grid, Shows, Variation
 from raytwin.generator.effects.focal_spot import _transfer_of_spot
 from raytwin.generator.effects.k_fluorescence import line_energy_keV
@@ -59,6 +60,9 @@ CATALOGUE = {
     "misregistration": ("px", 0.1, 3),
     "gain_map_error": ("%", 0.1, 3),
     "composition_error": ("%", 0.5, 5),
+    "crosstalk": ("%", 3, 40),
+    "tile_gain": ("%", 0.1, 3),
+    "line_flicker": ("%", 0.03, 1),
 }
 CACHE = ModelCache()
 
@@ -131,6 +135,10 @@ def numbers(found):
         found.white_variance_DN2 / 100,
         found.noise_autocovariance,
         np.array([found.row_variance_DN2, found.column_variance_DN2, found.bad_pixel_share, found.fixed_pattern_rms]),
+        np.array([0.0 if found.tile_pattern is None else found.tile_pattern.rms]),
+        np.zeros(3)
+        if found.flicker is None
+        else found.flicker.rms * 1000 * np.array([1.0, found.flicker.column_share, found.flicker.correlation(1)]),
         np.array([found.frame_factor_rms * 100]),
         found.temporal_correlation * 100,
         *[image[..., None] * course / 10 for image, course in found.trend_DN or ()],
@@ -196,7 +204,8 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     """Strength at the top of its range; expected and sampled read one state, and this shows that both read all of it."""
     earlier = request(frames=50)
     asked = request(**BEHIND, frames=300, start_s=1.2, previous=(earlier,))
-    effects = applied(name, EFFECTS[name].strength.high)
+    smaller = {"side_px": 16.0} if name == "tile_gain" else {}  # tiles that fit on the panel
+    effects = applied(name, EFFECTS[name].strength.high, **smaller)
     expected = expect(series_line, asked, effects)
     rng = np.random.default_rng(7)
     frames = np.stack(
@@ -208,7 +217,9 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     quantum = expected.quantum_variance_DN2
     lines = expected.row_variance_DN2 + expected.column_variance_DN2
     common = expected.frame_factor_rms**2 * expected.signal_DN**2
-    variance = quantum + expected.white_variance_DN2 + lines + common
+    flicker = expected.flicker
+    light = np.zeros(SHAPE) if flicker is None else flicker.rms * expected.signal_DN
+    variance = quantum + expected.white_variance_DN2 + lines + common + light**2
     count = len(frames)
     good = np.ones(SHAPE, dtype=bool)
     if name == "bad_pixels":
@@ -218,6 +229,14 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     if name == "gain_map_error":
         pattern = residual.mean(axis=0) / expected.signal_DN
         assert pattern.std() == pytest.approx(expected.fixed_pattern_rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
+        residual = residual - residual.mean(axis=0)
+    if name == "tile_gain":
+        gains = (residual.mean(axis=0) / expected.signal_DN)[:32, :32].reshape(2, 16, 2, 16).mean(axis=(1, 3))
+        whole = np.kron(gains, np.ones((16, 16)))
+        left = (residual.mean(axis=0) / expected.signal_DN)[:32, :32] - whole
+        assert np.mean(left**2) < 0.05 * np.mean(whole**2)  # steps at the seams, nothing inside
+        # four gains of nine whose mean is taken off
+        assert np.mean(gains**2) == pytest.approx(expected.tile_pattern.rms**2 * 8 / 9, rel=4 * math.sqrt(2 / 4))
         residual = residual - residual.mean(axis=0)
     if name == "output_drift":
         factor = (residual / expected.signal_DN).mean(axis=(1, 2))
@@ -232,7 +251,9 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     independent = good.sum() / 4  # neighbours share noise; rows share theirs
     if name == "row_noise":
         independent = SHAPE[0]
-    if name not in ("gain_map_error", "output_drift"):
+    if name == "line_flicker":
+        independent = SHAPE[0] * (1 - flicker.correlation(1)) / (1 + flicker.correlation(1))
+    if name not in ("gain_map_error", "tile_gain", "output_drift"):
         z = residual.mean(axis=0) / np.sqrt(variance / count)
         if name == "image_lag":
             z = z / math.sqrt(1 + 2 * expected.temporal_correlation.sum())
@@ -245,9 +266,10 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         seen = (spread[:, *left] * spread[:, *beside]).mean(axis=0) * count / (count - 1)
         known = np.sqrt(quantum[left] * quantum[beside]) * expected.noise_autocovariance[down, right]
         known = known + (expected.row_variance_DN2 if right else expected.column_variance_DN2)
+        known = known + light[left] * light[beside] * (1.0 if flicker is None else flicker.correlation(down))
         size = np.sqrt(variance[left] * variance[beside])
         pair = good[left] & good[beside]
-        bias = 0.004 if name == "gain_map_error" else 0.0  # eta^2 of the variance
+        bias = 0.004 if name in ("gain_map_error", "tile_gain") else 0.0  # eta^2 of the variance
         assert abs(((seen - known) / size)[pair].mean()) < 4 / math.sqrt(count * independent) + bias
     between = (spread[1:] * spread[:-1]).mean(axis=0)
     known = expected.temporal_correlation[0] * quantum
@@ -1109,6 +1131,37 @@ def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(ser
         )
         known = share * found.noise_autocovariance[lag]
         assert abs(seen - known) < 4 * math.sqrt(max(known, 1e-6) / count), lag
+
+
+def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise_and_flats_alone(series_line):
+    """Quanta are drawn on both sides of an edge, moved and spread by light; no transfer function is used."""
+    strength, reach_px, count = 30.0, 1.2, 4_000_000
+    effect = applied("crosstalk", strength, reach_px=reach_px)
+    plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
+    asked = request("object", thickness_mm=plate)
+    found, sharp = expect(series_line, asked, effect), expect(series_line, asked)
+    even = series_line.level_nearest(asked.setting).flat_shape
+    known, plain = ((one.signal_DN / even).mean(axis=0)[12:28] for one in (found, sharp))
+    rng = np.random.default_rng(3)
+    # it is the same all along the edge: of a place only the column counts
+    column = rng.uniform(8.0, 32.0, count)
+    column = column[rng.random(count) < np.where(column < 20.0, plain.min() / plain.max(), 1.0)]
+    distance, angle = rng.exponential(reach_px, column.size), rng.uniform(0.0, 2.0 * math.pi, column.size)
+    step = distance * np.stack([np.sin(angle), np.cos(angle)])
+    left = np.any(np.floor(np.stack([rng.random(column.size), column % 1.0]) + step) != 0.0, axis=0)
+    assert np.mean(left) == pytest.approx(leaving_share(reach_px), abs=1e-3)
+    moves = rng.random(column.size) < strength / 100.0 / np.mean(left)
+    assert np.mean(left & moves) == pytest.approx(0.30, abs=1.5e-3)
+    light = series_line.noise.spread.value.sigma_px * rng.standard_normal(column.size)
+    counts = np.histogram(column + np.where(moves, step[1], 0.0) + light, bins=np.arange(12, 29))[0]
+    full = count / 24.0
+    away = [(counts - full * image / plain.max()) / np.sqrt(full * image / plain.max()) for image in (known, plain)]
+    assert np.abs(away[0]).max() < 4.5 and np.abs(away[1]).max() > 15.0
+    # moved quanta are counts as the others: their noise is as correlated as before, and flats do not change
+    np.testing.assert_array_equal(found.noise_autocovariance, sharp.noise_autocovariance)
+    np.testing.assert_array_equal(
+        numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
+    )
 
 
 def test_a_share_of_an_output_s_drift_may_be_new_in_every_exposure(series_line):

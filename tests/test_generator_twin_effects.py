@@ -82,7 +82,8 @@ def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long
 
     def noise(flat):
         common = flat.row_variance_DN2 + flat.column_variance_DN2
-        common += (flat.frame_factor_rms * np.median(flat.signal_DN)) ** 2
+        flicker = 0.0 if flat.flicker is None else flat.flicker.rms
+        common += (flat.frame_factor_rms**2 + flicker**2) * np.median(flat.signal_DN) ** 2
         return math.sqrt(common + np.median(flat.quantum_variance_DN2 + flat.white_variance_DN2))
 
     level = np.median(with_it.signal_DN) / np.median(without.signal_DN)

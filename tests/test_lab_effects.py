@@ -287,6 +287,69 @@ def test_k_fluorescence_leaves_the_level_and_takes_variance_from_the_pixel_above
     assert binned(with_it) / binned(without) == pytest.approx(1.0 - 0.02, abs=5 * math.sqrt(2) * error)
 
 
+def test_crosstalk_moves_its_share_of_the_quanta_out_of_their_pixel_and_loses_none():
+    system = system_on("fine")
+    line, bare = line_with("crosstalk=20", "fine", system=system), line_with(None, "fine", system=system)
+    setting = setting_of(line, 60.0, geometry="fine")
+    # one pixel in an opaque plate lets light through
+    lengths = {"W": np.full(thickness_on_fine_grid(system, Edge(angle=0.0))["W"].shape, 5.0, dtype=np.float32)}
+    fine = lengths["W"].shape[0]
+    first = (fine // SUBPIXELS // 2) * SUBPIXELS
+    lengths["W"][first : first + SUBPIXELS, first : first + SUBPIXELS] = 0.0
+    both = []
+    for one in (line, bare):
+        arrivals = one.arrivals(setting, scene="hole", thickness_mm=lengths)
+        both.append(arrivals.sums[:, 0][arrivals.cell].astype(float))
+    moved, still = (image.reshape(fine // SUBPIXELS, SUBPIXELS, -1, SUBPIXELS).sum(axis=(1, 3)) for image in both)
+    at = first // SUBPIXELS
+    assert moved.sum() == pytest.approx(still.sum(), rel=1e-4)
+    assert 1.0 - moved[at, at] / still[at, at] == pytest.approx(0.20, abs=1e-3)
+    beside = [moved[at - 1, at], moved[at + 1, at], moved[at, at - 1], moved[at, at + 1]]
+    assert np.ptp(beside) < 0.01 * np.mean(beside) and min(beside) > 0.01 * still[at, at]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_gains_of_tiles_have_their_rms_and_steps_only_at_the_seams(seed):
+    effect = planted("tile_gain=1.5", seed=seed)
+    maps = detector_maps(system_on("coarse"))
+    gain = effect.maps(maps).DN_per_electron.astype(float) / maps.DN_per_electron
+    assert gain.mean() == pytest.approx(1.0, abs=1e-6)
+    assert gain.std() == pytest.approx(0.015, rel=1e-4)
+    side, first = effect.parameters["chip_px"], effect.parameters["first_px"]
+    seams = np.flatnonzero(np.any(np.abs(np.diff(gain, axis=1)) > 1e-5, axis=0)) + 1
+    np.testing.assert_array_equal(seams, np.arange(first, SIZE, side)[: seams.size])
+    if effect.parameters["channels"]:
+        assert np.ptp(gain, axis=0).max() < 1e-5
+
+
+def test_lines_flicker_with_the_light_by_their_rms_and_not_in_the_dark():
+    effect = planted("line_flicker=0.5", seed=2)
+    line = line_with("line_flicker=0.5", seed=2)
+    even = np.full((SIZE, SIZE), 1000.0, dtype=np.float32)
+    factors = np.array([stage_of(effect)(even, context_of(line.system, frame=n))[:, 0] / 1000.0 for n in range(400)])
+    assert np.ptp(stage_of(effect)(even, context_of(line.system)), axis=1).max() == 0.0
+    assert (factors - 1.0).std() == pytest.approx(0.005, rel=0.05)
+    assert factors.mean() == pytest.approx(1.0, abs=3e-4)
+    # the mean of ten exposures flickers less, and frames have phases of their own
+    summed = np.array([stage_of(effect)(even, context_of(line.system, frame=n, summed=10))[:, 0] for n in range(400)])
+    assert (summed / 1000.0 - 1.0).std() == pytest.approx(0.005 / math.sqrt(10.0), rel=0.1)
+    (dark, _), (bare, _) = next(line.dark(100.0, frames=1)), next(line_with(None).dark(100.0, frames=1))
+    assert np.array_equal(dark, bare)
+
+
+def test_quanta_that_moved_stay_independent():
+    system = system_on("fine", psf_sigma_px=0.35)
+    line, bare = line_with("crosstalk=30", "fine", system=system), line_with(None, "fine", system=system)
+    setting = setting_of(line, 60.0, geometry="fine")
+    lengths = thickness_on_fine_grid(system, Slab(layers_mm={"pmma": 10.0}))
+    with_it, without = (frames_of(one, setting, 40, scene="slab", thickness_mm=lengths) for one in (line, bare))
+    error = math.sqrt(2.0 / 40.0) / SIZE
+    assert covariance(with_it, 0, 0) / covariance(without, 0, 0) == pytest.approx(1.0, abs=5 * math.sqrt(2) * error)
+    for lag in ((0, 1), (1, 0), (1, 1)):
+        correlations = [covariance(one, *lag) / covariance(one, 0, 0) for one in (with_it, without)]
+        assert correlations[0] == pytest.approx(correlations[1], abs=5 * error)
+
+
 @pytest.mark.parametrize("since", ["always", "calibration"])
 def test_lag_leaves_its_strength_in_the_first_frame_without_beam(since):
     line = line_with(f"image_lag=2@{since}", seed=4)

@@ -1,9 +1,9 @@
 """How far laws of an effect's kind depart from the catalogue's: learnt from sessions of the second simulator.
 
 Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at each
-level of discrepancy, with and without a rest, tells how often each occurs (empirical Bayes, by expectation and maximisation); the
-same of what looks most like it once it is left out of the catalogue. The answers themselves are told beside it, and in how many
-sessions without an effect one family of probes is off.
+level of discrepancy, with and without a rest, tells how often each occurs and how long rests are (empirical Bayes, by expectation
+and maximisation); the same of what looks most like it once it is left out of the catalogue. The answers themselves are told beside
+it, and in how many sessions without an effect one family of probes is off.
 
     python validation/learn_discrepancy.py --line usual --families --json build/discrepancy/usual.json
     python validation/learn_discrepancy.py --learn build/discrepancy/*.json
@@ -14,6 +14,7 @@ import json
 import math
 import tempfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import law_families
@@ -22,15 +23,18 @@ import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.diagnose_session import problem_of
-from raytwin.diagnosis.inference.discrepancy import LEVELS
-from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
-from raytwin.diagnosis.inference.unknown import beyond
-from raytwin.diagnosis.judgement.judgement import verdict_of, weigh_problem
+from raytwin.diagnosis.inference.inference.curve_fits import CurveFit
+from raytwin.diagnosis.inference.inference.discrepancy import LEVELS
+from raytwin.diagnosis.inference.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
+from raytwin.diagnosis.inference.inference.observed import Observed
+from raytwin.diagnosis.inference.inference.unknown import LOG_DENSITY, beyond
+from raytwin.diagnosis.judgement.judgement.judgement import Weighed, verdict_of, weigh_problem
+from raytwin.diagnosis.problem.assemble import problem_of
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
 _NONE = 1e-3  # least frequency of a level: none is impossible
+_SHORTEST = 1e-3  # of a rest over what laws do: shorter ones do not show
 
 
 def session_row(path: Path, planted: str) -> dict:
@@ -38,6 +42,11 @@ def session_row(path: Path, planted: str) -> dict:
     with open_acquisition(path) as acquisition:
         session = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
         weighed = weigh_problem(problem_of(session, session.twin))
+    return row_of(weighed, planted)
+
+
+def row_of(weighed: Weighed, planted: str) -> dict:
+    """What one session tells of the planted effect's law, and of the law that is likest it."""
     problem, observed = weighed.problem, weighed.observed
     parts = {"parts": problem.parts, "part_names": problem.part_names}
     row = {"planted": planted, **told(weighed.hypotheses)}
@@ -48,13 +57,19 @@ def session_row(path: Path, planted: str) -> dict:
     others = [fit for fit in weighed.fits if fit.curve.effect != planted]
     if own:
         best = max(own, key=lambda fit: fit.log_evidence)
-        row["kind"] = [*best.by_level, evidence_with_rest(observed, [best.point], **parts)]
+        row["kind"] = told_by_law(observed, best, best.level, parts)
     if others:
         likest = max(others, key=lambda fit: fit.log_evidence)
-        row["another"] = [*likest.by_level, evidence_with_rest(observed, [likest.point], **parts)]
+        row["another"] = told_by_law(observed, likest, LEVELS.levels[-1], parts)
         row["likest"] = likest.curve.effect
-        row["left_out"] = told(weigh_hypotheses(observed, others, **parts))
+        row["left_out"] = told(weigh_hypotheses([(observed, others)], **parts))
     return row
+
+
+def told_by_law(observed: Observed, fit: CurveFit, level: float, parts: dict) -> dict:
+    """Log evidence of a law by level, and with a rest of any length beside it, at a level; that length over what the law does."""
+    evidence, ratio = evidence_with_rest(observed, [fit.at_level(level)], **parts)
+    return {"by_level": list(fit.by_level), "with_rest": evidence, "ratio": ratio}
 
 
 def told(hypotheses) -> dict:
@@ -63,34 +78,67 @@ def told(hypotheses) -> dict:
     return {"verdict": verdict.word, "named": list(verdict.named), "probability": verdict.leading.probability}
 
 
-def frequencies(rows: list[list[float]]) -> tuple[list[float], float]:
-    """Frequencies of the levels, and of a rest, that make evidences (session, level and last the one with a rest) likeliest.
+def frequencies(rows: list[dict], density: Callable[[list[float], list[float]], tuple]) -> dict:
+    """Frequencies of the levels and of a rest, and what is known of its length, that make the evidences of sessions likeliest.
 
     A session in which the effect does not show tells nothing and is left out.
+
+    Args:
+        rows: as `told_by_law` makes them.
+        density: of the ratios and how much each counts: what is fitted, and the log density of each ratio in its logarithm.
     """
-    known = [np.array(row) for row in rows if max(row) > _CLEAR and len(row) == len(LEVELS.levels) + 1]
-    levels, rest = np.full(len(LEVELS.levels), 1.0 / len(LEVELS.levels)), 0.5
+    known = [row for row in rows if max(*row["by_level"], row["with_rest"]) > _CLEAR]
+    by_level = np.array([row["by_level"] for row in known])
+    with_rest = np.array([row["with_rest"] for row in known])
+    ratios = [max(row["ratio"], _SHORTEST) for row in known]
+    levels, rest, of_length = (
+        np.full(len(LEVELS.levels), 1.0 / len(LEVELS.levels)),
+        0.5,
+        np.full(len(known), LOG_DENSITY),
+    )
+    fitted: tuple = ()
     for _ in range(_ROUNDS):
-        taken, with_rest = np.zeros(len(levels)), 0.0
-        for row in known:
-            scores = np.concatenate([row[:-1] + np.log(levels * (1.0 - rest)), [row[-1] + math.log(rest)]])
-            shares = np.exp(scores - np.logaddexp.reduce(scores))
-            taken += shares[:-1]
-            with_rest += shares[-1]
-            taken[int(np.argmax(row[:-1]))] += shares[-1]
+        scores = np.concatenate(
+            [
+                by_level + np.log(levels * (1.0 - rest)),
+                (with_rest + of_length - LOG_DENSITY + math.log(rest))[:, None],
+            ],
+            axis=1,
+        )
+        shares = np.exp(scores - np.logaddexp.reduce(scores, axis=1)[:, None])
+        taken = shares[:, :-1].sum(axis=0)
+        np.add.at(taken, np.argmax(by_level, axis=1), shares[:, -1])
         levels = np.maximum(taken / taken.sum(), _NONE)
         levels /= levels.sum()
-        rest = min(max(with_rest / len(known), _NONE), 1.0 - _NONE)
-    return [round(float(one), 3) for one in levels], round(float(rest), 3)
+        rest = min(max(float(shares[:, -1].mean()), _NONE), 1.0 - _NONE)
+        fitted, of_length = density(ratios, list(shares[:, -1]))
+    return {"levels": [round(float(one), 3) for one in levels], "rest": round(rest, 3), "length": fitted}
+
+
+def about_nothing(ratios: list[float], counts: list[float]) -> tuple[float, np.ndarray]:
+    """Standard deviation of a Gaussian about 0 of ratios that count so much, and their log densities in the logarithm."""
+    squares = np.square(ratios)
+    sd = math.sqrt(max(float(np.average(squares, weights=np.maximum(counts, 1e-9))), _SHORTEST**2))
+    share = np.array(ratios) / sd
+    return round(sd, 3), np.log(share) + 0.5 * math.log(2.0 / math.pi) - 0.5 * share**2
+
+
+def of_logarithm(ratios: list[float], counts: list[float]) -> tuple[list[float], np.ndarray]:
+    """Mean and standard deviation of the logarithms of ratios that count so much, and their log densities in the logarithm."""
+    logs, weights = np.log(ratios), np.maximum(counts, 1e-9)
+    mean = float(np.average(logs, weights=weights))
+    sd = math.sqrt(max(float(np.average((logs - mean) ** 2, weights=weights)), _SHORTEST))
+    return [round(mean, 3), round(sd, 3)], -0.5 * ((logs - mean) / sd) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sd)
 
 
 def learn(paths: list[Path]) -> None:
     """Print the table of `diagnosis/inference/discrepancy.toml`, and the scores of the sessions that it comes from."""
     rows = [row for path in paths for row in json.loads(path.read_text())]
-    kind, rest_of_kind = frequencies([row["kind"] for row in rows if "kind" in row])
-    another, rest_of_another = frequencies([row["another"] for row in rows if "another" in row])
-    print(f"levels = {list(LEVELS.levels)}\nof_kind = {kind}\nof_another = {another}")
-    print(f"rest_of_kind = {rest_of_kind}\nrest_of_another = {rest_of_another}")
+    kind = frequencies([row["kind"] for row in rows if "kind" in row], about_nothing)
+    another = frequencies([row["another"] for row in rows if "another" in row], of_logarithm)
+    print(f"levels = {list(LEVELS.levels)}\nof_kind = {kind['levels']}\nof_another = {another['levels']}")
+    print(f"rest_of_kind = {kind['rest']}\nrest_of_another = {another['rest']}")
+    print(f"rest_sd_of_kind = {kind['length']}\nrest_of_another_log = {another['length']}")
     single = [row for row in rows if row["planted"] not in ("none", *plain.UNKNOWN)]
     print(f"# named alone {sum(row['named'] == [row['planted']] for row in single)} of {len(single)}")
     wrong = [row for row in single if set(row["named"]) - {row["planted"]}]

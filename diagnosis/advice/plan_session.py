@@ -11,9 +11,7 @@ from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
 from ..checks.preparation import mislabelled, prepare_session
-from ..model.changes import catalogue_variants
-from ..problem.assemble import build_problem
-from ..problem.known_effects import already_there
+from ..problem.assemble import problem_of
 from ..session.coarse import unseen_in_squares
 from .plan import Distinguishability, distinguishability
 
@@ -106,19 +104,8 @@ def plan_session(
     suspects = tuple(item for item in session.suspects if not item.or_effects)
     if suspects:
         raise mislabelled(acquisition, suspects)
-    unseen = {
-        **({} if twin is None else already_there(twin.effects)),
-        **(unseen_in_squares() if session.factor > 1 else {}),
-    }
-    problem = build_problem(
-        session.acquisition,
-        session.twin,
-        variants=catalogue_variants(without=(*without, *unseen), side=session.factor),
-        calibrated_elsewhere=session.calibrated_elsewhere,
-        exposed=session.exposed,
-        side=session.factor,
-        progress=progress,
-    )
+    unseen = unseen_in_squares() if session.factor > 1 else {}
+    problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
     found = distinguishability(problem)
     shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
     return SessionPlan(

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from ..model.curves import Curve
-from .discrepancy import LEVELS, Levels
+from .discrepancy import LEAST_MOVED, LEVELS, Levels
 from .observed import Observed, Point
 
-_CHANCE_NODES = 161
 _ROUNDS, _SETTLED = 4, 0.05  # in which a level's best strength is found, and change of its logarithm that ends them
-_VARIANTS = 3  # of an effect that are fitted with all levels
+_VARIANTS = 3  # of an effect that are fitted with all levels, at least
+_CLOSE = math.log(100.0)  # of log evidence: what is less likely than that changes a mean by less than one per cent
 _WEAK = 0.3  # of the best strength
 IMPLAUSIBLE = 0.01  # probability that an effect is weaker or stronger than its plausible range
 _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which finer strengths are set, round by round
@@ -62,7 +62,8 @@ def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) ->
 def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exact: bool = False) -> CurveFit:
     """Evidence of one curve over none, its strength integrated over a log-uniform prior, see `log_integral`.
 
-    At each level the covariance is that of the law at its best strength, found in rounds.
+    What an effect does by chance grows with its strength; at each level the covariance is that of the law at its best strength, found
+    in rounds.
 
     Args:
         observed: what is weighed.
@@ -70,17 +71,6 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         levels: of discrepancy.
         exact: the law is taken as exact, and nothing about it as random: a first look, at a fraction of the cost.
     """
-    if curve.by_chance_alone:
-        strengths, value = _fit_chance(observed, curve)
-        evidence = log_integral(strengths, value, curve.low, curve.high)
-        return CurveFit(
-            curve=curve,
-            by_level=np.full(len(levels.levels), evidence),
-            log_evidence=evidence,
-            level=0.0,
-            strengths=strengths,
-            log_likelihood=value,
-        )
     coarse = curve.log_strengths()
     sharp = _Terms(observed, curve)
     strengths, value = sharp.closed_in(coarse)
@@ -103,37 +93,61 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
     )
 
 
+def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
+    """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
+    alone = observed.standing(curve.effect)
+    fit = fit_curve(alone, alone.scaled(curve), exact=exact)
+    more = observed.over_none(curve.effect)
+    return replace(fit, curve=curve, by_level=fit.by_level + more, log_evidence=fit.log_evidence + more)
+
+
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
-    """Every curve fitted: with all levels of discrepancy those variants of each effect that are likeliest with an exact law."""
-    found = [fit_curve(observed, curve, exact=True) for curve in curves]
+    """Every curve fitted: with all levels of discrepancy those variants of an effect that are likeliest, or close to it, if exact."""
+    found = [fit_effect(observed, curve, exact=True) for curve in curves]
     ranked: dict[str, list[int]] = {}
     for number in sorted(range(len(curves)), key=lambda number: -found[number].log_evidence):
         ranked.setdefault(curves[number].effect, []).append(number)
     for numbers in ranked.values():
-        for number in numbers[:_VARIANTS]:
-            found[number] = fit_curve(observed, curves[number])
-        for number in numbers[_VARIANTS:]:
-            if not curves[number].by_chance_alone:  # else it is the same at all levels
-                # of the others no more is counted than an exact law's part, as often as laws are exact
-                exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])
-                found[number] = replace(found[number], log_evidence=exact)
+        least = found[numbers[0]].log_evidence - _CLOSE
+        close = max(_VARIANTS, sum(found[number].log_evidence > least for number in numbers))
+        for number in numbers[:close]:
+            found[number] = fit_effect(observed, curves[number])
+        for number in numbers[close:]:
+            # of the others no more is counted than an exact law's part, as often as laws are exact
+            exact = found[number].log_evidence + math.log(LEVELS.of_kind[0])
+            found[number] = replace(found[number], log_evidence=exact)
     return found
 
 
 class _Terms:
-    """Log likelihood over none of a curve at any strength, with what may vary beside it fixed."""
+    """Log likelihood over none of a curve at any strength: r ~ N(m(s), C + s^2 S S^T), S what it does by chance, C all else.
+
+    With S^T C^-1 S = V D V^T and c = V^T S^T C^-1 (r - m) it is that of N(m, C) and
+    1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
+    """
 
     def __init__(self, observed: Observed, curve: Curve) -> None:
         self._curve = curve
-        inner = observed.nuisances.inner
-        self._linear = inner(curve.responses, observed.residual[None, :])[:, 0]
-        self._gram = inner(curve.responses, curve.responses)
+        nodes, chance = len(curve.responses), _chance_of(curve)
+        moved = np.concatenate([curve.responses, observed.residual[None, :], chance])
+        inner = observed.nuisances.inner(moved, moved)
+        self._linear, self._gram = inner[:nodes, nodes], inner[:nodes, :nodes]
+        self._values, vectors = np.linalg.eigh(inner[nodes + 1 :, nodes + 1 :])
+        self._values = np.maximum(self._values, 0.0)
+        self._of_nodes, self._of_residual = inner[:nodes, nodes + 1 :] @ vectors, inner[nodes, nodes + 1 :] @ vectors
 
     def at(self, strengths: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Log likelihood over none, and squared length of the response, at strengths."""
         weights = self._curve.weights(strengths)
         quadratic = np.einsum("si,ij,sj->s", weights, self._gram, weights)
-        return weights @ self._linear - 0.5 * quadratic, quadratic
+        value = weights @ self._linear - 0.5 * quadratic
+        if len(self._values):
+            grown = np.multiply.outer(strengths**2, self._values)
+            taken = strengths[:, None] ** 2 / (1.0 + grown)
+            response = weights @ self._of_nodes
+            value += 0.5 * np.sum(taken * (self._of_residual - response) ** 2 - np.log1p(grown), axis=1)
+            quadratic = quadratic - np.sum(taken * response**2, axis=1)
+        return value, np.maximum(quadratic, 0.0)
 
     def closed_in(self, coarse: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Strengths and their log likelihood: a peak sharper than the nodes lie apart is closed in on."""
@@ -155,7 +169,7 @@ def _at_level(
     coarse = curve.log_strengths()
     found = None
     for _ in range(_ROUNDS):
-        wide = observed.widened(curve, best, level)
+        wide = observed.widened(curve, best, level, chance=False)
         if wide is None:
             break
         strengths, value = _Terms(wide, curve.over(wide.units / observed.units)).closed_in(coarse)
@@ -170,21 +184,12 @@ def _at_level(
     return found
 
 
-def _fit_chance(observed: Observed, curve: Curve) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Strengths and log likelihood over none of a curve that moves probes by chance alone: r ~ N(0, C + s^2 S S^T), S its spread.
-
-    With S^T C^-1 S = V D V^T and c = V^T S^T C^-1 r the log likelihood ratio is
-    1/2 sum c_i^2 s^2 / (1 + s^2 d_i) - 1/2 sum log(1 + s^2 d_i).
-    """
+def _chance_of(curve: Curve) -> NDArray[np.float64]:
+    """What a curve does by chance a unit of strength (factor, probe); what moves nothing that shows is left out."""
     if curve.spread is None:
-        raise ValueError(f"curve {curve.effect} {curve.variant} moves nothing")
-    spread, inner = curve.spread.T, observed.nuisances.inner
-    values, vectors = np.linalg.eigh(inner(spread, spread))
-    along = vectors.T @ inner(spread, observed.residual[None, :])[:, 0]
-    strengths = curve.log_strengths(_CHANCE_NODES)
-    grown = np.multiply.outer(strengths**2, np.maximum(values, 0.0))
-    quadratic = np.sum(along**2 * strengths[:, None] ** 2 / (1.0 + grown), axis=1)
-    return strengths, 0.5 * (quadratic - np.sum(np.log1p(grown), axis=1))
+        return np.zeros((0, curve.responses.shape[1]))
+    shows = np.max(np.abs(curve.spread), axis=0, initial=0.0) * curve.reach[1] >= LEAST_MOVED
+    return np.asarray(curve.spread[:, shows].T)
 
 
 def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:

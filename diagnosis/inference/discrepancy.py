@@ -6,6 +6,7 @@ k times as large as what it does. Levels are no choice for a session: evidence i
 of many shapes have shown (`discrepancy.toml`). The shares below are choices: no script has fitted them.
 """
 
+import math
 import tomllib
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -23,7 +24,8 @@ class Levels:
 
     Fields: levels (level,), relative; of_kind (level,): their frequencies where the effect is of the kind that a law describes;
     of_another: where it is not, and the law is the one of the catalogue that resembles it most; rest_of_kind, rest_of_another: how
-    often such a law leaves a rest in some families of probes beyond that.
+    often such a law leaves a rest in some families of probes beyond that; rest_sd_of_kind: of the length of a rest over that of what
+    the laws do, as a Gaussian about 0; rest_of_another_log: mean and standard deviation of the logarithm of that, a Gaussian.
     """
 
     levels: tuple[float, ...]
@@ -31,11 +33,19 @@ class Levels:
     of_another: tuple[float, ...]
     rest_of_kind: float = 0.0
     rest_of_another: float = 0.0
+    rest_sd_of_kind: float = 0.5
+    rest_of_another_log: tuple[float, float] = (0.0, 1.0)
 
     def up_to(self, level: float) -> "Levels":
         """Those up to a level, with frequencies as they are."""
         kept = sum(one <= level for one in self.levels)
         return replace(self, levels=self.levels[:kept], of_kind=self.of_kind[:kept], of_another=self.of_another[:kept])
+
+
+def log_frequency(level: float, *, another: bool = False) -> float:
+    """Log of how often laws of an effect's kind (or of `another` kind) are off by a level."""
+    frequencies = LEVELS.of_another if another else LEVELS.of_kind
+    return math.log(frequencies[int(np.argmin(np.abs(np.array(LEVELS.levels) - level)))])
 
 
 def _learnt() -> Levels:
@@ -48,11 +58,13 @@ def _learnt() -> Levels:
         of_another=another,
         rest_of_kind=float(table["rest_of_kind"]),
         rest_of_another=float(table["rest_of_another"]),
+        rest_sd_of_kind=float(table["rest_sd_of_kind"]),
+        rest_of_another_log=(float(table["rest_of_another_log"][0]), float(table["rest_of_another_log"][1])),
     )
 
 
 LEVELS = _learnt()
-# of a level: what a law leaves in the shape of another effect, over what it does; and the sd of a rest over it
+# of a level: what a law leaves in the shape of another effect, over what it does
 LEAK_SHARE = 0.5
 # beyond it a law does not carry the probes: what is off by more than half of itself explains anything
 FARTHEST_LEVEL = 0.4
@@ -62,7 +74,8 @@ PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by
 LEAST_FACTOR = 0.05  # variance of a factor along itself that is worth carrying
-_LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
+_LEAST_RATIO = 1e-3  # of a rest over what laws do: shorter ones do not show
+LEAST_MOVED = 0.3  # standard deviations of a probe by which what is random about a law must move one to be carried
 _TIMES_SEEN = (
     1.5  # what a law predicts in a place over what is seen there, up to which it may be off by a share of itself
 )
@@ -99,15 +112,21 @@ class LawFactors:
 
 
 def law_factors(
-    curve: Curve, strength: float, response: NDArray[np.float64], groups: NDArray[np.intp], level: float
+    curve: Curve,
+    strength: float,
+    response: NDArray[np.float64],
+    groups: NDArray[np.intp],
+    level: float,
+    *,
+    chance: bool = True,
 ) -> LawFactors:
-    """What is random about an effect at a strength: its law's inaccuracy, and its own spread."""
+    """What is random about an effect at a strength: its law's inaccuracy, and, with `chance`, its own spread."""
     if curve.exact is not None:
         response = np.where(curve.exact, 0.0, response)
-    spread = curve.spread
-    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < _LEAST_MOVED:
+    spread = curve.spread if chance else None
+    if spread is None or float(np.max(np.abs(spread), initial=0.0)) * strength < LEAST_MOVED:
         spread = np.zeros((len(response), 0))
-    moves = float(np.max(np.abs(response), initial=0.0)) * level >= _LEAST_MOVED
+    moves = float(np.max(np.abs(response), initial=0.0)) * level >= LEAST_MOVED
     return LawFactors(group_factors(response, groups, level if moves else 0.0), spread * strength)
 
 
@@ -144,12 +163,17 @@ def law_terms(
     return factors, own_variance(curve, strength, response, places, level)
 
 
-def log_rest(ratio: float) -> float:
-    """Log prior, but for a constant, of a rest so many times as long as what the laws beside it do: a Gaussian about 0.
+def log_rest(ratio: float, *, another: bool = False) -> float:
+    """Log density, in the logarithm of it, of how many times as long a rest is as what the laws beside it do.
 
-    Its standard deviation is LEAK_SHARE: what is as large as that is no rest of a law that explains it.
+    another: the laws are only like what is there.
     """
-    return -0.5 * (ratio / LEAK_SHARE) ** 2
+    ratio = max(ratio, _LEAST_RATIO)
+    if another:
+        middle, sd = LEVELS.rest_of_another_log
+        return -0.5 * ((math.log(ratio) - middle) / sd) ** 2 - math.log(math.sqrt(2.0 * math.pi) * sd)
+    share = ratio / LEVELS.rest_sd_of_kind
+    return math.log(share) + 0.5 * math.log(2.0 / math.pi) - 0.5 * share**2
 
 
 def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:

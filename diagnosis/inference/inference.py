@@ -4,7 +4,8 @@ Probes are residuals r (probe,) against the twin, in units of their own standard
 integrated out exactly (they are linear with Gaussian priors): r ~ N(m, C), C = I + F F^T, F (probe, factor) the
 responses to the nuisances times their prior standard deviations.
 
-    none      m = 0; now and then one family of probes is off by a little (`unknown.Chance`)
+    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.standing`); now and then one family of
+              probes is off by a little (`unknown.Chance`)
     effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
@@ -21,10 +22,10 @@ from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, interval_of, log_mean_exp
-from .discrepancy import LEVELS, log_rest
+from .discrepancy import LEVELS, log_frequency, log_rest
 from .observed import Observed, Point
-from .pairs import Single, left_by_the_stronger, log_prior, weigh_pairs
-from .unknown import Beyond, beyond
+from .pairs import Single, left_by_the_stronger, left_in_place, log_prior, weigh_pairs
+from .unknown import LOG_DENSITY, Beyond, beyond
 
 UNKNOWN = "unknown_effect"
 _WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
@@ -61,8 +62,7 @@ class Priors:
 
 
 def weigh_hypotheses(
-    observed: Observed,
-    fits: Sequence[CurveFit],
+    seen: Sequence[tuple[Observed, Sequence[CurveFit]]],
     *,
     parts: NDArray[np.intp],
     part_names: Sequence[str],
@@ -72,22 +72,49 @@ def weigh_hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
+    An effect that the twin has is weighed like any other: a hypothesis that holds it has it at any strength, all others as strong as
+    the twin.
+
     Args:
-        observed: standardised probes less the twin's, and what may vary.
-        fits: of each effect's curves to it; several curves of one effect are variants with equal prior.
+        seen: standardised probes less the twin's with what may vary, and the fits of each effect's curves to it; several curves of
+            one effect are variants with equal prior. Several of these for several levels by which laws of the twin's own effects may
+            be off, over which the evidence is averaged.
         parts, part_names: families of probes (probe,) in which an unknown effect may show.
         priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
     """
-    priors = priors or Priors()
+    weighed: list[tuple[Hypothesis, float]] = []
+    for observed, fits in seen:
+        # one zero for all, and how often laws are off by so much
+        zero = observed.standing().log_likelihood - seen[0][0].standing().log_likelihood
+        zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
+        found = _weighed(observed, fits, parts, part_names, priors or Priors(), of_catalogue, rests)
+        weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
+    return _by_effects(weighed)
+
+
+def _weighed(
+    observed: Observed,
+    fits: Sequence[CurveFit],
+    parts: NDArray[np.intp],
+    part_names: Sequence[str],
+    priors: Priors,
+    of_catalogue: int,
+    rests: bool,
+) -> list[tuple[Hypothesis, float]]:
+    """All hypotheses with their log evidence over none, and the logarithms of their priors."""
     singles = _singles(fits)
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
-    none = beyond(observed, parts, part_names)
     looked_at = _WITH_REST if rests else 0
     beside = _Rests(observed, parts, part_names)
-    weighed = [(Hypothesis(effects=(), probability=0.0, log_evidence=none.allowed), math.log(priors.none))]
+    none = beside.none
+    nothing = beside.no_effect(rests)
+    weighed = [(nothing, math.log(priors.none))]
+    of_given = _left_by_given(observed, singles)
+    if of_given is not None:
+        weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     of_single = math.log(priors.single / count)
     alike, whole = [], {}
     for effect in ranked:
@@ -106,8 +133,10 @@ def weigh_hypotheses(
         if number < looked_at:
             found = beside.of_kind(found, list(pair.fits.values()))
         weighed.append((found, of_pair))
-        # or the weaker of them is what the stronger one's law leaves
+        # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
         strong, leaves = left_by_the_stronger(observed, pair)
+        if any(observed.has(effect) for effect in pair.effects if effect != strong):
+            continue
         alone = replace(whole[strong], log_evidence=found.log_evidence + leaves, rest=found.rest)
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
@@ -116,7 +145,17 @@ def weigh_hypotheses(
     evidence = float(np.logaddexp(none.log_evidence, likest)) - math.log(2.0)
     unknown = Hypothesis(effects=(UNKNOWN,), probability=0.0, log_evidence=evidence, location=none.place)
     weighed.append((unknown, math.log(priors.unknown)))
-    return _by_effects(weighed)
+    return weighed
+
+
+def _left_by_given(observed: Observed, singles: Mapping[str, Single]) -> float | None:
+    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
+    others = [single for effect, single in singles.items() if not observed.has(effect)]
+    if not (observed.given and others):
+        return None
+    length = math.hypot(*(observed.length(point.curve, point.strength) for point in observed.given))
+    levels = [(1.0, observed.given[0].level)]
+    return max(single.log_evidence + left_in_place(observed, single.best, length, levels) for single in others)
 
 
 def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:
@@ -136,9 +175,11 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
 
 def evidence_with_rest(
     observed: Observed, points: Sequence[Point], *, parts: NDArray[np.intp], part_names: Sequence[str]
-) -> float:
-    """Log evidence over none of effects at their points with a rest beside them, whatever it is."""
-    return _Rests(observed, parts, part_names).beside(points)[0]
+) -> tuple[float, float]:
+    """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs."""
+    rests = _Rests(observed, parts, part_names)
+    evidence, found = rests.beside(points)
+    return evidence, rests.ratio(points, found)
 
 
 class _Rests:
@@ -148,37 +189,57 @@ class _Rests:
         self._observed = observed
         self._parts = parts
         self._names = names
+        self.none = beyond(observed.standing(), parts, names)
+
+    def no_effect(self, rests: bool) -> Hypothesis:
+        """What the twin has and nothing else; with `rests` the laws of that may leave a rest."""
+        plain = Hypothesis(effects=(), probability=0.0, log_evidence=self.none.allowed)
+        if not (rests and self._observed.given):
+            return plain
+        return self._weighed(replace(plain, log_evidence=0.0), [], self.none.log_evidence, self.none)
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
         """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
         points = [fit.point for fit in fits]
-        evidence, found = self.beside(points)
+        return self._weighed(hypothesis, points, *self.beside(points))
+
+    def _weighed(self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: Beyond) -> Hypothesis:
+        """A hypothesis with log evidence `evidence` where there is a rest `found`, and without."""
         plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
-        moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in points))
-        with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(found.length / max(moved, 1.0))
+        with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(self.ratio(points, found)) - LOG_DENSITY
         return replace(
             hypothesis,
             log_evidence=float(np.logaddexp(plain, with_rest)),
             rest=found.place if with_rest > plain else "",
         )
 
+    def ratio(self, points: Sequence[Point], found: Beyond) -> float:
+        """Length of a rest over that of what the laws beside it do, those of the twin's own effects among them."""
+        named = {point.curve.effect for point in points}
+        acting = [*points, *(point for point in self._observed.given if point.curve.effect not in named)]
+        moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in acting))
+        return found.length / max(moved, 1.0)
+
     def of_another(self, single: Single) -> float:
         """Log evidence over none of an effect that is only like one of the catalogue's."""
         plain = log_mean_exp(
             np.array([fit.averaged(LEVELS.of_another) for fit in single.fits if len(fit.by_level) > 1])
         )
-        evidence, _ = self.beside([single.best.at_level(LEVELS.levels[-1])], another=True)
+        points = [single.best.at_level(LEVELS.levels[-1])]
+        evidence, found = self.beside(points, another=True)
+        evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
         share = LEVELS.rest_of_another
         return float(np.logaddexp(plain + math.log1p(-share), evidence + math.log(share)))
 
     def beside(self, points: Sequence[Point], *, another: bool = False) -> tuple[float, Beyond]:
         """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
-        beside = self._observed
+        effects = [point.curve.effect for point in points]
+        alone = beside = self._observed.standing(*effects)
         for point in points:
             beside = beside.beside(point)
         found = beyond(beside, self._parts, self._names)
-        evidence = beside.log_likelihood - self._observed.log_likelihood + found.log_evidence
-        evidence += sum(log_prior(point, another=another) for point in points)
+        evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
+        evidence += found.log_evidence + sum(log_prior(point, another=another) for point in points)
         return evidence, found
 
 

@@ -1,6 +1,7 @@
 """What is weighed: standardised probes with what may vary beside an effect, the law of an effect that is there among it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,9 +13,10 @@ from ..model.curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
 
-FREE_SD = (
-    1.0  # of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
-)
+# of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
+FREE_SD = 1.0
+# of that of an effect which the twin has, besides its law: as far as intervals of strengths are widened for real laws
+GIVEN_SD = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +34,8 @@ class Observed:
 
     Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
     one factor; places (probe,), within which it is off by a share of no more than what is seen there; root (probe,): standard
-    deviations of the probes in the units of the first (None: 1).
+    deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still in the residual:
+    `standing` takes them off.
     """
 
     residual: NDArray[np.float64]
@@ -40,6 +43,7 @@ class Observed:
     groups: NDArray[np.intp]
     places: NDArray[np.intp]
     root: NDArray[np.float64] | None = None
+    given: tuple[Point, ...] = ()
 
     @property
     def units(self) -> NDArray[np.float64]:
@@ -57,15 +61,48 @@ class Observed:
         squares = float(self.residual @ self.left)
         return -0.5 * (self.nuisances.log_determinant + squares) - float(np.sum(np.log(self.units)))
 
+    @cached_property
+    def _standing(self) -> dict[frozenset[str], "Observed"]:
+        return {}
+
+    def has(self, effect: str) -> bool:
+        """Whether the twin has an effect."""
+        return bool(self._free([effect]))
+
+    def standing(self, *free: str) -> "Observed":
+        """The same with the effects that the twin has as strong as it has them, but those in `free`, which are not there."""
+        left_out = self._free(free)
+        if left_out not in self._standing:
+            found = replace(self, given=()) if self.given else self
+            for point in self.given:
+                if point.curve.effect not in left_out:
+                    found = found.beside(point, sd=GIVEN_SD)
+            self._standing[left_out] = found
+        return self._standing[left_out]
+
+    def over_none(self, *free: str) -> float:
+        """Log evidence, over all that the twin has and nothing else, of all that but the effects in `free`."""
+        return self.standing(*free).log_likelihood - self.standing().log_likelihood
+
+    def off_by(self, level: float) -> "Observed":
+        """The same with laws of the effects that the twin has off by another level."""
+        return replace(self, given=tuple(replace(point, level=level) for point in self.given))
+
+    def _free(self, effects: Sequence[str]) -> frozenset[str]:
+        return frozenset(point.curve.effect for point in self.given).intersection(effects)
+
     def scaled(self, curve: Curve) -> Curve:
         """A curve in the units of the first probes, in these."""
         return curve if self.root is None else curve.over(self.root)
 
-    def widened(self, curve: Curve, strength: float, level: float) -> "Observed | None":
-        """The same residual where a curve's law (in these units) is off by a level at a strength; None: that moves nothing."""
+    def widened(self, curve: Curve, strength: float, level: float, *, chance: bool = True) -> "Observed | None":
+        """The same residual where a curve's law (in these units) is off by a level at a strength; None: that moves nothing.
+
+        chance: with what the effect does by chance there, its spread; what it gives each probe by itself counts in either case.
+        """
         effective = self.nuisances.solve(curve.response(strength))
         effective = credible(effective, self.left, self.places)
-        law = law_factors(curve, strength, effective, self.groups, level)
+        law = law_factors(curve, strength, effective, self.groups, level, chance=chance)
         own = own_variance(curve, strength, effective, self.places, level)
         if not law and float(own.max()) < LEAST_FACTOR:
             return None
@@ -77,11 +114,11 @@ class Observed:
             root=self.units * root,
         )
 
-    def beside(self, point: Point) -> "Observed":
-        """What is left once an effect stands there, its strength free about that: FREE_SD in its logarithm, as a Gaussian."""
+    def beside(self, point: Point, *, sd: float = FREE_SD) -> "Observed":
+        """What is left once an effect stands there, its strength free about that by `sd` in its logarithm, as a Gaussian."""
         wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
         own = wide.scaled(point.curve)
-        free = FREE_SD * slope(own, point.strength)[:, None]
+        free = sd * slope(own, point.strength)[:, None]
         nuisances = wide.nuisances
         if np.any(free):
             nuisances = nuisances.over(np.ones(len(free)), free, csc_array((0, len(free))))

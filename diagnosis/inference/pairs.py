@@ -12,7 +12,7 @@ import numpy as np
 
 from ..model.curves import Curve
 from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral
-from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density
+from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
 from .observed import FREE_SD, Observed, Point
 
 _IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
@@ -60,11 +60,11 @@ def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: i
     for first in ranked[:leading]:
         best = singles[first].best
         point = best.at_level(min(best.level, FARTHEST_LEVEL))
-        beside = observed.beside(point)
-        start = beside.log_likelihood - observed.log_likelihood
+        alone = _beside_first(observed, point, first)
         for second, own in curves.items():
             if second == first:
                 continue
+            start, beside = _beside_first(observed, point, second) if observed.has(second) else alone
             gain = max(fit_curve(beside, beside.scaled(curve), exact=True).log_evidence for curve in own)
             a, b = sorted((first, second))
             if (a, b) not in seen or start + gain > seen[a, b][0]:
@@ -75,19 +75,26 @@ def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: i
 
 def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Curve]], other: str) -> Pair:
     """Two effects by turns: `other` beside a first one at its point, then the first beside the other, and so on."""
-    none = observed.log_likelihood
     best, fits = -math.inf, {}
     for turn in range(_TURNS):
-        beside = observed.beside(point)
+        start, beside = _beside_first(observed, point, other)
         fit = _beside(beside, curves[other])
         second = Point(curve=_own(curves[other], fit), strength=fit.best, level=fit.level)
-        evidence = beside.log_likelihood - none + log_prior(point) + fit.log_evidence
+        evidence = start + log_prior(point) + fit.log_evidence
         fits[other] = replace(fit, curve=second.curve)
         before, best = best, max(best, evidence)
         if turn and evidence < before + _SETTLED:
             break
         point, other = second, point.curve.effect
     return Pair(log_evidence=best, fits=fits)
+
+
+def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, Observed]:
+    """What a first effect leaves to another, and its log evidence over none without the prior; neither is there by the twin."""
+    both = (point.curve.effect, other)
+    alone = observed.standing(*both)
+    beside = alone.beside(point)
+    return observed.over_none(*both) + beside.log_likelihood - alone.log_likelihood, beside
 
 
 def _own(curves: Sequence[Curve], fit: CurveFit) -> Curve:
@@ -115,19 +122,32 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     """
     lengths = {effect: observed.length(fit.curve, fit.best) for effect, fit in pair.fits.items()}
     strong, weak = sorted(lengths, key=lambda effect: -lengths[effect])
-    first, second = pair.fits[strong], pair.fits[weak]
-    ratios = lengths[weak] / max(lengths[strong], 1e-12) * second.strengths / second.best
+    first = pair.fits[strong]
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
-    least = 1.0 / max(lengths[strong], 1.0)  # a standard deviation
-    levels = list(zip(shares, LEVELS.levels, strict=False))
+    return strong, left_in_place(
+        observed, pair.fits[weak], lengths[strong], list(zip(shares, LEVELS.levels, strict=False))
+    )
+
+
+def left_in_place(observed: Observed, second: CurveFit, length: float, levels: Sequence[tuple[float, float]]) -> float:
+    """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
+
+    Args:
+        observed: what is weighed.
+        second: the effect's fit beside that law.
+        length: how far the law moves the probes, standard deviations.
+        levels: by which it is off, each after its probability.
+    """
+    ratios = observed.length(second.curve, second.best) / max(length, 1e-12) * second.strengths / second.best
+    least = 1.0 / max(length, 1.0)  # a standard deviation
     density = sum(share * leak_density(ratios, level, least) for share, level in levels)
     low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
     top = float(second.log_likelihood.max())
     likelihood = np.exp(second.log_likelihood - top)
     left = float(np.trapezoid(likelihood * density, np.log(second.strengths))) + float(likelihood[0]) * low
     there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
-    return strong, top + math.log(max(left, 1e-300)) - there
+    return top + math.log(max(left, 1e-300)) - there
 
 
 def log_prior(point: Point, *, another: bool = False) -> float:
@@ -136,11 +156,9 @@ def log_prior(point: Point, *, another: bool = False) -> float:
     Strengths are even in their logarithm; those about the point are as free as `Observed.beside` leaves them.
     """
     curve, log = point.curve, math.log
-    frequencies = LEVELS.of_another if another else LEVELS.of_kind
-    level = frequencies[int(np.argmin(np.abs(np.array(LEVELS.levels) - point.level)))]
     if curve.low <= point.strength <= curve.high:
         density = (1.0 - IMPLAUSIBLE) / log(curve.high / curve.low)
     else:
         low, high = curve.reach
         density = IMPLAUSIBLE / (log(high / low) - log(curve.high / curve.low))
-    return log(level) + log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)
+    return log_frequency(point.level, another=another) + log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)

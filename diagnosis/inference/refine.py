@@ -68,10 +68,10 @@ class _Refinement:
 
     def run(self, task: Task) -> None:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
-        seen = self._whole
+        seen = self._standing(task)
         if task.beside is not None:
             if task.moves_more and not self._clear(
-                task.beside[0].effect, self._whole.beside(self._where(task.effect, task.own))
+                task.beside[0].effect, seen.beside(self._where(task.effect, task.own))
             ):
                 return
             seen = seen.beside(self._where(task.beside[0].effect, task.beside))
@@ -103,6 +103,11 @@ class _Refinement:
                 best = _Closer(start, curve, there.best, there.log_evidence)
         if best is not None:
             self._closer[task.effect] = best
+
+    def _standing(self, task: Task) -> Seen:
+        """What a task's effects are fitted to: the twin has its effects but these."""
+        effects = [task.effect] if task.beside is None else [task.effect, task.beside[0].effect]
+        return replace(self._whole, observed=self._whole.observed.standing(*effects))
 
     def _where(self, effect: str, grid: tuple[Curve, float]) -> Point:
         """An effect as it was found last, its law off as usual; that of the grid before."""

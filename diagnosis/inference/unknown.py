@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .observed import Observed
 
 SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
+LOG_DENSITY = -math.log(math.log(SIZES[-1] / SIZES[0]))  # of their logarithm, where every size is as likely
 _SWEEPS = 4
 
 

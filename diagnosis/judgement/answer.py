@@ -197,13 +197,7 @@ def in_pixels(diagnosis: Diagnosis, *, twin: Twin, factor: int) -> Diagnosis:
         factor: pixels along each side of a square.
     """
     added = tuple(
-        AppliedEffect(
-            id=item.id,
-            parameters=parameters_in_pixels(item.id, item.parameters, factor),
-            since=item.since,
-            options=item.options,
-        )
-        for item in diagnosis.added
+        replace(item, parameters=parameters_in_pixels(item.id, item.parameters, factor)) for item in diagnosis.added
     )
     causes = []
     for cause in diagnosis.causes:

@@ -80,21 +80,22 @@ def left_over(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What nuisances fitted on `fit` leave of the other probes, in standard deviations of that prediction, and these (probe,).
 
-    added: effects and their strengths that are taken off; what they do by chance is fitted beside the nuisances and counts as
-    noise. What their laws may be off by is fitted as well, so that no nuisance is drawn away by it, but neither taken off nor
-    counted.
+    added: effects and their strengths that are taken off, in place of the base's own; what they do by chance is fitted beside the
+    nuisances and counts as noise. What their laws, and those of the base's effects, may be off by is fitted as well, so that no
+    nuisance is drawn away by it, but neither taken off nor counted.
     """
-    residual, factors, own = problem.residual, problem.factors, np.ones(len(problem.residual))
+    residual = problem.left_by({point.curve.effect: (point.curve, point.strength) for point in added})
+    factors, own = problem.factors, np.ones(len(residual))
     for point in added:
         curve, strength = point.curve, point.strength
-        residual = residual - curve.response(strength)
         if curve.spread is not None:
             factors = np.concatenate([factors, strength * curve.spread], axis=1)
         if curve.jitter is not None:
             own = own + strength**2 * curve.jitter
     inexact, laws = own[fit], [factors[fit]]
     places = problem.places
-    for point in added:
+    named = {point.curve.effect for point in added}
+    for point in (*added, *(item for item in problem.given if item.curve.effect not in named)):
         bare = replace(point.curve, spread=None, jitter=None)
         of_law, of_probe = law_terms(bare, point.strength, problem.groups, places, max(point.level, USUAL_LEVEL))
         laws.append(of_law[fit])

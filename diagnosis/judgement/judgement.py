@@ -12,6 +12,7 @@ from ...generator.line.twin import Twin
 from ..advice.next_series import best_measurement, proposal_text
 from ..advice.plan import WORTH_IT, best_repeat, repeat_text
 from ..inference.curve_fits import CurveFit, fit_effects
+from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS
 from ..inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
@@ -20,7 +21,6 @@ from ..inference.refine import refine
 from ..inference.whitening import Whitening
 from ..model.curves import Curve
 from ..problem.known_effects import with_found
-from ..problem.known_laws import CHANGED_FROM, CHANGED_SD, KnownStrength, known_strengths, with_any_strength
 from ..problem.problem import Problem
 from .answer import Cause, Diagnosis, Place
 from .held_out import held_out
@@ -45,18 +45,10 @@ def judge(
 ) -> Diagnosis:
     """The answer to an assembled problem."""
     tell = progress or (lambda stage: None)
-    nuisances = LocalNuisances(problem.factors, problem.blocks)
-    known = known_strengths(problem, nuisances)
-    changed = [item.effect for item in known if item.log_evidence > CHANGED_FROM]
-    if changed:
-        problem = with_any_strength(problem, changed)
-        nuisances = LocalNuisances(problem.factors, problem.blocks)
     weighed = weigh_problem(problem, priors=priors, tell=tell)
     problem = weighed.problem
-    hypotheses = weighed.hypotheses
-    if changed:
-        hypotheses = _of_another_strength(hypotheses, known_strengths(problem, nuisances, of=changed, sd=CHANGED_SD))
-    verdict = verdict_of(hypotheses)
+    nuisances = LocalNuisances(problem.factors, problem.blocks)
+    verdict = verdict_of(weighed.hypotheses)
     tell("held-out data")
     gap, by_axis, shares = held_out(problem, verdict.leading, rng)
     leading, named = verdict.leading, verdict.named
@@ -65,7 +57,6 @@ def judge(
     added = tuple(applied_at_best(problem, leading, effect) for effect in named)
     ambiguous = verdict.word == "ambiguous"
     beside = replace(problem, residual=_left(problem, leading))
-    others = [item for item in known_strengths(beside, nuisances, of=changed, sd=CHANGED_SD) if item.is_another]
     return Diagnosis(
         verdict=verdict.word,
         hypotheses=verdict.hypotheses,
@@ -84,7 +75,7 @@ def judge(
         named=named,
         problem=problem,
         warnings=tuple(problem.skipped),
-        notes=(*_beyond_plausible(leading), *(item.note for item in others)),
+        notes=(*_beyond_plausible(leading), *_of_another_strength(problem, verdict)),
         not_tested=weighed.out_of_reach,
         strained=_strained(problem, leading, nuisances),
     )
@@ -111,19 +102,22 @@ def weigh_problem(
     """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
+    had = [point.curve.effect for point in problem.given]
+    given = whitening.curves([point.curve for point in problem.given])
     observed = Observed(
-        residual=whitening.apply(problem.residual[None, :])[0],
+        residual=whitening.apply(problem.residual_without(had)[None, :])[0],
         nuisances=Nuisances(whitening.factors),
         groups=problem.groups,
         places=problem.places,
+        given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
     )
     whitened = whitening.curves(problem.curves)
+
     fits = fit_effects(observed, whitened)
 
-    def weigh(rests: bool) -> tuple[Hypothesis, ...]:
+    def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, rests: bool) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
-            observed,
-            fits,
+            seen,
             parts=problem.parts,
             part_names=problem.part_names,
             priors=priors,
@@ -131,7 +125,7 @@ def weigh_problem(
             rests=rests,
         )
 
-    first = weigh(rests=False)
+    first = weigh([(observed, fits)], rests=False)
     tell("refinement")
     closer = refine(
         first,
@@ -147,7 +141,11 @@ def weigh_problem(
         whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
         fits = fit_effects(observed, whitened)
     tell("all hypotheses")
-    hypotheses = weigh(rests=True)
+    seen = [(observed, fits)]
+    if observed.given:
+        levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
+        seen = [(one, fit_effects(one, whitened)) for one in levels]
+    hypotheses = weigh(seen, rests=True)
     problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     return Weighed(
@@ -160,23 +158,6 @@ def weigh_problem(
         observed=observed,
         fits=fits,
     )
-
-
-def _of_another_strength(hypotheses: tuple[Hypothesis, ...], known: Sequence[KnownStrength]) -> tuple[Hypothesis, ...]:
-    """Hypotheses where the base has an effect of another strength than the session: to want no other effect is no agreement."""
-    others = [item for item in known if item.is_another]
-    none = next(item for item in hypotheses if not item.effects)
-    if not others or none is not hypotheses[0]:
-        return hypotheses
-    found = [
-        replace(item, probability=0.0)
-        if item is none
-        else replace(item, probability=item.probability + none.probability, location=others[0].location)
-        if item.effects == (UNKNOWN,)
-        else item
-        for item in hypotheses
-    ]
-    return tuple(sorted(found, key=lambda item: (-item.probability, -item.log_evidence)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,12 +308,24 @@ def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
+    """What to say of effects that the twin has and that are named: how strong the session shows them."""
+    notes = []
+    for point in problem.given:
+        effect = point.curve.effect
+        if effect in verdict.named:
+            value, low, high = (one / point.strength for one in strength_of(problem, verdict.leading, effect))
+            notes.append(
+                f"the twin has {effect}, and this session shows {value:.2f} ({low:.2f} to {high:.2f}) times as much of it"
+            )
+    return tuple(notes)
+
+
 def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
     """What the leading explanation leaves of the residual (probe,)."""
-    left = problem.residual.copy()
-    for effect, curve in leading.variants.items():
-        left -= curve.response(leading.strengths[effect][0])
-    return left
+    return problem.left_by(
+        {effect: (curve, leading.strengths[effect][0]) for effect, curve in leading.variants.items()}
+    )
 
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:

@@ -35,9 +35,10 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
 
     A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
     """
+    strength = hypothesis.strengths[effect][0]
     if EFFECTS[effect].reading.frame_levels:
-        return _applied(problem, hypothesis, effect, strength_of(problem, hypothesis, effect)[0])
-    return _applied(problem, hypothesis, effect, hypothesis.strengths[effect][0])
+        strength = strength_of(problem, hypothesis, effect)[0]
+    return replace(_applied(problem, hypothesis, effect, strength), law_sd=hypothesis.levels[effect])
 
 
 def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
@@ -67,10 +68,12 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     """The strength at which the probes that define it have their measured values, and its 95 % interval; None: at none."""
     curve = hypothesis.variants[effect]
     exact = np.zeros(len(problem.residual), dtype=bool) if curve.exact is None else curve.exact
-    left = problem.residual[exact].copy()
-    for other in hypothesis.effects:
-        if other != effect:
-            left -= hypothesis.variants[other].response(hypothesis.strengths[other][0])[exact]
+    others = {
+        other: (hypothesis.variants[other], hypothesis.strengths[other][0])
+        for other in hypothesis.effects
+        if other != effect
+    }
+    left = problem.left_by(others, without=[effect])[exact]
     lowest, highest = curve.reach
     if len(curve.strengths) > 1:
         # a refined curve is known about its nodes: far from them its cubics may come back to what was measured
@@ -156,22 +159,25 @@ def strengths_on(
     if not effects:
         return strengths
     # in the probes as they are: whitened ones gave a heel of 5 % a strength on half of a session that left three times the gap
+    had = [point.curve.effect for point in problem.given]
     part = Observed(
-        residual=problem.residual[fit],
+        residual=problem.residual_without(had)[fit],
         nuisances=Nuisances(problem.factors[fit]),
         groups=problem.groups[fit],
         places=problem.places[fit],
+        given=tuple(
+            replace(point, curve=point.curve.of_probes(fit))
+            for point in problem.given
+            if point.curve.effect not in effects
+        ),
     )
     for _ in range(3 if len(effects) > 1 else 1):
         for effect in effects:
             curve = leading.variants[effect]
             if curve.by_chance_alone:
                 continue  # the strength is that of all probes
-            others = sum(
-                (leading.variants[other].response(strengths[other]) for other in effects if other != effect),
-                np.zeros(len(problem.residual)),
-            )
-            rest = replace(part, residual=(problem.residual - others)[fit])
-            own = replace(curve.of_probes(fit), spread=None)
+            others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
+            rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
+            own = rest.scaled(replace(curve.of_probes(fit), spread=None))
             strengths[effect] = fit_curve(rest, own, levels=USUAL).best
     return strengths

@@ -197,7 +197,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
 
 
 def with_pauses(variants: Sequence[Variant], *, stated: bool) -> list[Variant]:
-    """The variants for a session whose times between series are stated, or not: then a lag's ghosts ask how long they were."""
+    """The variants for a session whose times between series are stated, or not: then lag and drift ask how long pauses were."""
     if stated:
         return list(variants)
     result = []

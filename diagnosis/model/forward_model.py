@@ -33,13 +33,15 @@ def draft_cache() -> ModelCache:
 class Change:
     """A change asked of the forward model.
 
-    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; parameters (parameter,) of the spectrum in
-    place of the best ones; step_sd: size of a nuisance's step in prior standard deviations; spectral: moves lit series alone.
+    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
+    one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
+    standard deviations; spectral: moves lit series alone.
     """
 
     label: str
     twin: Twin
     effects: tuple[AppliedEffect, ...] = ()
+    instead_of: tuple[AppliedEffect, ...] = ()
     parameters: NDArray[np.float64] | None = None
     step_sd: float = 1.0
     spectral: bool = False
@@ -57,8 +59,10 @@ class Change:
 
     def touches(self, request: SeriesRequest) -> bool:
         """Whether the change can show in a series."""
-        if not self.effects:
+        if not (self.effects or self.instead_of):
             return self.spectral is False or request.beam_on
+        if any(effect.since == "always" or request.after_calibration for effect in self.instead_of):
+            return True
         for effect in self.effects:
             if effect.since == "calibration" and not request.after_calibration:
                 continue
@@ -104,7 +108,12 @@ class Change:
 
     def whenever_it_began(self, request: SeriesRequest) -> object | None:
         """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
-        if len(self.effects) != 1 or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS or not self.touches(request):
+        if (
+            self.instead_of
+            or len(self.effects) != 1
+            or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS
+            or not self.touches(request)
+        ):
             return None
         effect = self.effects[0]
         if effect.since == "always" and any(not item.after_calibration for item in request.previous):
@@ -146,9 +155,16 @@ class ForwardModel:
         return 1.0 + OF_BEAMS_GROWS * (departures_found(self.base.spectral) - 1.0)
 
     def change(self, variant: Variant, strength: float) -> Change:
-        """An effect of the catalogue at a strength, in this session."""
+        """An effect of the catalogue at a strength, in this session; it takes the place of the same one, if the base has that."""
         applied = with_conditions(variant.applied(strength), self.conditions)
-        return Change(label=variant.effect, twin=self.base, effects=(applied,))
+        return replace(self.without(variant.effect), label=variant.effect, effects=(applied,))
+
+    def without(self, effect: str) -> Change:
+        """The base twin less one of its effects; the base itself where it has not that."""
+        had = tuple(item for item in self.base.effects if item.id == effect)
+        rest = tuple(item for item in self.base.effects if item.id != effect)
+        twin = replace(self.base, effects=rest) if had else self.base
+        return Change(label=f"without {effect}", twin=twin, instead_of=had)
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
         """The series as the base twin expects it.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...generator.frames.series import ExpectedSeries
 from ..probes.fixed_pattern import lines_of, pattern_noise
+from ..probes.line_scalars import bent_share
 from ..probes.model_scalars import expected_scalars
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS
 from ..probes.registration import Placement
@@ -312,8 +313,12 @@ def _context(
 
 
 def _lines_of_noise(model: ExpectedSeries) -> tuple[float, float]:
-    """Variance of rows and of columns from frame to frame, DN^2."""
-    return model.row_variance_DN2, model.column_variance_DN2
+    """Variance of rows and of columns from frame to frame, DN^2, as second differences of lines show it."""
+    rows, columns, flicker = model.row_variance_DN2, model.column_variance_DN2, model.flicker
+    if flicker is None:
+        return rows, columns
+    of_light = flicker.rms**2 * float(np.mean(model.signal_DN)) ** 2 * bent_share(flicker)
+    return rows + (1.0 - flicker.column_share) * of_light, columns + flicker.column_share * of_light
 
 
 def _with_lines(

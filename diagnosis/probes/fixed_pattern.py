@@ -6,12 +6,14 @@ readout lines) show in the means of rows or columns far above what single pixels
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
+from ...generator.line.line_state import TilePattern
 from ..session.even_maps import mean_over
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2
 from .noise_correlation import autocovariance, correlation_sum
@@ -37,6 +39,13 @@ class Pattern:
     blocks_DN2: float | None
     rows_DN2: float | None
     columns_DN2: float | None
+
+    def times(self, factor: float) -> "Pattern":
+        """All variances times a factor."""
+        blocks, rows, columns = (
+            None if one is None else factor * one for one in (self.blocks_DN2, self.rows_DN2, self.columns_DN2)
+        )
+        return Pattern(pixel_DN2=factor * self.pixel_DN2, blocks_DN2=blocks, rows_DN2=rows, columns_DN2=columns)
 
 
 def pattern_noise(
@@ -76,6 +85,39 @@ def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> flo
     next_to = two - one
     two_apart = 1.5 * (three - one) - 2.0 * next_to
     return one - (4.0 * next_to - two_apart) / 3.0
+
+
+@lru_cache(maxsize=64)
+def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
+    """What gains of tiles of variance 1 DN^2 add to the variances of a `Pattern` over a panel of `shape`.
+
+    All of these are differences of neighbours, so that each is a sum over the tiles of squared differences of the shares that
+    neighbours have in a tile.
+    """
+    row_in, column_in = (np.eye(int(number[-1]) + 1)[number] for number in map(tiles.tile_of, shape))
+    strips = tiles.strips_share
+    alone = 1.0 - strips
+
+    def blocks(inside: NDArray[np.float64]) -> NDArray[np.float64]:
+        whole = inside[: len(inside) - len(inside) % BLOCK_PX]
+        return np.asarray(whole.reshape(-1, BLOCK_PX, inside.shape[1]).mean(axis=1))
+
+    def differing(inside: NDArray[np.float64]) -> float:
+        return float(np.mean(np.sum(np.diff(inside, axis=0) ** 2, axis=1))) / 2.0
+
+    def bent(inside: NDArray[np.float64]) -> float:
+        return float(np.mean(np.sum(np.diff(inside, n=2, axis=0) ** 2, axis=1))) / 6.0
+
+    def of_mean(inside: NDArray[np.float64]) -> float:
+        return float(np.sum(inside.mean(axis=0) ** 2))
+
+    of_blocks = differing(blocks(column_in)) * (strips + alone * float(np.mean(np.sum(blocks(row_in) ** 2, axis=1))))
+    return Pattern(
+        pixel_DN2=differing(column_in),
+        blocks_DN2=of_blocks,
+        rows_DN2=alone * bent(row_in) * of_mean(column_in),
+        columns_DN2=bent(column_in) * (strips + alone * of_mean(row_in)),
+    )
 
 
 def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:

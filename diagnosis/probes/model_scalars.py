@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from ...generator.frames.series import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
+from .fixed_pattern import Pattern, shares_of_tiles
+from .line_scalars import LineNoise, bent_share
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
@@ -57,43 +59,43 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
     areas = context.areas
     rows, columns = context.good.shape
     keep = lag_loss(expected)
-    row, column = expected.row_variance_DN2, expected.column_variance_DN2
+    lines = LineNoise.of(expected, context)
     mean_q, label_q = areas.means(expected.quantum_variance_DN2)
     mean_w, label_w = areas.means(expected.white_variance_DN2)
     moving = MovingPicture.of(expected, context)
     moved = moving.pixels()
-    total = max(mean_q * keep + mean_w + row + column + moved, LEAST_NOISE_DN2)
+    total = max(mean_q * keep + mean_w + lines.pixel() + moved, LEAST_NOISE_DN2)
     correlations = [autocovariance(expected, dr, dc) for dr, dc in LAGS]
-    lines = [(row if dr == 0 else 0.0) + (column if dc == 0 else 0.0) for dr, dc in LAGS]
     for label, name in enumerate(context.label_names):
         # an area whose pixels are brighter than others by their gain is noisier by its square
         q, w = float(label_q[label] * context.label_gain[label]) * keep, float(label_w[label])
         shared = moving.pixels(label)
-        here = max(q + w + row + column + shared, LEAST_NOISE_DN2)
+        here = max(q + w + lines.pixel(label) + shared, LEAST_NOISE_DN2)
         variance_name, correlation_names = _noise_names(name)
         values[variance_name] = math.log(here)
-        for known, correlation, line in zip(correlation_names, correlations, lines, strict=True):
-            values[known] = (q * correlation + shared + line) / here
+        for known, correlation, lag in zip(correlation_names, correlations, LAGS, strict=True):
+            values[known] = (q * correlation + shared + lines.together(*lag, label)) / here
 
     def over_total(variance_DN2: float) -> float:
         return math.log(max(variance_DN2, 1e-12) / total)
 
     line_q = mean_q * keep
     if context.whole_lines:
+        row, column = lines.rows(), lines.columns()
         of_row = (row + moving.rows()) * columns + column + line_q * correlation_sum(expected, 1, columns) + mean_w
         of_column = (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w
         values["row_ratio"], values["column_ratio"] = over_total(of_row), over_total(of_column)
     of_block = line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX) + mean_w
-    values["block_ratio"] = over_total(of_block + BLOCK_PX * (row + column) + BLOCK_PX**2 * moved)
+    values["block_ratio"] = over_total(of_block + BLOCK_PX**2 * (lines.block(BLOCK_PX) + moved))
     temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
-    full = max(mean_q + mean_w + row + column + moved, LEAST_NOISE_DN2)
+    full = max(mean_q + mean_w + lines.pixel() + moved, LEAST_NOISE_DN2)
     for step in (1, 2):
         correlation = float(temporal[step - 1]) if temporal.size >= step else 0.0
         values[f"temporal_correlation {step}"] = (correlation * mean_q + moving.lasting(step)) / full
     values["kurtosis"] = _kurtosis(expected, context, full) + moving.kurtosis(expected)
     if context.kind in ("flat", "object"):
         quantum = (mean_q * keep * correlation_sum(expected, rows, columns) + mean_w) / areas.order.size
-        quantum += row / rows + column / columns
+        quantum += lines.frame(rows, columns)
         # seen in steps from frame to frame
         steps = 1.0 - float(expected.frame_factor_correlation[1])
         wandering = steps * (expected.frame_factor_rms * context.reference_signal_DN) ** 2
@@ -109,24 +111,33 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     rows, columns = context.good.shape
     row, column = expected.row_variance_DN2, expected.column_variance_DN2
     signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
+    if expected.flicker is not None:
+        bent = expected.flicker.rms**2 * signal2 * bent_share(expected.flicker)
+        row += (1.0 - expected.flicker.column_share) * bent
+        column += expected.flicker.column_share * bent
     pattern = PATTERN_PIXEL_SHARE * expected.fixed_pattern_rms**2 * signal2
+    tiles = Pattern(pixel_DN2=0.0, blocks_DN2=0.0, rows_DN2=0.0, columns_DN2=0.0)
+    if expected.tile_pattern is not None:
+        tiles = shares_of_tiles((rows, columns), expected.tile_pattern).times(expected.tile_pattern.rms**2 * signal2)
     # more quanta's noise in the frames is more of it in their mean
     mean_q, _ = context.areas.means(expected.quantum_variance_DN2)
     added = (mean_q - context.quantum_DN2) / context.frames
     neighbours = 1.0 - autocovariance(expected, 0, 1)
     lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
     noise = context.pattern_noise
-    values["fixed_pattern"] = math.sqrt(max(1.0 + (pattern + added * neighbours) / noise.pixel_DN2, 1e-3))
+    values["fixed_pattern"] = math.sqrt(
+        max(1.0 + (pattern + tiles.pixel_DN2 + added * neighbours) / noise.pixel_DN2, 1e-3)
+    )
     if noise.blocks_DN2 is not None:
-        of_blocks = (pattern + lasting) / BLOCK_PX**2 / noise.blocks_DN2
+        of_blocks = ((pattern + lasting) / BLOCK_PX**2 + (tiles.blocks_DN2 or 0.0)) / noise.blocks_DN2
         values["fixed_pattern blocks"] = math.sqrt(max(1.0 + of_blocks, 1e-3))
     if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
         # a pattern is no more alike along a line than across it; lines that change leave their mean
-        for name, noise_DN2, line, length in (
-            (FIXED_ROWS, noise.rows_DN2, row, columns),
-            (FIXED_COLUMNS, noise.columns_DN2, column, rows),
+        for name, noise_DN2, line, seams, length in (
+            (FIXED_ROWS, noise.rows_DN2, row, tiles.rows_DN2 or 0.0, columns),
+            (FIXED_COLUMNS, noise.columns_DN2, column, tiles.columns_DN2 or 0.0, rows),
         ):
-            of_lines = ((pattern + added) / length + line / context.frames) / noise_DN2
+            of_lines = ((pattern + added) / length + seams + line / context.frames) / noise_DN2
             values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share

@@ -10,5 +10,4 @@ Files:
     line_noise         noise of rows and columns that is no effect
     output_course      levels and trends of a drifting output
     known_effects      effects that the twin has already
-    known_laws         their laws and strengths
 """

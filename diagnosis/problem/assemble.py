@@ -14,9 +14,20 @@ from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.series import beam_conditions, expected_series, session_conditions, with_conditions
 from ...generator.line.twin import Twin
+from ..checks.preparation import PreparedSession
+from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
+from ..inference.observed import Point
 from ..model import changes as scales
 from ..model.calibrated_maps import calibrated_maps, exposure_of
-from ..model.changes import Variant, always_a_little, smooth_twin, spectral_sds, twin_changes, with_pauses
+from ..model.changes import (
+    Variant,
+    always_a_little,
+    catalogue_variants,
+    smooth_twin,
+    spectral_sds,
+    twin_changes,
+    with_pauses,
+)
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import memory_of, new_outliers
 from ..model.forward_model import Change, ForwardModel, draft_cache, strength_rows
@@ -28,8 +39,7 @@ from ..session.even_maps import Map
 from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
 from ..session.usable import SeenSeries, look_at_all, stated_series, summarise_all
-from .known_effects import lasting
-from .known_laws import beside_known, without_each
+from .known_effects import lasting, with_found
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns
 from .problem import Problem, SeriesView
@@ -99,12 +109,13 @@ def build_problem(
         replace(model.change(variant, variant.strengths[0]), label=variant.name)
         for variant in always_a_little(side=side)
     ]
-    changes += without_each(model.base)
+    had = {item.id: item for item in model.base.effects}
+    changes += [model.without(effect) for effect in had]
     unjudged = _of_quanta() if only_own_noise(session) else {}
     compared = _Compared(
         measured=measured,
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
-        known=len(model.base.effects),
+        had=had,
         variants=tuple(variants),
         thicker=_thicker_scenes(expected.series),
         back=back,
@@ -115,6 +126,28 @@ def build_problem(
         tell(f"responses of {one.name}")
         parts.append(compared.part(one))
     return _joined(parts, compared)
+
+
+def problem_of(
+    session: PreparedSession,
+    twin: Twin,
+    *,
+    without: Sequence[str] = (),
+    variants: Sequence[Variant] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Problem:
+    """What inference is asked about a prepared session, with a twin and `variants` (None: the catalogue less `without`)."""
+    return build_problem(
+        session.acquisition,
+        twin,
+        variants=catalogue_variants(without=without, side=session.factor) if variants is None else variants,
+        calibrated_elsewhere=session.calibrated_elsewhere,
+        exposed=session.exposed,
+        ends_at_zero=session.ends_at_zero,
+        spectral_point=session.spectral_point,
+        side=session.factor,
+        progress=progress,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,14 +288,14 @@ class _Part:
 class _Compared:
     """A session and the changes that every series of it is asked with.
 
-    Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; known: number of
-    these; variants; thicker: see `_thicker_scenes`; back: prior standard deviations from the base twin's spectral parameters to the
+    Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; had: these effects;
+    variants; thicker: see `_thicker_scenes`; back: prior standard deviations from the base twin's spectral parameters to the
     calibrated ones, by name; side: of the squares of the panel's pixels that stand for pixels.
     """
 
     measured: _Measured
     asked: tuple[Asked, ...]
-    known: int
+    had: Mapping[str, AppliedEffect]
     variants: tuple[Variant, ...]
     thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
     back: Mapping[str, float]
@@ -330,7 +363,9 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     names = tuple(name for block in blocks for name in block.names)
     series_of = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
     factors = _factors(blocks, responses, compared)
-    curves, chosen, missing = _curves(blocks, responses, names, compared)
+    first_less = len(responses) - len(compared.had)
+    done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
+    curves, chosen, missing = _curves(blocks, responses, names, compared, done)
     of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
     groups, group_names = _numbered(
         [
@@ -351,7 +386,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     residual = np.concatenate([block.residual for block in blocks])
     for name, step in compared.back.items():
         residual -= step * factors.get(name, 0.0)
-    problem = Problem(
+    return Problem(
         residual=residual,
         factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(names), 0)),
         factor_names=tuple(factors),
@@ -373,11 +408,28 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         skipped=compared.measured.skipped,
         missing_effects=missing,
         conditions=session.model.conditions,
-        respond=partial(_respond, session, [part.probes for part in parts]),
+        respond=partial(_respond, session, [part.probes for part in parts], done),
         side=compared.side,
+        given=tuple(_as_given(item, done[effect]) for effect, item in compared.had.items()),
     )
-    known = responses[len(responses) - compared.known :]
-    return beside_known(problem, -known, [item.id for item in problem.base.effects])
+
+
+def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
+    """An effect that the twin has, as it has it; done (probe,): what it does there."""
+    inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
+    strength = abs(effect.parameters["strength"])
+    curve = Curve(
+        effect=effect.id,
+        variant="as the twin has it",
+        parameters=inner,
+        low=strength,
+        high=strength,
+        strengths=np.array([strength]),
+        responses=done[None, :],
+        since=effect.since,
+    )
+    level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
+    return Point(curve=curve, strength=strength, level=level)
 
 
 def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
@@ -397,7 +449,7 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
     columns: Columns = {}
     first = sum(len(variant.strengths) for variant in compared.variants)
-    last = len(compared.asked) - compared.known
+    last = len(compared.asked) - len(compared.had)
     for item, response in zip(compared.asked[first:last], responses[first:last], strict=True):
         if not item.failed:
             columns[item.change.label] = response / item.change.step_sd
@@ -419,8 +471,9 @@ def _curves(
     responses: NDArray[np.float64],
     names: Sequence[ProbeName],
     compared: _Compared,
+    done: Mapping[str, NDArray[np.float64]],
 ) -> tuple[list[Curve], list[Variant], dict[str, str]]:
-    """Curves with their variants, and why each effect without a curve cannot be judged."""
+    """Curves with their variants, and why each effect without a curve cannot be judged; done (probe,): by the base's own effects."""
     curves: list[Curve] = []
     chosen: list[Variant] = []
     missing: dict[str, str] = {}
@@ -432,7 +485,7 @@ def _curves(
         if failed:
             missing.setdefault(variant.effect, failed)
             continue
-        own = responses[list(rows)]
+        own = responses[list(rows)] + done.get(variant.effect, 0.0)
         spread = by_chance(variant, blocks, rows[0], readout_ms)
         # a wandering output shifts levels by chance even where too few frames show its noise
         wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
@@ -453,12 +506,13 @@ def _curves(
 def _respond(
     session: SessionModel,
     probes: Sequence[SeriesProbes],
+    done: Mapping[str, NDArray[np.float64]],
     variants: Sequence[Variant],
     wanted: NDArray[np.bool_] | None = None,
 ) -> dict[int, NDArray[np.float64]]:
     """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
 
-    Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
+    done: as in `_curves`. Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
     """
     asked = [
         session.ask(session.model.change(variant, strength)) for variant in variants for strength in variant.strengths
@@ -475,14 +529,17 @@ def _respond(
             responses[[row for row, _ in moved], start:stop] = one.responses([found for _, found in moved])
         start += len(one)
     return {
-        number: responses[list(rows)]
+        number: responses[list(rows)] + done.get(variants[number].effect, 0.0)
         for number, rows in enumerate(strength_rows(variants))
         if not any(asked[row].failed for row in rows)
     }
 
 
 def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:
-    """What effects add to each view's corrected mean frame (row, column), DN, calibration having taken in its part."""
+    """What effects change in each view's corrected mean frame (row, column), DN, calibration having taken in its part.
+
+    They take the place of the same ones that the base has.
+    """
     shape = problem.base.maps.shape
     cache = draft_cache()
     moved: dict[str, NDArray[np.float64]] = {}
@@ -490,7 +547,7 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
         changed = expected_series(
             problem.base,
             view.session.request,
-            effects=(*problem.base.effects, *effects),
+            effects=with_found(problem.base.effects, effects),
             cache=cache,
             use_measured_level=False,
         )

@@ -2,20 +2,10 @@
 
 from collections.abc import Sequence
 
-from ...generator.effects import EFFECTS, AppliedEffect, effect_of
+from ...generator.effects import AppliedEffect, effect_of
 
 # what these do to mean frames by chance is in no law: they are sought again, and take the place of those the twin has
 _IN_NO_LAW = ("output", "pixels", "lines", "offset")
-
-
-def already_there(effects: Sequence[AppliedEffect]) -> dict[str, str]:
-    """Why effects that a twin has are not sought once more, by id."""
-    return {
-        item.id: f"the twin has it already ({item.parameters['strength']:.3g} {EFFECTS[item.id].strength.unit});"
-        " the gap is what it leaves"
-        for item in lasting(effects)
-        if item.id in EFFECTS and "strength" in item.parameters
-    }
 
 
 def lasting(effects: Sequence[AppliedEffect]) -> tuple[AppliedEffect, ...]:

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.line.line_state import TilePattern
 from ..model import changes as scales
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import autocovariance, correlation_sum
@@ -341,6 +342,24 @@ def changed_gain_pattern(
     smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
     rest[:maps] = probes.projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
     return smooth, rest
+
+
+def changed_tiles(probes: SeriesProbes, signal: NDArray[np.float64], tiles: TilePattern) -> NDArray[np.float64]:
+    """What gains of tiles and strips of 1 % rms do by chance: responses (probe, tile or strip); signal: (row, column), DN."""
+    item, maps = probes.series.session, len(probes.projection)
+    rows, columns = (tiles.tile_of(length) for length in signal.shape)
+    images = []
+    if tiles.strips_share < 1.0:
+        number = rows[:, None] * (columns[-1] + 1) + columns
+        lone = 0.01 * math.sqrt(1.0 - tiles.strips_share)
+        images += [np.where(number == tile, lone * signal, 0.0) for tile in range(number[-1, -1] + 1)]
+    if tiles.strips_share > 0.0:
+        whole = 0.01 * math.sqrt(tiles.strips_share)
+        images += [np.where(columns == strip, whole * signal, 0.0) for strip in range(columns[-1] + 1)]
+    found = np.zeros((len(probes), len(images)))
+    if item.request.beam_on and not item.calibrates:
+        found[:maps] = probes.projection.apply(np.stack(images).astype(np.float32)).T
+    return found
 
 
 def noise_of_lines(probes: SeriesProbes) -> NDArray[np.float64]:

@@ -14,18 +14,23 @@ _MOMENTS = 8  # of a series, that stand for its exposures against another's
 
 @dataclass(frozen=True, slots=True)
 class OutputCourse:
-    """How a wandering output of unit variance moves: a share new in every exposure, the rest with exp(-|dt| / tau)."""
+    """How a wandering output of unit variance moves: a share new in every exposure, the rest with exp(-|dt| / tau).
+
+    Fields: correlation_s, tau, s; jitter_share, 0 to 1; idle_s: pause before each series whose pause is not stated, s.
+    """
 
     correlation_s: float
     jitter_share: float
+    idle_s: float = 0.0
 
     def means(self, requests: Sequence[SeriesRequest], readout_ms: float | None) -> NDArray[np.float64]:
         """A root (series, factor) of the covariance of the series' means."""
         middles = (np.arange(_MOMENTS) + 0.5) / _MOMENTS
+        idle_s = self.idle_s * np.cumsum([not item.pause_stated for item in requests])
         times = np.array(
             [
-                item.start_s + middles * item.frames * item.exposures_per_frame * item.interval_s(readout_ms)
-                for item in requests
+                item.start_s + pause_s + middles * item.frames * item.exposures_per_frame * item.interval_s(readout_ms)
+                for item, pause_s in zip(requests, idle_s, strict=True)
             ]
         ).ravel()
         alike = np.exp(-np.abs(times[:, None] - times[None, :]) / self.correlation_s)

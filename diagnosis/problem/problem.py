@@ -1,6 +1,6 @@
 """What inference is asked about: the probes of a session, what may explain them, and what stands beside them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
 from ...generator.line.twin import Twin
+from ..inference.observed import Point
 from ..inference.seen import Blocks, Responder
 from ..model.changes import Variant
 from ..model.curves import Curve
@@ -44,7 +45,8 @@ class Problem:
     part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
     calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
     cannot be judged here and why; conditions of the session that effects know; respond asks the forward model for further
-    variants; side of the squares of the panel's pixels that stand for pixels.
+    variants; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
+    the residual: what they do, at their strengths.
     """
 
     residual: NDArray[np.float64]
@@ -70,6 +72,27 @@ class Problem:
     conditions: dict[str, float]
     respond: Responder
     side: int = 1
+    given: tuple[Point, ...] = ()
+
+    def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
+        """The residual (probe,) of the base less those of its own effects that are among these."""
+        left = self.residual.copy()
+        for point in self.given:
+            if point.curve.effect in effects:
+                left += point.curve.response(point.strength)
+        return left
+
+    def left_by(
+        self, strengths: Mapping[str, tuple[Curve, float]], *, without: Sequence[str] = ()
+    ) -> NDArray[np.float64]:
+        """What effects, with their curves and strengths, leave of the residual (probe,).
+
+        They take the place of the base's own; of these, those in `without` are not there either.
+        """
+        left = self.residual_without((*strengths, *without))
+        for curve, strength in strengths.values():
+            left -= curve.response(strength)
+        return left
 
     @property
     def places(self) -> NDArray[np.intp]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ...generator.line.line_state import LineFlicker, TilePattern
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.responses import Asked, Moved, SessionModel
@@ -17,6 +18,7 @@ from ..session.session import SessionSeries
 from .nuisance_columns import (
     Columns,
     changed_gain_pattern,
+    changed_tiles,
     gain_map_noise,
     level_of,
     local_nuisances,
@@ -35,7 +37,8 @@ class SeriesBlock:
     Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
     (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
     pattern_jitter (probe,): what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to
-    rows (to columns) does; uneven (2, probe), by number of change: more of it on one side of the panel.
+    rows (to columns) does; lit_lines, alike, of 1 % of the light; uneven (2, probe), by number of change: more of it on one side of
+    the panel; tiles (probe, tile), alike: what 1 % of changed gains of its tiles does by chance.
     """
 
     session: SessionSeries
@@ -49,7 +52,9 @@ class SeriesBlock:
     pattern: NDArray[np.float64]
     pattern_jitter: NDArray[np.float64]
     lines: NDArray[np.float64]
+    lit_lines: NDArray[np.float64]
     uneven: dict[int, NDArray[np.float64]]
+    tiles: dict[int, NDArray[np.float64]]
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -87,6 +92,12 @@ def series_block(
         {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
         signal.shape,
     )
+    tiles = {
+        number: changed_tiles(probes, signal, one) * shrink[:, None]
+        for number, item in enumerate(asked)
+        if not item.failed and (one := _tiles_of(item)) is not None
+    }
+    lines, context = noise_of_lines(probes) * shrink**2, probes.series.context
     return SeriesBlock(
         session=probes.series.session,
         names=probes.names,
@@ -98,9 +109,20 @@ def series_block(
         offset=offset_of_later(probes) * shrink,
         pattern=pattern * shrink[:, None],
         pattern_jitter=jitter * shrink**2,
-        lines=noise_of_lines(probes) * shrink**2,
+        lines=lines,
+        lit_lines=lines * (0.01 * context.reference_signal_DN if context.kind in ("flat", "object") else 0.0) ** 2,
         uneven={number: columns * shrink for number, columns in by_side.items()},
+        tiles=tiles,
     )
+
+
+def _tiles_of(asked: Asked) -> TilePattern | None:
+    """Tiles whose gains a change draws; None: it has nothing to do with tiles."""
+    if _random_of(asked.change.label) != "tiles":
+        return None
+    (effect,) = asked.change.effects
+    numbers = EFFECTS[effect.id].values(effect.parameters)
+    return TilePattern(rms=0.01, side_px=numbers["side_px"], strips_share=numbers["strips_share"], seed=0)
 
 
 def _random_of(label: str) -> str:
@@ -134,6 +156,8 @@ def by_chance(
         return np.concatenate([block.offset for block in blocks])[:, None] * scales.CUT_OFF_SHARE
     if random == "pixels":
         return np.concatenate([block.pattern for block in blocks])
+    if random == "tiles":
+        return np.concatenate([block.tiles[row] for block in blocks])
     return _of_output(variant, blocks, readout_ms) if random == "output" else None
 
 
@@ -150,6 +174,16 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
         shares = read_noise_DN**2 * np.array([1.0 - columns, columns])
         every = variant.since == "always"
         return np.concatenate([shares @ block.lines * float(every or not block.session.calibrates) for block in blocks])
+    if random == "lines of light":
+        numbers = EFFECTS[variant.effect].values(variant.parameters)
+        flicker = LineFlicker(rms=0.01, column_share=numbers["column_share"], together_lines=numbers["together_lines"])
+        # in smooth shapes, of which most probes are, lines that go together count as fewer
+        fewer = (1.0 + flicker.correlation(1)) / (1.0 - flicker.correlation(1))
+        shares = fewer * np.array([1.0 - flicker.column_share, flicker.column_share])
+        every = variant.since == "always"
+        return np.concatenate(
+            [shares @ block.lit_lines * float(every or not block.session.calibrates) for block in blocks]
+        )
     return None
 
 
@@ -161,7 +195,8 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     ]
     if not lit:
         return None
-    wanders = OutputCourse(variant.parameters["correlation_s"], variant.parameters["jitter_share"])
+    own = variant.parameters
+    wanders = OutputCourse(own["correlation_s"], own["jitter_share"], own.get("idle_s", 0.0))
     means = wanders.means([block.session.request for block, _ in lit], readout_ms)
     single = []  # (probe, what it does by itself)
     levels = np.zeros((size, means.shape[1]))

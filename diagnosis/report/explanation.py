@@ -6,7 +6,6 @@ from typing import Any
 
 from ...generator.effects import EFFECTS
 from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
-from ..problem.known_laws import changed_effect
 
 _NAMED_DOUBTS = 3
 _NAMED_STRAINED = 3
@@ -151,12 +150,6 @@ def verdict_text(diagnosis: Diagnosis) -> str:
             f"{figures}."
         )
     where = _where_text(diagnosis.where)
-    changed = changed_effect(diagnosis.unknown_location)
-    if diagnosis.verdict == "unknown_effect" and changed is not None:
-        return (
-            f"The session agrees with its twin but for one thing: {title_of(changed)}, which the twin has, is of another"
-            f" strength here (probability {diagnosis.probability_unknown:.2f}). {figures}, with that strength left free."
-        )
     if diagnosis.verdict == "unknown_effect":
         return (
             f"{where} No effect of the catalogue, and no pair of them, explains it (probability"

@@ -11,7 +11,6 @@ from ...generator.effects import EFFECTS
 from ...reports import Figure, SortedTable, write_page
 from ..judgement.answer import Cause, Diagnosis
 from ..problem.assemble import map_changes
-from ..problem.known_laws import changed_effect
 from .explanation import (
     axis_text,
     compared_text,
@@ -105,10 +104,7 @@ def headline(diagnosis: Diagnosis) -> str:
         return "Labels look wrong"
     if diagnosis.verdict == "no_gap":
         return "No gap: the session agrees with its twin"
-    changed = changed_effect(diagnosis.unknown_location)
     if diagnosis.verdict == "unknown_effect":
-        if changed is not None:
-            return _sentence(f"{title_of(changed)} is of another strength than the twin's")
         return "An effect that is not in the catalogue"
     if diagnosis.verdict == "ambiguous":
         names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
@@ -165,7 +161,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
             ),
             *measured,
         ]
-    if diagnosis.verdict == "unknown_effect" and changed_effect(diagnosis.unknown_location) is None:
+    if diagnosis.verdict == "unknown_effect":
         return [
             *measured,
             step("Look at the maps and probes below: the place of the gap says which part of the line to inspect."),

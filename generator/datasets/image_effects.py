@@ -18,7 +18,7 @@ from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
 from ..frames._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
-from ..frames.defects import gain_pattern, new_bad_pixels
+from ..frames.defects import gain_pattern, new_bad_pixels, sample_flicker, tile_gain
 from ..frames.flat_change import has_always_bent, is_in_noise
 from ..kernels.projection import project_polychromatic
 from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
@@ -366,8 +366,13 @@ class ImageEffects:
     ) -> FloatArray:
         state, shape = self._end, self.twin.maps.shape
         value = charge
+        if state.flicker is not None:
+            flicker = replace(state.flicker, rms=state.flicker.rms / math.sqrt(averaged))
+            value = value * sample_flicker(flicker, shape, rng)
         if state.gain_pattern is not None:
             value = value * gain_pattern(state.gain_pattern, shape)
+        if state.tile_pattern is not None:
+            value = value * tile_gain(state.tile_pattern, shape)
         value = value * (1.0 - state.bend_per_DN * value)
         bad = new_bad_pixels(state, shape)
         if bad is not None:

@@ -13,6 +13,7 @@ from ..line.line_state import STAGES
 from .bad_pixels import BAD_PIXELS
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
+from .crosstalk import CROSSTALK
 from .dark_drift import DARK_DRIFT
 from .effect import (
     EVERY_SERIES,
@@ -36,6 +37,7 @@ from .heel import HEEL
 from .image_lag import IMAGE_LAG
 from .k_fluorescence import K_FLUORESCENCE
 from .kv_error import KV_ERROR
+from .line_flicker import LINE_FLICKER
 from .misregistration import MISREGISTRATION
 from .motion_blur import MOTION_BLUR
 from .mtf_tail import MTF_TAIL
@@ -44,6 +46,7 @@ from .object_scatter import OBJECT_SCATTER
 from .output_drift import OUTPUT_DRIFT
 from .quantisation import QUANTISATION
 from .row_noise import ROW_NOISE
+from .tile_gain import TILE_GAIN
 from .veiling_glare import VEILING_GLARE
 
 # within a stage effects act in this order, those of other packages after ours
@@ -70,6 +73,9 @@ OURS: dict[str, Effect] = {
         MOTION_BLUR,
         GAIN_MAP_ERROR,
         COMPOSITION_ERROR,
+        CROSSTALK,
+        TILE_GAIN,
+        LINE_FLICKER,
     )
 }
 EFFECTS = Catalogue(OURS)

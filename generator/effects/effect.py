@@ -30,10 +30,17 @@ RANDOM = {
     "sides": "more of it on one side of the panel than on the other",
     "offset": "lost bits may be cut off or rounded away: half a step on every level",
     "pixels": "a pattern from pixel to pixel, a part of it smooth",
+    "tiles": "a gain of each tile and strip of columns",
     "lines": "means of the lines of a few frames",
+    "lines of light": "the same, in proportion to their light",
     "output": "level and trend of each lit series",
 }
-_ASKED_OF_RANDOM = {"lines": ("column_share",), "output": ("correlation_s", "jitter_share")}  # parameters
+_ASKED_OF_RANDOM = {  # parameters
+    "lines": ("column_share",),
+    "lines of light": ("column_share", "together_lines"),
+    "tiles": ("side_px", "strips_share"),
+    "output": ("correlation_s", "jitter_share"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,17 +1,44 @@
-"""Where the defects are that calibration has not seen: drawn from the effect's own seed, so that every frame has the same."""
+"""Defects that calibration has not seen, drawn from the effect's own seed, so that every frame has the same; lines that flicker."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line.line_state import FixedPattern, FloatArray, LineState
+from ..line.line_state import FixedPattern, FloatArray, LineFlicker, LineState, TilePattern
 
 
 def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
     """Factor (row, column) of a fixed pattern of the gain, mean 1."""
     rng = np.random.default_rng([0x6A17, pattern.seed])
     return 1.0 + pattern.rms * rng.standard_normal(shape)
+
+
+def tile_gain(pattern: TilePattern, shape: tuple[int, int]) -> FloatArray:
+    """Factor (row, column) of the gains of tiles and strips, mean 1 over the panel: what all share is its level."""
+    rng = np.random.default_rng([0x711E, pattern.seed])
+    rows, columns = (pattern.tile_of(length) for length in shape)
+    tiles = rng.standard_normal((rows[-1] + 1, columns[-1] + 1))[rows][:, columns]
+    strips = rng.standard_normal(columns[-1] + 1)[columns]
+    share = pattern.strips_share
+    drawn = math.sqrt(1.0 - share) * tiles + math.sqrt(share) * strips
+    return np.asarray(1.0 + pattern.rms * (drawn - drawn.mean()))
+
+
+def sample_flicker(flicker: LineFlicker, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
+    """Factor (row, column) of the lines of one exposure."""
+    from scipy.signal import lfilter
+
+    factor = np.ones((1, 1))
+    next_to = flicker.correlation(1)
+    for axis, share in enumerate((1.0 - flicker.column_share, flicker.column_share)):
+        if share > 0.0:
+            drawn = math.sqrt(1.0 - next_to**2) * rng.standard_normal(shape[axis])
+            drawn[0] /= math.sqrt(1.0 - next_to**2)
+            lines = flicker.rms * math.sqrt(share) * lfilter([1.0], [1.0, -next_to], drawn)
+            factor = factor + np.expand_dims(lines, 1 - axis)
+    return np.asarray(factor)
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,5 +144,7 @@ def _quantum(flat: ExpectedSeries) -> float:
 
 def _variance(flat: ExpectedSeries) -> float:
     lines = flat.row_variance_DN2 + flat.column_variance_DN2
+    if flat.flicker is not None:
+        lines += (flat.flicker.rms * _level(flat)) ** 2
     pixel = float(np.median(flat.quantum_variance_DN2 + flat.white_variance_DN2))
     return pixel + lines + (flat.frame_factor_rms * _level(flat)) ** 2

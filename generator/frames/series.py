@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..effects import AppliedEffect, Effect, effect_of, in_order
-from ..line.line_state import FloatArray, LagLaw, LineContext, LineState
+from ..line.line_state import FloatArray, LagLaw, LineContext, LineFlicker, LineState, TilePattern
 from ..line.rounding import rounded_variance
 from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import mean_signal_energy_keV
 from ..line.twin import Twin
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
-from .defects import gain_pattern, new_bad_pixels
+from .defects import gain_pattern, new_bad_pixels, sample_flicker, tile_gain
 
 __all__ = [
     "ExpectedSeries",
@@ -149,12 +149,14 @@ class ExpectedSeries:
         white_variance_DN2: of electronics, secondary quanta and the ADC; without row and column noise.
         noise_autocovariance: (4, 4) of the quantum part over lags of 0-3 rows and columns, 1 at lag 0.
         row_variance_DN2, column_variance_DN2: of what a row or a column of one frame has in common.
+        flicker: factors of the lines of a frame; None: there are none.
         frame_factor_rms: of the common factor of a frame.
         frame_factor_correlation: (frames,) its correlation over 0, 1, 2... frames.
         temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
         quantisation_step_DN: of the stored numbers, before averaging; 0: none.
         bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
         fixed_pattern_rms: relative, of a gain pattern that no map knows.
+        tile_pattern: the same of tiles; None: there is none.
         saturated_share: share of pixels whose mean lies at the end of the ADC's range.
         frames: in the series.
     """
@@ -168,6 +170,7 @@ class ExpectedSeries:
     noise_autocovariance: FloatArray
     row_variance_DN2: float
     column_variance_DN2: float
+    flicker: LineFlicker | None
     frame_factor_rms: float
     frame_factor_correlation: FloatArray
     temporal_correlation: FloatArray
@@ -175,6 +178,7 @@ class ExpectedSeries:
     bad_pixel_share: float
     hot_pixel_share: float
     fixed_pattern_rms: float
+    tile_pattern: TilePattern | None
     saturated_share: float
     frames: int
 
@@ -783,6 +787,9 @@ def expected_series(
         noise_autocovariance=charge.pattern.autocovariance,
         row_variance_DN2=state.row_variance_DN2 / averaged,
         column_variance_DN2=state.column_variance_DN2 / averaged,
+        flicker=None
+        if state.flicker is None or not request.beam_on
+        else replace(state.flicker, rms=state.flicker.rms / math.sqrt(averaged)),
         frame_factor_rms=state.output_rms * math.sqrt(output) if request.beam_on else 0.0,
         frame_factor_correlation=correlation,
         temporal_correlation=covariance[1:] / covariance[0],
@@ -790,6 +797,7 @@ def expected_series(
         bad_pixel_share=state.bad_share,
         hot_pixel_share=state.bad_share * state.bad_hot_share,
         fixed_pattern_rms=0.0 if state.gain_pattern is None or not request.beam_on else state.gain_pattern.rms,
+        tile_pattern=state.tile_pattern if request.beam_on else None,
         saturated_share=saturated,
         frames=request.frames,
     )
@@ -845,6 +853,8 @@ def sample_series(
             trapped, found = _paused(state.lag, carried.trapped_DN, _pause_s(state.lag, request, carried.time_s))
         share = np.asarray(state.lag.trapped)[:, None, None]
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
+    if state.tile_pattern is not None and request.beam_on:
+        gain = (1.0 if gain is None else gain) * tile_gain(state.tile_pattern, shape)
     bad = new_bad_pixels(state, shape)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
     electronic = np.sqrt(_read_variance(twin, state, cache))
@@ -874,6 +884,8 @@ def sample_series(
                         error += math.sqrt(state.output_jitter_share) * state.output_rms * float(rng.standard_normal())
                     factor = max(1.0 + error, 0.0)
                 value = factor * charge.mean + math.sqrt(factor) * noise
+                if state.flicker is not None:
+                    value = value * sample_flicker(state.flicker, shape, rng)
             if trapped is not None:
                 released = (1.0 - decay) * trapped
                 trapped = trapped - released + share * value

@@ -14,6 +14,7 @@ The stages follow the order in which a real line works:
     readout      ADC and bad pixels
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -70,6 +71,39 @@ class FixedPattern:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TilePattern:
+    """Relative gains of square tiles and of strips over whole columns, normal, drawn from `seed`; tiles begin at the corner.
+
+    Fields: rms of all; side_px of tiles and strips; strips_share of the variance that belongs to strips.
+    """
+
+    rms: float
+    side_px: float
+    strips_share: float
+    seed: int
+
+    def tile_of(self, length: int) -> NDArray[np.intp]:
+        """Number of the tile that each of `length` pixels in line lies in (pixel,)."""
+        return np.floor(np.arange(length) / max(self.side_px, 1.0)).astype(np.intp)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineFlicker:
+    """Factors common to the rows and columns of one exposure, new in each.
+
+    Fields: rms; column_share of the variance; together_lines: over so many lines their correlation falls to 1/e.
+    """
+
+    rms: float
+    column_share: float
+    together_lines: float
+
+    def correlation(self, lines: int) -> float:
+        """Of two lines so far apart."""
+        return math.exp(-abs(lines) / self.together_lines)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FinePicture:
     """A picture with sharp borders: cells finer than pixels, see `_fine_picture`.
 
@@ -103,9 +137,10 @@ class LineState:
         flat_factor: change of the illumination against the calibrated flat, map or (1, 1).
         output_rms, output_correlation_s, output_jitter_share: common random factor of each exposure, its rms, correlation
             time, and the share of its variance that is new in every exposure.
+        flicker: factors of the lines of an exposure, or None.
         lag: traps, or None.
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
-        gain_pattern: fixed pattern of the gain that calibration does not know.
+        gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
         row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
         read_variance_taken_DN2: of the calibrated electronic variance, what effects that the calibration saw account for.
@@ -131,9 +166,11 @@ class LineState:
     output_rms: float = 0.0
     output_correlation_s: float = 0.0
     output_jitter_share: float = 0.0
+    flicker: LineFlicker | None = None
     lag: LagLaw | None = None
     bend_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
+    tile_pattern: TilePattern | None = None
     offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
     row_variance_DN2: float = 0.0
     column_variance_DN2: float = 0.0

@@ -87,6 +87,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
                         "since": item.since,
                         "options": dict(item.options),
                     }
+                    | ({} if item.law_sd is None else {"law_sd": item.law_sd})
                     for item in twin.effects
                 ]
             )
@@ -341,6 +342,7 @@ def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:
             parameters={str(name): float(value) for name, value in item["parameters"].items()},
             since=str(item["since"]),
             options={str(name): str(value) for name, value in item.get("options", {}).items()},
+            law_sd=float(item["law_sd"]) if "law_sd" in item else None,
         )
         for item in json.loads(text)
     )

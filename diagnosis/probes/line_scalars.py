@@ -1,0 +1,102 @@
+"""What noise of lines adds to scalar probes: offsets of rows and columns, and lines that flicker with the light."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.frames.series import ExpectedSeries
+from ...generator.line.line_state import LineFlicker
+from .scalar_context import ScalarContext
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineNoise:
+    """Variances, DN^2, of what rows and columns of one frame have in common.
+
+    Fields: row, column: of offsets, the same with and without light; flicker: of lines with the light, None: none; squares: mean
+    square of the signal over all good pixels and over those of each label; of_rows, of_columns: mean square of the signal's means
+    along rows and columns.
+    """
+
+    row: float
+    column: float
+    flicker: LineFlicker | None = None
+    squares: tuple[float, ...] = (0.0,)
+    of_rows: float = 0.0
+    of_columns: float = 0.0
+
+    @staticmethod
+    def of(expected: ExpectedSeries, context: ScalarContext) -> "LineNoise":
+        """Of a series as the model expects it."""
+        row, column, flicker = expected.row_variance_DN2, expected.column_variance_DN2, expected.flicker
+        if flicker is None:
+            return LineNoise(row=row, column=column)
+        signal = np.asarray(expected.signal_DN, dtype=np.float64)
+        whole, labels = context.areas.means(signal**2)
+        of_rows, of_columns = (float(np.mean(signal.mean(axis=axis) ** 2)) for axis in (1, 0))
+        return LineNoise(
+            row=row,
+            column=column,
+            flicker=flicker,
+            squares=(whole, *map(float, labels)),
+            of_rows=of_rows,
+            of_columns=of_columns,
+        )
+
+    def pixel(self, label: int | None = None) -> float:
+        """Of single pixels: of all good ones, or of a label's."""
+        return self.row + self.column + float(self._shares(self._square(label)).sum())
+
+    def together(self, down: int, right: int, label: int | None = None) -> float:
+        """Covariance of pixels so many rows and columns apart."""
+        found = (self.row if down == 0 else 0.0) + (self.column if right == 0 else 0.0)
+        if self.flicker is None:
+            return found
+        fades = np.array([self.flicker.correlation(down), self.flicker.correlation(right)])
+        return found + float(self._shares(self._square(label)) @ fades)
+
+    def rows(self) -> float:
+        """Of rows' offsets, each the mean of all its pixels."""
+        return self.row + float(self._shares(self.of_rows)[0])
+
+    def columns(self) -> float:
+        """Of columns' offsets."""
+        return self.column + float(self._shares(self.of_columns)[1])
+
+    def block(self, side: int) -> float:
+        """Of means over side x side pixels."""
+        found = (self.row + self.column) / side
+        return found + float(self._shares(self._square(None)).sum()) * self._of_mean(side)
+
+    def frame(self, rows: int, columns: int) -> float:
+        """Of means over a frame."""
+        found = self.row / rows + self.column / columns
+        if self.flicker is None:
+            return found
+        by_row, by_column = self._shares(self._square(None))
+        return found + float(by_row) * self._of_mean(rows) + float(by_column) * self._of_mean(columns)
+
+    def _square(self, label: int | None) -> float:
+        return self.squares[0 if label is None or self.flicker is None else 1 + label]
+
+    def _shares(self, square: float) -> NDArray[np.float64]:
+        """Variance of rows' and of columns' factors at a mean square of the signal."""
+        if self.flicker is None:
+            return np.zeros(2)
+        share = self.flicker.column_share
+        return np.asarray(self.flicker.rms**2 * square * np.array([1.0 - share, share]))
+
+    def _of_mean(self, count: int) -> float:
+        """Variance of the mean of so many lines' factors over that of one."""
+        if self.flicker is None:
+            return 1.0 / count
+        lag = np.arange(1, count)
+        fades = np.exp(-lag / self.flicker.together_lines)
+        return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * fades)) / count
+
+
+def bent_share(flicker: LineFlicker) -> float:
+    """A sixth of the variance of second differences of lines' factors over their variance."""
+    one, two = flicker.correlation(1), flicker.correlation(2)
+    return (6.0 - 8.0 * one + 2.0 * two) / 6.0

@@ -19,7 +19,7 @@ BLOCK_PX = 8  # side of the blocks whose means show slow texture
 LEAST_NOISE_DN2 = 1e-4  # of a pixel: noise below the ADC's step can vanish, and a simulated dark may have none
 PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
 _QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
-_CODES_FRAMES = 16
+CODES_FRAMES = 16  # the first, in which codes are counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,9 +229,9 @@ def summarise_series(
     for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
         if codes is not None:
             if raw.dtype.kind in "ui":
-                if coded < _CODES_FRAMES:
-                    code_parts.append(raw[: _CODES_FRAMES - coded][:, good].ravel())
-                    coded += min(len(raw), _CODES_FRAMES - coded)
+                if coded < CODES_FRAMES:
+                    code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
+                    coded += min(len(raw), CODES_FRAMES - coded)
             else:
                 codes = None
         if saturation_DN is not None:

@@ -26,7 +26,7 @@ class FreshNoiseDataset:
                 ...
 
     Args:
-        source: `FreshReferences` or `FreshScenes`.
+        source: `FreshReferences`.
         transform: called with image, masks and a generator of its own for this item; crops, turns, scales.
         seed: of the transforms.
     """

@@ -40,9 +40,7 @@ if TYPE_CHECKING:
         with_conditions,
     )
     from .kernels.kernels import (
-        deposit_spread_from_photons,
         draw_key,
-        gamma_step_DN,
         sample_frames,
         sample_quanta,
     )
@@ -79,7 +77,6 @@ if TYPE_CHECKING:
         Prediction,
         Predictions,
         predict_flatfield,
-        predict_flatfields,
         slope_share,
         spectral_model_of,
     )
@@ -115,7 +112,6 @@ if TYPE_CHECKING:
     )
     from .spread.noise import (
         digitise,
-        frame_sd_DN,
         sample_correlated_quanta,
         sample_frame_noise,
     )
@@ -186,15 +182,12 @@ _LAZY = {
     "Spread": "spread.psf",
     "blur_variance_share": "spread.psf",
     "compute_contrast_map": "predictions.contrast",
-    "deposit_spread_from_photons": "kernels.kernels",
     "digitise": "spread.noise",
     "draw_key": "kernels.kernels",
     "estimate_from_sd": "line.twin",
     "estimate_shift_px": "spread.registration",
     "expected_series": "frames.series",
-    "frame_sd_DN": "spread.noise",
     "gain_behind_object": "line.spectral_signal",
-    "gamma_step_DN": "kernels.kernels",
     "generate_dataset": "datasets.generate",
     "generate_from_description": "datasets.generate_described",
     "noise_autocovariance": "spread.psf",
@@ -203,7 +196,6 @@ _LAZY = {
     "plan_top_up": "references.topup",
     "predict_contrast": "predictions.contrast",
     "predict_flatfield": "predictions.predict",
-    "predict_flatfields": "predictions.predict",
     "predict_levels": "predictions.predict_many",
     "project_polychromatic": "kernels.projection",
     "published_delta_r": "predictions.contrast",
@@ -282,15 +274,12 @@ __all__ = [
     "blur_variance_share",
     "calibration_answer",
     "compute_contrast_map",
-    "deposit_spread_from_photons",
     "digitise",
     "draw_key",
     "estimate_from_sd",
     "estimate_shift_px",
     "expected_series",
-    "frame_sd_DN",
     "gain_behind_object",
-    "gamma_step_DN",
     "gaussian_spread",
     "generate_dataset",
     "generate_from_description",
@@ -301,7 +290,6 @@ __all__ = [
     "plot_levels",
     "predict_contrast",
     "predict_flatfield",
-    "predict_flatfields",
     "predict_levels",
     "predict_words",
     "project_polychromatic",

@@ -13,9 +13,8 @@ from raytwin.acquisition.setting import filters_from_text
 from raytwin.campaign.fresh_noise import EpochSampler, FreshNoiseDataset
 from raytwin.cli import main
 from raytwin.errors import InputError
-from raytwin.generator.datasets.fresh import FreshReferences, FreshScenes
+from raytwin.generator.datasets.fresh import FreshReferences
 from raytwin.generator.datasets.generate import generate_dataset
-from raytwin.generator.scenes.describe import read_description
 from raytwin.generator.twins.twin_io import write_twin
 from raytwin.segmentation import RECIPES
 from raytwin.segmentation.examples import examples_from_dataset
@@ -145,23 +144,6 @@ def test_a_sampler_shows_every_image_once_an_epoch_and_can_go_on(twin, reference
     assert [position for _, position in passes[0]] != [position for _, position in passes[1]]
     assert list(EpochSampler(dataset, seed=1, first_epoch=2)) == passes[2]
     assert list(EpochSampler(dataset, shuffle=False)) == [(0, position) for position in range(6)]
-
-
-def test_scenes_of_a_description_are_new_in_every_epoch_unless_asked_otherwise(tmp_path, twin):
-    path = tmp_path / "d.toml"
-    path.write_text(
-        '[[product]]\nshape = "ellipsoid"\nmaterial = "water"\nlength_mm = [3, 4]\nwidth_mm = [2, 3]\nheight_mm = [3, 5]\n'
-    )
-    description = read_description(path)
-    options = {"images": 2, "low": LOW, "high": HIGH, "seed": 1}
-    moving = FreshScenes(twin, description, **options)
-    still = FreshScenes(twin, description, new_scenes=False, **options)
-    assert len(moving) == 2
-    assert not np.array_equal(moving.example(0, epoch=0).product_mask, moving.example(0, epoch=1).product_mask)
-    first, second = (still.example(0, epoch=epoch) for epoch in (0, 1))
-    np.testing.assert_array_equal(first.product_mask, second.product_mask)
-    assert not np.array_equal(first.log_images, second.log_images)
-    np.testing.assert_array_equal(first.log_images, moving.example(0, epoch=0).log_images)
 
 
 def test_examples_of_an_epoch_come_from_the_source_and_validation_stays_the_same(twin, references):

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from raytwin.errors import InputError
-from raytwin.generator.kernels.kernels import draw_key, gamma_step_DN, sample_frames, sample_quanta
+from raytwin.generator.kernels.kernels import draw_key, sample_frames, sample_quanta
 from raytwin.generator.kernels.projection import project_polychromatic
 from raytwin.generator.spread.psf import noise_autocovariance, noise_kernel_1d, optical_kernel_1d
 
@@ -388,7 +388,6 @@ def test_no_photons_no_electronics_nothing_but_the_dark():
 def test_keys_come_from_the_callers_generator():
     assert draw_key(np.random.default_rng(3)) == draw_key(np.random.default_rng(3))
     assert draw_key(np.random.default_rng(3)) != draw_key(np.random.default_rng(4))
-    assert gamma_step_DN(2.0, 0.25) == pytest.approx(2.0 * 1.5 / 1.25)
 
 
 @given(

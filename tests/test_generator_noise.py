@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import skew
 
 from raytwin.errors import InputError
-from raytwin.generator.spread.noise import digitise, frame_sd_DN, sample_correlated_quanta, sample_frame_noise
+from raytwin.generator.spread.noise import digitise, sample_correlated_quanta, sample_frame_noise
 from raytwin.generator.spread.psf import Spread, noise_autocovariance
 
 SIGMA = 0.6
@@ -103,14 +103,6 @@ def test_impossible_variances_and_steps_are_refused():
         sample_correlated_quanta(np.array([[1.0, -1.0]]), 1.0, spread=Spread(sigma_px=0.5), rng=rng)
     with pytest.raises(InputError, match="DN a quantum"):
         sample_correlated_quanta(np.ones((2, 2)), 0.0, spread=Spread(sigma_px=0.5), rng=rng)
-
-
-def test_sd_of_averaged_frames_falls_with_the_root_of_their_number():
-    one = frame_sd_DN(1000.0, slope_DN=2.0, read_variance_DN2=165.0)
-    assert float(one) == pytest.approx(math.sqrt(2165.0))
-    assert float(frame_sd_DN(1000.0, slope_DN=2.0, read_variance_DN2=165.0, averaged=9)) == pytest.approx(one / 3)
-    with pytest.raises(InputError, match="averaged: got 0"):
-        frame_sd_DN(1.0, slope_DN=1.0, read_variance_DN2=1.0, averaged=0)
 
 
 def test_adc_rounds_to_its_steps_and_clips_to_its_range():

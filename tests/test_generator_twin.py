@@ -24,7 +24,7 @@ from raytwin.generator.line.twin import (
     estimate_from_sd,
     gaussian_spread,
 )
-from raytwin.generator.predictions.predict import predict_flatfield, predict_flatfields, slope_share, spectral_model_of
+from raytwin.generator.predictions.predict import predict_flatfield, slope_share, spectral_model_of
 from raytwin.generator.references.as_published import published_parameters, sample_as_published
 from raytwin.generator.spread.noise import sample_frame_noise
 from raytwin.generator.spread.psf import Spread, blur_variance_share, sampled_gaussian_1d
@@ -272,7 +272,7 @@ def test_without_a_spectrum_only_measured_levels_are_predicted():
     assert known.photons_absorbed is None
     assert known.to_dict()["air_kerma_uGy"] is None
     with pytest.raises(InputError, match="no spectral part"):
-        predict_flatfields(plain, [setting_from_text("kv=60,power_w=40,exposure_ms=20,filter=Cu:0.05")])
+        predict_flatfield(plain, setting_from_text("kv=60,power_w=40,exposure_ms=20,filter=Cu:0.05"))
     with pytest.raises(InputError, match="without spectral part"):
         spectral_model_of(plain)
 

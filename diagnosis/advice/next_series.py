@@ -35,7 +35,7 @@ FRAMES = 20  # of each series that is planned
 Explanation = Mapping[str, tuple[Curve, float]]  # effect -> curve of the problem, strength
 
 _OPAQUE = ("W", 3.0)  # mm
-_TILT = math.radians(4.0)  # of an edge against the pixels
+_TILT = math.radians(4.0)  # of an edge against the pixels: IEC 62220-1 has 1.5 to 3 degrees, ISO 12233 has 5
 _SLAB_MM = 20.0
 _STEPS_MM = {"pmma": (0.0, 3.0, 8.0, 16.0, 30.0), "Al": (0.0, 0.5, 1.2, 2.5)}
 _FILTER = Filter(material="Cu", thickness_mm=0.2)

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile
+from ...calibration.priors import PRIORS
 from ...calibration.spectral_fit import model_for
 from ...errors import InputError
 from ...generator.line.spectral_signal import OpenBeam, SpectralModel
 from .readings import FloatArray, Label, Reading
 
-INHERENT_MM_AL = 1.0  # where nothing is declared
+INHERENT = PRIORS["inherent_filtration_mm_Al"]  # of a tube, beyond what is declared
 DEEPEST = 4.0  # -log T beyond which nothing is compared
 
 
@@ -41,7 +42,7 @@ class LabelModel:
         self._thickness: dict[str, dict[str, FloatArray]] = {}
         self._points: dict[str, tuple[FloatArray, NDArray[np.intp]]] = {}
 
-    def weights(self, label: Label, inherent_mm_Al: float = INHERENT_MM_AL) -> FloatArray | None:
+    def weights(self, label: Label, inherent_mm_Al: float = INHERENT.centre) -> FloatArray | None:
         """(3, energy) of a beam, or None where the label does not say enough."""
         if self.model is None or label.kV is None:
             return None
@@ -55,7 +56,7 @@ class LabelModel:
                 self._weights[key] = None
         return self._weights[key]
 
-    def log_level(self, label: Label, inherent_mm_Al: float = INHERENT_MM_AL) -> float:
+    def log_level(self, label: Label, inherent_mm_Al: float = INHERENT.centre) -> float:
         """Logarithm of the level but for a constant."""
         weights = self.weights(label, inherent_mm_Al)
         rate = 0.0 if weights is None else math.log(max(float(weights[0].sum()), 1e-300))
@@ -84,7 +85,7 @@ class LabelModel:
         return self._thickness[scene]
 
     def depth(
-        self, scene: str, label: Label, factor: float = 1.0, inherent_mm_Al: float = INHERENT_MM_AL
+        self, scene: str, label: Label, factor: float = 1.0, inherent_mm_Al: float = INHERENT.centre
     ) -> FloatArray | None:
         """-log T (row, column) of a scene with its path lengths times a factor, or None where it is unknown."""
         key = (scene, label.kV, label.filters, factor, inherent_mm_Al)

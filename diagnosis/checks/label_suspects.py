@@ -29,8 +29,9 @@ from .readings import FloatArray, Label, Reading, Suspect
 
 LEAST_EVIDENCE = 10.0
 _CONSTANT_SD, _OWN_BEAM_SD = 10.0, 3.0  # of the common level; of a beam of unknown kV or load
-_LEVEL_SDS = {"voltage": 0.2, "voltage since": 0.2, "beam since": 0.05, "filters": 0.15, "series": 0.04}
-_GAIN_SDS = {"since": 0.35, "beam": 0.08, "beam since": 0.08, "series": 0.08}
+# relative; of a beam and of a voltage as much again for series after the calibration
+_LEVEL_SDS = {"voltage": 0.2, "beam": 0.05, "filters": 0.15, "series": 0.04}
+_GAIN_SDS = {"since": 0.35, "beam": 0.08}
 _ATTENUATION_SDS = {"all": 0.1, "placement": 0.3, "series": 0.12}
 _OBJECT_EXTRA = 0.05  # of level and noise behind an object
 _SUSPECT_Z = 3.5
@@ -155,9 +156,9 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
         taken = np.array([maps.taken_by_filters(label) for label in labels])
         return np.asarray(
             _CONSTANT_SD**2
-            + voltage * (_LEVEL_SDS["voltage"] ** 2 + _LEVEL_SDS["voltage since"] ** 2 * np.outer(late, late))
+            + voltage * (_LEVEL_SDS["voltage"] ** 2 + _LEVEL_SDS["voltage"] ** 2 * np.outer(late, late))
             + voltage * _LEVEL_SDS["filters"] ** 2 * np.outer(taken, taken)
-            + _LEVEL_SDS["beam since"] ** 2 * later
+            + _LEVEL_SDS["beam"] ** 2 * later
             + free(labels)
         )
 
@@ -175,7 +176,7 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
         index: (
             math.log(item.gain_DN),
             math.hypot(
-                _GAIN_SDS["series"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0),
+                _GAIN_SDS["beam"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0),
                 item.gain_sd,
                 item.released,
             ),
@@ -192,7 +193,7 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
             _CONSTANT_SD**2
             + _GAIN_SDS["since"] ** 2 * np.outer(late, late)
             + _GAIN_SDS["beam"] ** 2 * same
-            + _GAIN_SDS["beam since"] ** 2 * later
+            + _GAIN_SDS["beam"] ** 2 * later
             + same * np.outer(unknown, unknown)
         )
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from .label_model import DEEPEST, INHERENT_MM_AL, LabelModel, measured_depth
+from .label_model import DEEPEST, INHERENT, LabelModel, measured_depth
 from .readings import FloatArray, Reading, Suspect
 
-_INHERENT_MAY_BE_MM_AL = (0.0, 3.0)  # as far as calibration's prior plausibly goes
 _INHERENT_TRIED_MM_AL = (*(0.25 * step for step in range(13)), 3.5, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0)  # where flats tell
 _FITS, _FITS_NOT = 0.995, 0.5  # correlations of shadow and map
 _FITS_BETTER = 0.3  # share of what is missing from 1 that another map may leave
@@ -22,12 +21,12 @@ _SCALE_AGREES = 0.07  # scatter takes more from thick parts, and not the same at
 _LOG_FACTORS = tuple(round(0.02 * step, 2) for step in range(-40, 41))
 _SHIFTS_PX = (-4, -2, 0, 2, 4)
 _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
-    "turned by 180 degrees": lambda image: image[::-1, ::-1],
-    "mirrored top to bottom": lambda image: image[::-1],
-    "mirrored left to right": lambda image: image[:, ::-1],
-    "transposed": lambda image: image.T,
+    "turned by 180 degrees": np.flip,
+    "mirrored top to bottom": np.flipud,
+    "mirrored left to right": np.fliplr,
+    "transposed": np.transpose,
     "turned by 90 degrees": np.rot90,
-    "turned by 270 degrees": lambda image: np.rot90(image, 3),
+    "turned by 270 degrees": lambda image: np.flip(np.rot90(image)),
 }
 
 
@@ -71,7 +70,7 @@ def _inherent_mm_Al(flats: Sequence[Reading], maps: LabelModel) -> tuple[float, 
                 seen.append(_INHERENT_TRIED_MM_AL[int(np.argmin(off))])
     if seen:
         return (float(np.median(seen)),)
-    return (INHERENT_MM_AL, *_INHERENT_MAY_BE_MM_AL)
+    return (INHERENT.centre, INHERENT.low, INHERENT.centre + 2.0 * INHERENT.sd)
 
 
 def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Sequence[str]) -> str:
@@ -99,21 +98,21 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
         none = shadow < 0.5 * float(np.ptp(np.quantile(depth[maps.good], ends)))
         return f"the thickness maps of {scene} hold an object, but its frames show no shadow" if none else ""
     stride = maps.stride
-    own = _correlation(picture, depth, maps.good, stride)
+    own = _correlation(picture, depth, stride)
     if not own < _FITS:
         return ""
     best, name = own, ""
     for turn, change in _TURNS.items():
         turned = change(depth)
         if turned.shape == depth.shape:
-            value = _correlation(picture, turned, maps.good, stride)
+            value = _correlation(picture, turned, stride)
             if value > best:
                 best, name = value, f"the same maps {turn}"
     for other in others:
         if other != scene:
             candidate = maps.depth(other, item.label)
             if candidate is not None and float(np.std(np.clip(candidate, 0.0, DEEPEST))) > 0.03:
-                value = _correlation(picture, candidate, maps.good, stride)
+                value = _correlation(picture, candidate, stride)
                 if value > best:
                     best, name = value, f"the maps of {other}"
     if name and 1.0 - best < _FITS_BETTER * (1.0 - own) and best > 0.9:
@@ -123,7 +122,7 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
     return ""
 
 
-def _correlation(picture: FloatArray, depth: FloatArray, good: NDArray[np.bool_], stride: int) -> float:
+def _correlation(picture: FloatArray, depth: FloatArray, stride: int) -> float:
     """Largest correlation of a picture's and a map's -log T, smoothed, over displacements of some pixels."""
     from scipy.ndimage import gaussian_filter, median_filter
 

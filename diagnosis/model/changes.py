@@ -44,13 +44,15 @@ ROUGH_FIELDS = 24
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
 TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
-READ_NOISE_SD = 0.01  # rows and columns of a tenth each add 2 % to the variance, and calibration may leave them out
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
 TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
 # always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
 SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape in a series
 SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as likely as the one of half its number
 LINE_NOISE_LIMIT = 0.1  # rms of row and of column offsets over the read noise
+READ_NOISE_SD = (
+    LINE_NOISE_LIMIT**2
+)  # rows and columns of that size add twice it to the variance; calibration may leave them out
 OUTPUT_STEP_LIMIT = 0.0005 / math.sqrt(
     8.0
 )  # rms of an output with 1/f noise of 0.05 % over 16 octaves: two octaves of it

@@ -17,7 +17,7 @@ from ..probes.registration import Placement
 from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
 from ..session.session import SessionSeries
-from ..session.summaries import SeriesSummary
+from ..session.summaries import CODES_FRAMES, SeriesSummary
 from ..session.usable import SeenSeries
 from .calibrated_maps import CalibratedMaps, exposure_of
 from .defects import counting_series
@@ -31,12 +31,9 @@ Moved = tuple[
     Map, Mapping[str, float]
 ]  # change of a corrected mean frame, DN, and the scalar probes under the change, by name
 Known = dict[object, tuple[ExpectedSeries, Map, dict[str, float]]]
-_NO_DISPLACEMENT = {ALONG_ROWS: 0.0, ALONG_COLUMNS: 0.0}
+_NO_DISPLACEMENT = dict.fromkeys((ALONG_ROWS, ALONG_COLUMNS), 0.0)
 _WHOLE_LINES = 0.98  # share of the pixels in use that a series must show for noise of rows and columns
-_CODES_SHARE, _CODES_FRAMES = (
-    0.02,
-    16,
-)  # range of codes to the pixels of so many frames, at most, in which all codes occur
+_CODES_SHARE = 0.02  # range of codes to the pixels of the frames looked at, at most, in which all codes occur
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -299,7 +296,7 @@ def _context(
         previous_signal_DN=previous_DN,
         calibrates=item.calibrates,
         codes_usable=kind in ("dark", "flat")
-        and 0 < code_range < _CODES_SHARE * clean.sum() * min(frames, _CODES_FRAMES),
+        and 0 < code_range < _CODES_SHARE * clean.sum() * min(frames, CODES_FRAMES),
         pattern_noise=pattern_noise(
             expected, clean, frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
         ),

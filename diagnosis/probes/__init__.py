@@ -5,6 +5,7 @@ Files:
     map_probes          a mean frame projected on templates
     frame_scalars       noise, times and patterns of measured frames
     model_scalars       the same by the forward model
+    line_scalars        what noise of rows and columns adds to scalars
     scalar_context      pixels, times and numbers that both refer to
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     registration        displacement of a scene against its thickness maps

@@ -134,4 +134,5 @@ def _mean_product(images: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(images @ images.T / max(images.shape[1], 1))
 
 
-_STILL = MovingPicture((), (), np.zeros((0, 0)), np.zeros((0, 1)), np.zeros(0, np.intp), np.zeros((0, 0)))
+_NOTHING = np.array([])
+_STILL = MovingPicture((), (), _NOTHING, _NOTHING, _NOTHING.astype(np.intp), _NOTHING)

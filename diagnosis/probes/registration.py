@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from ...generator.spread._fine_picture import FINE
 
+RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
-_CAUTION = (0.5, 0.3, 0.15, 0.1, 0.1, 0.1)
+_CAUTION = (0.5, 0.3, 0.15, *(RENDER_SHARE,) * 3)
 _SETTLED_PX = 0.0005  # step below which a further one with the same share changes nothing
 LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
 _STRAY_PX = 2.0  # radius over which light that strays is taken as even
@@ -28,7 +29,6 @@ _LARGEST_STEP_PX = 0.25
 _SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
 _WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
 CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
-RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

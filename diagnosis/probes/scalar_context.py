@@ -1,6 +1,7 @@
 """What the scalar probes of a series refer to: pixels by label, times, and the base model's numbers."""
 
 import math
+import sys
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from ...generator.frames.series import ExpectedSeries
 from .fixed_pattern import Pattern
 
-_AFTERGLOW_EDGES = (0, 1, 2, 3, 5, 9, 17, 33, 65, 129, 100000)
+# frames after the exposure: the first alone, then octaves
+_AFTERGLOW_EDGES = (0, 1, *(1 + 2**octave for octave in range(8)), sys.maxsize)
 
 
 @dataclass(frozen=True, slots=True)

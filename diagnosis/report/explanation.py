@@ -7,9 +7,9 @@ from typing import Any
 from ...generator.effects import EFFECTS
 from ..judgement.answer import EXPLAINED, Cause, Diagnosis, Place
 
-_NAMED_DOUBTS = 3
-_NAMED_STRAINED = 3
-_NAMED_UNTESTED = 8
+# so many of a kind fit into a paragraph
+_NAMED = 3
+_NAMED_UNTESTED = 8  # names alone are shorter
 _NAMED_FAMILIES = 4
 _SHAPED_LIKE = "like "  # templates of what effects would do
 _KIND_WORDS = {"flat": "flats", "dark": "darks", "object": "objects", "afterglow": "frames after the beam"}
@@ -115,8 +115,8 @@ def strained_text(diagnosis: Diagnosis) -> str:
     """Nuisances that the frames pull far from what is known of them; empty without any."""
     if not diagnosis.strained:
         return ""
-    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED_STRAINED])
-    more = len(diagnosis.strained) - _NAMED_STRAINED
+    shown = ", ".join(f"{name} ({value:+.0f} sd)" for name, value in diagnosis.strained[:_NAMED])
+    more = len(diagnosis.strained) - _NAMED
     shown += f" and {more} more" if more > 0 else ""
     return f"Pulled far from what is known of it: {shown}. Check these maps, labels and positions."
 
@@ -126,8 +126,8 @@ def paragraph(diagnosis: Diagnosis) -> str:
     text = verdict_text(diagnosis)
     if diagnosis.mislabelled:
         doubts = [item.text for item in diagnosis.mislabelled]
-        shown = "; ".join(doubts[:_NAMED_DOUBTS])
-        more = f"; and {len(doubts) - _NAMED_DOUBTS} more" if len(doubts) > _NAMED_DOUBTS else ""
+        shown = "; ".join(doubts[:_NAMED])
+        more = f"; and {len(doubts) - _NAMED} more" if len(doubts) > _NAMED else ""
         text = f"Labels look wrong: {shown}{more}. No effect is named until they are right or left out. {text}"
     if diagnosis.not_tested or len(diagnosis.warnings) > len(diagnosis.mislabelled):
         text += f" {compared_text(diagnosis)}"

@@ -168,15 +168,15 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
             step("Describe the effect in a file of your own, if you know its equation (documentation: effects)."),
         ]
     if diagnosis.verdict == "ambiguous":
-        return [*measured, *_confirmed_by(diagnosis, diagnosis.causes[:3])]
+        return [*measured, *_confirmed_by(diagnosis.causes[:3])]
     use = step(
         "Use the improved twin that lies beside this page; every command takes it.",
         "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
     )
-    return [use, *measured, *_confirmed_by(diagnosis, _leading(diagnosis))]
+    return [use, *measured, *_confirmed_by(_leading(diagnosis))]
 
 
-def _confirmed_by(diagnosis: Diagnosis, causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
+def _confirmed_by(causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
     """The measurement that shows each cause by itself."""
     known = [cause.effect for cause in causes if cause.effect in EFFECTS]
     return [

@@ -17,10 +17,9 @@ from ...errors import InputError
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
 LEAST_NOISE_DN2 = 1e-4  # of a pixel: noise below the ADC's step can vanish, and a simulated dark may have none
-TIME_TILES = 4  # tiles a side whose means are kept frame by frame
 PIECE_FRAMES = 64  # at most, that are looked at together: each pixel is scaled by its own variance within them
 _QUIET = 0.01  # of the mean variance, below which a pixel may be one that never leaves its code
-_CODES_FRAMES = 16
+CODES_FRAMES = 16  # the first, in which codes are counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,9 +31,9 @@ class SeriesSummary:
     label, of which there are label_pixels (label,), and over its label_pairs (label, lag) of neighbours;
     row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the means of rows, columns and blocks
     of BLOCK_PX; temporal_covariance_DN2 (2,): mean product of a pixel's deviations one and two frames apart;
-    kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); tile_mean_DN (n, TIME_TILES,
-    TIME_TILES); distinct_codes, code_range: how many whole numbers occur between the 1st and 99th percentile, and how
-    many there are from the first to the last of them; highest_DN, saturated_share.
+    kurtosis_excess of differences, pooled over standardised pixels; frame_mean_DN (n,); distinct_codes,
+    code_range: how many whole numbers occur between the 1st and 99th percentile, and how many there are from the first
+    to the last of them; saturated_share.
     """
 
     frames: int
@@ -51,10 +50,8 @@ class SeriesSummary:
     temporal_covariance_DN2: NDArray[np.float64]
     kurtosis_excess: float
     frame_mean_DN: NDArray[np.float64]
-    tile_mean_DN: NDArray[np.float64]
     distinct_codes: int
     code_range: int
-    highest_DN: float
     saturated_share: float
 
     def without_lines(self, rows_DN2: float, columns_DN2: float) -> "SeriesSummary":
@@ -180,21 +177,6 @@ def look_at_series(
     )
 
 
-def _tiles(frames: NDArray[np.float32], good: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
-    """Means of good pixels in count x count tiles (n, count, count)."""
-    rows, columns = good.shape
-    row_edges = np.linspace(0, rows, count + 1).astype(int)[:-1]
-    column_edges = np.linspace(0, columns, count + 1).astype(int)[:-1]
-    weight = good.astype(np.float32)
-
-    def add(array: NDArray[np.float32]) -> NDArray[np.float64]:
-        return np.asarray(
-            np.add.reduceat(np.add.reduceat(array, row_edges, axis=-2), column_edges, axis=-1), dtype=np.float64
-        )
-
-    return np.asarray(add(frames * weight) / np.maximum(add(weight), 1e-9))
-
-
 def summarise_series(
     pieces: Iterable[NDArray[Any]],
     *,
@@ -236,9 +218,9 @@ def summarise_series(
     row_sum = column_sum = block_sum = 0.0
     temporal = np.zeros(2)
     temporal_pairs = np.zeros(2)
-    frame_means, tiles = [], []
+    frame_means = []
     codes: NDArray[np.int64] | None = np.zeros(0, dtype=np.int64)
-    highest, saturated = -np.inf, 0
+    saturated = 0
     blocks = _block_weights(good)
     row_count = np.maximum(use.sum(axis=1), 1.0)
     column_count = np.maximum(use.sum(axis=0), 1.0)
@@ -247,24 +229,22 @@ def summarise_series(
     for raw, x, cleaned, d in _pieces(pieces, good, pattern, name):
         if codes is not None:
             if raw.dtype.kind in "ui":
-                if coded < _CODES_FRAMES:
-                    code_parts.append(raw[: _CODES_FRAMES - coded][:, good].ravel())
-                    coded += min(len(raw), _CODES_FRAMES - coded)
+                if coded < CODES_FRAMES:
+                    code_parts.append(raw[: CODES_FRAMES - coded][:, good].ravel())
+                    coded += min(len(raw), CODES_FRAMES - coded)
             else:
                 codes = None
-        highest = max(highest, float(raw[:, good].max()))
         if saturation_DN is not None:
             saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
         means = np.tensordot(x, use, axes=2).astype(np.float64) / n_good
         frame_means.append(means)
-        tiles.append(_tiles(x, good, TIME_TILES))
         d2 = variances.add(x, cleaned, d)
         if len(d):
             if len(d) > 3:
                 inside = (d * d)[:, good] / np.maximum(d2 / len(d), 1e-12)[good]
                 inside[:, _standing_still(raw, d2, good)] = 0.0
                 pair_fourth += float(np.sum(inside * inside))
-                pair_second += inside.size * (1.0 + 0.0)
+                pair_second += float(inside.size)
             for index, (first, second, selected) in enumerate(pairs_of_lag):
                 product = np.einsum("nrc,nrc->rc", d[(slice(None), *first)], d[(slice(None), *second)])
                 for label, mask in enumerate(selected):
@@ -307,10 +287,8 @@ def summarise_series(
         temporal_covariance_DN2=temporal / np.maximum(temporal_pairs, 1),
         kurtosis_excess=kurtosis_excess(pair_fourth, pair_second, min(n_pairs, PIECE_FRAMES)),
         frame_mean_DN=np.concatenate(frame_means),
-        tile_mean_DN=np.concatenate(tiles),
         distinct_codes=distinct,
         code_range=span,
-        highest_DN=highest,
         saturated_share=saturated / (frames * n_good),
     )
 

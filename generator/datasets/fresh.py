@@ -15,9 +15,7 @@ from ...acquisition.dataset_io import Dataset, read_dataset
 from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..line.twin import Twin
-from ..scenes.describe import Description
 from .generate import ReferenceImages
-from .generate_described import DescribedScenes
 
 _FRESH = 5  # place of these random streams among those of a seed
 
@@ -112,53 +110,3 @@ class FreshReferences:
             images = ReferenceImages(self._twin, dataset, low=low, high=high, **self._options)
             self._opened = (os.getpid(), dataset, images)
         return self._opened[1], self._opened[2]
-
-
-class FreshScenes:
-    """Scenes of a description at a target setting: other noise, and by default other scenes too, in every epoch.
-
-    Args:
-        twin: the calibrated line.
-        description: what to draw.
-        images: how many an epoch.
-        low, high: target settings.
-        seed: of scenes and noise.
-        new_scenes: False shows the scenes of epoch 0 again and again.
-
-    Raises:
-        InputError: see `DescribedScenes`.
-    """
-
-    def __init__(
-        self,
-        twin: Twin,
-        description: Description,
-        *,
-        images: int,
-        low: Setting,
-        high: Setting,
-        seed: int,
-        new_scenes: bool = True,
-    ) -> None:
-        if images < 1:
-            raise InputError("number of images", received=images, expected="1 or more")
-        self._scenes = DescribedScenes(twin, description, low=low, high=high, seed=seed)
-        self._count = images
-        self._seed = seed
-        self._new_scenes = new_scenes
-
-    def __len__(self) -> int:
-        return self._count
-
-    def example(self, position: int, *, epoch: int) -> FreshExample:
-        """Image `position` of an epoch."""
-        _checked(position, self._count, epoch)
-        pair = self._scenes.pair(position + (epoch * self._count if self._new_scenes else 0))
-        counts = self._scenes.draw(pair, np.random.default_rng([self._seed, _FRESH, epoch, position]))
-        return FreshExample(
-            log_images=np.stack(
-                [model.log_image(plane) for model, plane in zip(self._scenes.models, counts, strict=True)]
-            ),
-            foreign_object_mask=pair.foreign_object_mask,
-            product_mask=pair.product_mask,
-        )

@@ -24,31 +24,6 @@ def draw_key(rng: np.random.Generator) -> int:
     return int(rng.integers(0, 2**64, dtype=np.uint64))
 
 
-def gamma_step_DN(gain_DN: ArrayLike, deposit_spread: ArrayLike) -> NDArray[np.float64]:
-    """Third cumulant over variance of quanta whose deposits follow a gamma distribution, DN.
-
-    gain (1 + 2 s) / (1 + s), s the deposits' squared coefficient of variation (variance over squared mean).
-    """
-    spread = np.asarray(deposit_spread, dtype=np.float64)
-    return np.asarray(np.asarray(gain_DN, dtype=np.float64) * (1.0 + 2.0 * spread) / (1.0 + spread))
-
-
-def deposit_spread_from_photons(
-    photons: ArrayLike, *, signal_DN: ArrayLike, gain_DN: ArrayLike, white_fraction: float = 0.0
-) -> NDArray[np.float64]:
-    """Squared coefficient of variation of what a photon deposits, for `sample_frames`; no unit.
-
-    photons x gain / (1 + white_fraction) / signal - 1, never below 0; 0 where there is no signal.
-
-    Args:
-        photons: absorbed in the pixel, mean.
-        signal_DN, gain_DN, white_fraction: of the same pixel, as in `sample_frames`; shapes broadcast.
-    """
-    number, signal, gain = (np.asarray(one, dtype=np.float64) for one in (photons, signal_DN, gain_DN))
-    second = number * gain / (1.0 + white_fraction) / np.where(signal > 0, signal, np.inf)
-    return np.asarray(np.clip(second - 1.0, 0.0, None))
-
-
 def is_tensor(values: object) -> bool:
     """Whether `values` is a torch tensor, told without loading torch."""
     return hasattr(values, "detach") and hasattr(values, "device")
@@ -171,7 +146,7 @@ def _prepare(
         maps = {name: on_device(values, places[0]) for name, values in maps.items()}
     slope, excess = maps["gain"] / float(1.0 + white), maps["excess"]
     if step_DN is None:
-        step = slope * (1.0 + 2.0 * excess) / (1.0 + excess)  # see gamma_step_DN
+        step = slope * (1.0 + 2.0 * excess) / (1.0 + excess)  # of deposits that follow a gamma distribution
     else:
         step = maps["step"]
         _check_deposits(slope, step, excess)

@@ -28,7 +28,6 @@ __all__ = [
     "Prediction",
     "binned_over_single",
     "predict_flatfield",
-    "predict_flatfields",
     "slope_share",
     "spectral_model_of",
 ]
@@ -495,8 +494,3 @@ def _log_sd(estimate: Estimate) -> float:
     if estimate.low <= 0:
         return (estimate.high - estimate.low) / (2 * 1.959964) / max(abs(estimate.value), 1e-300)
     return math.log(estimate.high / estimate.low) / (2 * 1.959964)
-
-
-def predict_flatfields(twin: Twin, settings: Sequence[Setting]) -> tuple[Prediction, ...]:
-    """`predict_flatfield` for many settings."""
-    return tuple(predict_flatfield(twin, setting) for setting in settings)

@@ -107,19 +107,6 @@ def sample_frame_noise(
     return np.asarray(noise + scale * rng.standard_normal(signal_DN.shape, dtype=np.float32))
 
 
-def frame_sd_DN(
-    signal_DN: ArrayLike, *, slope_DN: ArrayLike, read_variance_DN2: ArrayLike, averaged: int = 1
-) -> NDArray[np.float64]:
-    """Temporal standard deviation of one pixel of the mean of `averaged` frames, DN.
-
-    sqrt((slope x signal + read variance) / averaged), slope being the photon-transfer slope (the spread's share in it).
-    """
-    if averaged < 1:
-        raise InputError("averaged", received=averaged, expected="1 frame or more")
-    variance = np.asarray(slope_DN) * np.clip(np.asarray(signal_DN), 0.0, None) + np.asarray(read_variance_DN2)
-    return np.asarray(np.sqrt(variance / averaged))
-
-
 def digitise(
     counts_DN: NDArray[np.floating], *, bits: int | None, quantised: bool, averaged: int = 1
 ) -> NDArray[np.float32]:

@@ -93,7 +93,8 @@ class MapView:
     """Contrast-to-noise ratio of the object over both voltages.
 
     Fields: kV_low, kV_high (axis values); cnr (low, high), NaN where the pair is none, cannot be or saturates; allowed (low, high):
-    within the declared limits of the line and without saturation; best (kV low, kV high, ratio) among the allowed, None: none is.
+    within the declared limits of the line and without saturation; best (kV low, kV high, ratio) among the allowed; None where none
+    is.
     """
 
     kV_low: tuple[float, ...]

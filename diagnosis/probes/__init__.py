@@ -7,6 +7,7 @@ Files:
     model_scalars       the same by the forward model
     line_scalars        what noise of rows and columns adds to scalars
     scalar_context      pixels, times and numbers that both refer to
+    line_scalars        what noise of rows and columns adds to them
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     registration        displacement of a scene against its thickness maps
     moving_picture      noise that a fading picture seems to add

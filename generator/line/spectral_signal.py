@@ -79,7 +79,8 @@ OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
 _OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
 _ABSORBER = "absorber_mm:"
-_KV_ERRORS = np.arange(-40, 41) * 0.005  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
+# nodes of the tube voltage error; between them linear, 3e-6 of the signal
+_KV_ERRORS: NDArray[np.float64] = np.linspace(-0.2, 0.2, 81)
 LARGEST_KV_ERROR = 0.2
 _USUAL_KV_ERROR = 0.06  # up to it sums end 7 % above the voltage
 _ALL_NODES = slice(None)

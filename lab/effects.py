@@ -13,13 +13,15 @@ import numpy as np
 
 from ..errors import InputError
 from .effect import FORM, SINCE, Asked, EffectLaw, Site
-from .effects_beam import BEAM_LAWS
+from .effects_beam import BEAM_LAWS, COVER_LAWS
 from .effects_detector import DETECTOR_LAWS
 from .effects_pixels import PIXEL_LAWS
 from .effects_unknown import UNKNOWN_LAWS
 from .line import Planted
 
-EFFECTS: Mapping[str, EffectLaw] = {law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS, *UNKNOWN_LAWS, *PIXEL_LAWS)}
+EFFECTS: Mapping[str, EffectLaw] = {
+    law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS, *UNKNOWN_LAWS, *PIXEL_LAWS, *COVER_LAWS)
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

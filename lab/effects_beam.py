@@ -142,6 +142,45 @@ def _field_coordinates(system: LabSystem) -> tuple[Array, Array]:
     return result[0], result[1]
 
 
+# --- something in the way ----------------------------------------------------------------------------------------------
+
+_FOIL = "Al"
+
+
+def _grey_absorber(request: Asked, site: Site) -> Planted:
+    """A foil, or a mesh of wires, that hides the beam from a bent border on; its penumbra is a straight ramp."""
+    rng, taken = site.rng, request.strength / 100.0
+    degrees = float(rng.uniform(0.0, 360.0))
+    border, bend = float(rng.uniform(-0.15, 0.3)), float(rng.uniform(-0.15, 0.15))
+    ramp = float(np.exp(rng.uniform(math.log(0.02), math.log(0.15))))
+    foil = bool(rng.random() < 0.5)
+    angle = math.radians(degrees)
+    # so thick that 45 keV lose the share
+    thick_mm = -math.log1p(-taken) / float(mu_per_mm(_FOIL, np.array([45.0]))[0])
+
+    def hidden(exposure: Exposure) -> Array:
+        y, x = _field_coordinates(exposure.system)
+        if round(exposure.panel_rotation_deg) % 360 == 180:
+            y, x = -y, -x
+        along = y[:, None] * math.cos(angle) + x[None, :] * math.sin(angle)
+        beside = x[None, :] * math.cos(angle) - y[:, None] * math.sin(angle)
+        return np.asarray(np.clip((along + bend * beside**2 - border) / ramp + 0.5, 0.0, 1.0))
+
+    def shade(rates: FineRates, exposure: Exposure) -> FineRates:
+        left = (1.0 - taken * hidden(exposure)).astype(np.float32)
+        return rates_of_map(rates.spelled_out() * left[:, :, None], rates)
+
+    def sheet(exposure: Exposure) -> dict[str, FineMap]:
+        return {_FOIL: (thick_mm * hidden(exposure)).astype(np.float32)}
+
+    return _told(
+        request,
+        "an aluminium foil with a wedged rim" if foil else "a mesh of opaque wires",
+        {"direction_deg": degrees, "border": border, "bend": bend, "ramp": ramp, "foil": foil},
+        **({"layers": sheet} if foil else {"rates": shade}),
+    )
+
+
 # --- source, motion, position -----------------------------------------------------------------------------------------
 
 
@@ -356,4 +395,8 @@ BEAM_LAWS: tuple[EffectLaw, ...] = (
     _law("heel", "a beam that the anode dims on one side", "%", (1.0, 20.0), _heel, since="calibration"),
     _law("output_drift", "an output that drifts", "%", (0.1, 3.0), _output_drift),
 )
-BEAM_UNITS = {law.id: law.unit for law in BEAM_LAWS}
+# further ones come last in the registry: the random numbers of those before stay theirs
+COVER_LAWS: tuple[EffectLaw, ...] = (
+    _law("grey_absorber", "something in a part of the beam", "%", (0.5, 60.0), _grey_absorber, since="calibration"),
+)
+BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *COVER_LAWS)}

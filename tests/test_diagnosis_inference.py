@@ -517,7 +517,7 @@ def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
     np.testing.assert_allclose(same.at(1.0), known.rows)
 
 
-def test_reach_is_sought_before_shape_and_the_stronger_of_a_leading_pair_alone_as_well():
+def test_reach_is_sought_before_shape_and_effects_of_a_leading_pair_alone_as_well():
     reach, shape, angle = (SimpleNamespace(name=name) for name in ("length_mm", "order", "direction_deg"))
     assert _in_turn([reach, shape]) == [[reach], [reach, shape]]
     assert _in_turn([reach, angle]) == [[reach, angle]]
@@ -538,7 +538,14 @@ def test_reach_is_sought_before_shape_and_the_stronger_of_a_leading_pair_alone_a
 
     pair, alone, other = explanation(weak=1.0, strong=9.0), explanation(strong=8.0), explanation(weak=2.0)
     wins = replace(pair, log_evidence=12.0)
-    assert asked(wins, alone, other) == [("strong", None), ("strong", ("weak", 1.0)), ("weak", ("strong", 9.0))]
+    beside = [("strong", ("weak", 1.0)), ("weak", ("strong", 9.0))]
+    assert asked(wins, alone) == [("strong", None), *beside]
+    # the other one is asked alone where alone it comes near: beside the stronger it went where the two together want it
+    assert asked(wins, alone, other) == [("strong", None), *beside, ("weak", None)]
+    assert asked(replace(wins, log_evidence=120.0), replace(alone, log_evidence=110.0), other) == [
+        ("strong", None),
+        *beside,
+    ]
     # behind a single effect, what led alone is not asked once more beside the other
     assert asked(alone, replace(pair, log_evidence=9.0), other) == [
         ("strong", None),

@@ -282,6 +282,7 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         "excess_noise",
         "bad_pixels",
         "mtf_tail",
+        "grey_absorber",
     }
     for name, effect in EFFECTS.items():
         if "flat" not in effect.shows.series:

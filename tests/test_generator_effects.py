@@ -63,6 +63,7 @@ CATALOGUE = {
     "crosstalk": ("%", 3, 40),
     "tile_gain": ("%", 0.1, 3),
     "line_flicker": ("%", 0.03, 1),
+    "grey_absorber": ("%", 0.5, 60),
 }
 CACHE = ModelCache()
 
@@ -134,7 +135,14 @@ def numbers(found):
         found.quantum_variance_DN2 / 100,
         found.white_variance_DN2 / 100,
         found.noise_autocovariance,
-        np.array([found.row_variance_DN2, found.column_variance_DN2, found.bad_pixel_share, found.fixed_pattern_rms]),
+        np.array(
+            [
+                found.row_variance_DN2,
+                found.column_variance_DN2,
+                found.bad_pixel_share,
+                0.0 if found.gain_pattern is None else found.gain_pattern.rms,
+            ]
+        ),
         np.array([0.0 if found.tile_pattern is None else found.tile_pattern.rms]),
         np.zeros(3)
         if found.flicker is None
@@ -228,7 +236,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         assert abs(share - expected.bad_pixel_share) < 4 * math.sqrt(8 * expected.bad_pixel_share / good.size)
     if name == "gain_map_error":
         pattern = residual.mean(axis=0) / expected.signal_DN
-        assert pattern.std() == pytest.approx(expected.fixed_pattern_rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
+        assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
         residual = residual - residual.mean(axis=0)
     if name == "tile_gain":
         gains = (residual.mean(axis=0) / expected.signal_DN)[:32, :32].reshape(2, 16, 2, 16).mean(axis=(1, 3))
@@ -1162,6 +1170,39 @@ def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise
     np.testing.assert_array_equal(
         numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
     )
+
+
+@pytest.mark.parametrize(("strength", "sheet"), [(5.0, 0.0), (5.0, 1.0), (60.0, 1.0), (40.0, 0.5)])
+@pytest.mark.parametrize("setting", [SOFT, MEASURED])
+def test_behind_an_absorber_passes_what_beer_lambert_says_energy_by_energy(series_line, strength, sheet, setting):
+    asked = request("object", setting=setting, thickness_mm={"Al": np.full(SHAPE, 4.0)})
+    effect = applied("grey_absorber", strength, border=0.0, penumbra=0.03, direction_deg=90.0, sheet_share=sheet)
+    found = expect(series_line, asked, effect).signal_DN / expect(series_line, asked).signal_DN
+    kV = 40.0 if setting is SOFT else 90.0
+    model = spectral_model_of(series_line)
+    weights = model.moment_weights(series_line.spectral.best, OpenBeam(kV=kV, filters=filters_from_text("Cu:0.05")))[0]
+    energies, mu = model.energies_keV[: weights.size], model.mu("Al")[: weights.size]
+    # so much aluminium takes its share of 45 keV photons; a mesh takes the same of all
+    tau = -math.log(1.0 - strength / 100.0)
+    thick_mm = tau * sheet / np.interp(45.0, energies, mu)
+    behind = np.exp(-4.0 * mu)
+    known = (
+        np.sum(weights * behind * np.exp(-thick_mm * mu)) / np.sum(weights * behind) * math.exp(-tau * (1.0 - sheet))
+    )
+    # three sheets stand for all, and the border's penumbra for its blur
+    assert found[:, :12] == pytest.approx(1.0, abs=2e-4)
+    assert found[:, 28:] == pytest.approx(known, rel=2e-3)
+    assert found[5, 19] > found[5, 20] > known
+
+
+def test_an_absorber_that_was_always_there_is_in_the_flat_until_the_panel_turns(series_line):
+    effect = applied("grey_absorber", 10.0, since="always", sheet_share=1.0)
+    np.testing.assert_array_equal(
+        numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
+    )
+    turned = request(panel_rotation_deg=180.0)
+    ratio = expect(series_line, turned, effect).signal_DN / expect(series_line, turned).signal_DN
+    assert ratio[:, 0].mean() < 0.95 and ratio[:, -1].mean() > 1.05
 
 
 def test_a_share_of_an_output_s_drift_may_be_new_in_every_exposure(series_line):

@@ -9,6 +9,7 @@ import pytest
 from raytwin.acquisition.setting import Filter
 from raytwin.errors import InputError
 from raytwin.lab import EFFECTS, EffectRequest, compute_level, detector_maps, request_from_text
+from raytwin.lab.attenuation import mu_per_mm
 from raytwin.lab.chain import SUBPIXELS, FrameContext
 from raytwin.lab.effect import Site
 from raytwin.lab.effects import plant
@@ -131,6 +132,30 @@ def test_heel_changes_the_open_beam_across_the_field_by_its_strength_and_turns_w
     behind = expected_keV(line, setting_of(line, kV, filtered=True))
     along = behind[:, middle] if abs(math.cos(math.radians(degrees))) > 0.7 else behind[middle, :]
     assert abs(along[0] - along[-1]) / along[middle] < 0.058
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 5])
+def test_an_absorber_takes_its_share_of_45_keV_on_one_side_and_turns_with_the_panel(seed):
+    system = system_on("coarse")
+    effect = planted("grey_absorber=20", seed=seed)
+    line, bare = line_with("grey_absorber=20", seed=seed, system=system), line_with(None, system=system)
+    ratios = {}
+    for kV in (40.0, 90.0):
+        setting = setting_of(line, kV)
+        ratios[kV] = expected_keV(line, setting) / expected_keV(bare, setting)
+        turned = expected_keV(line, setting, rotation=180.0) / expected_keV(bare, setting)
+        assert turned == pytest.approx(ratios[kV][::-1, ::-1], rel=1e-3)
+        assert ratios[kV].max() == pytest.approx(1.0, abs=1e-3)
+    if not effect.parameters["foil"]:
+        assert [ratios[kV].min() for kV in ratios] == pytest.approx([0.80, 0.80], abs=1e-3)
+        return
+    # the aluminium behind which a fifth of 45 keV photons is missing, as a filter of the whole beam
+    thick_mm = -math.log(0.80) / float(mu_per_mm("Al", np.array([45.0]))[0])
+    behind = (*COPPER, Filter(material="Al", thickness_mm=thick_mm))
+    for kV, ratio in ratios.items():
+        known, whole = (compute_level(system, kV=kV, filters=one).energy_keV_per_mAs for one in (behind, COPPER))
+        assert ratio.min() == pytest.approx(known / whole, rel=2e-3)
+    assert ratios[40.0].min() < ratios[90.0].min() - 0.02
 
 
 def test_output_drift_has_its_rms_over_the_frames_of_the_session():

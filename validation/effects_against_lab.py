@@ -151,7 +151,9 @@ def residuals(seen: Measured, known: ExpectedSeries, good: NDArray[np.bool_]) ->
         own = float(np.median(variance[good] / known.signal_DN[good] ** 2)) / count
         spread = 1.4826 * float(np.median(np.abs(relative - np.median(relative))))
         pattern = math.sqrt(max(spread**2 - own, 0.0))
-        found.append(np.array([(pattern - known.fixed_pattern_rms) / math.hypot(0.3 * math.sqrt(own), 2e-4)]))
+        found.append(
+            np.array([(pattern - getattr(known.gain_pattern, "rms", 0.0)) / math.hypot(0.3 * math.sqrt(own), 2e-4)])
+        )
         far = float(np.mean(np.abs(relative - np.median(relative)) > 8.0 * max(spread, 0.004)))
         share = known.bad_pixel_share
         found.append(np.array([(far - share) / (0.3 * share + 1.0 / good.sum())]))

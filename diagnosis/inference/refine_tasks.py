@@ -44,7 +44,11 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
         more = max(moves, key=lambda effect: moves[effect])
         if number == 0 and len(at) > 1:
             result.append(Task(more, at[more], leads=True))
-        known = {task.effect for task in result if task.beside or len(at) == 1 or (number > 0 and task.effect == more)}
+        if len(at) == 1:
+            # beside another it went where the two together want it
+            known = {task.effect for task in result if task.beside is None}
+        else:
+            known = {task.effect for task in result if task.beside or (number > 0 and task.effect == more)}
         for effect in hypothesis.effects:
             if effect not in known and len({task.effect for task in result} | {effect}) <= _MOST_EFFECTS:
                 beside = next((one for name, one in at.items() if name != effect), None)

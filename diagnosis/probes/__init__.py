@@ -6,7 +6,9 @@ Files:
     frame_scalars       noise, times and patterns of measured frames
     model_scalars       the same by the forward model
     line_scalars        what noise of rows and columns adds to scalars
+    line_scalars        what noise of lines adds to them
     scalar_context      pixels, times and numbers that both refer to
+    line_scalars        what noise of rows and columns adds to them
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     registration        displacement of a scene against its thickness maps
     moving_picture      noise that a fading picture seems to add

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
-from ...generator.line.line_state import TilePattern
+from ...generator.line.line_state import FixedPattern, TilePattern
 from ..session.even_maps import mean_over
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2
 from .noise_correlation import autocovariance, correlation_sum
@@ -46,6 +46,9 @@ class Pattern:
             None if one is None else factor * one for one in (self.blocks_DN2, self.rows_DN2, self.columns_DN2)
         )
         return Pattern(pixel_DN2=factor * self.pixel_DN2, blocks_DN2=blocks, rows_DN2=rows, columns_DN2=columns)
+
+
+NO_PATTERN = Pattern(pixel_DN2=0.0, blocks_DN2=0.0, rows_DN2=0.0, columns_DN2=0.0)
 
 
 def pattern_noise(
@@ -85,6 +88,28 @@ def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> flo
     next_to = two - one
     two_apart = 1.5 * (three - one) - 2.0 * next_to
     return one - (4.0 * next_to - two_apart) / 3.0
+
+
+@lru_cache(maxsize=64)
+def shares_of_pixels(shape: tuple[int, int], correlation_px: float) -> Pattern:
+    """What pixels' gains of variance 1 DN^2, alike over so many pixels, add to the variances of a `Pattern` over a panel."""
+    field = FixedPattern(rms=1.0, seed=0, correlation_px=correlation_px)
+
+    def of_means(length: int, apart: int = 0) -> float:
+        """Covariance of means over so many pixels in line, which begin so far apart."""
+        lag = np.arange(1.0 - length, length)
+        return float(np.sum((length - np.abs(lag)) * field.correlation(lag + apart))) / length**2
+
+    one, two = field.correlation(1.0), field.correlation(2.0)
+    bent = float(6.0 - 8.0 * one + 2.0 * two) / 6.0
+    of_rows, of_columns = (bent * of_means(length) for length in (shape[1], shape[0]))
+    block = of_means(BLOCK_PX)
+    return Pattern(
+        pixel_DN2=float(1.0 - one),
+        blocks_DN2=block * (block - of_means(BLOCK_PX, BLOCK_PX)),
+        rows_DN2=of_rows,
+        columns_DN2=of_columns,
+    )
 
 
 @lru_cache(maxsize=64)

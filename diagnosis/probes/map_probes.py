@@ -106,6 +106,21 @@ class MapProjection:
         variance = np.asarray(sd_DN, dtype=np.float32).ravel() ** 2
         return np.array([np.square(row) @ variance for row in self._rows], dtype=np.float64)
 
+    def field_noise(self, sd_DN: NDArray[np.floating], side_px: float) -> NDArray[np.float64]:
+        """The same of noise that is alike over an area of side_px x side_px pixels: that of squares of about this side."""
+        side = max(round(side_px), 1)
+        if side == 1:
+            return self.pixel_noise(sd_DN)
+        over = side_px**2 / side**2
+        sd = np.asarray(sd_DN, dtype=np.float32)
+        result = np.empty(len(self))
+        for number, row in enumerate(self._rows):
+            squares = row.reshape(self._shape) * sd
+            for axis, length in enumerate(self._shape):
+                squares = np.add.reduceat(squares, np.arange(0, length, side), axis=axis)
+            result[number] = over * float(np.sum(squares.astype(np.float64) ** 2))
+        return result
+
     def line_noise(self) -> NDArray[np.float64]:
         """Variance (2, probe) that noise of 1 DN, common to each row and then common to each column, gives the projections."""
         pixels = self._rows.reshape(len(self), *self._shape)

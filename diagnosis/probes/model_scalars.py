@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...generator.frames.series import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
-from .fixed_pattern import Pattern, shares_of_tiles
+from .fixed_pattern import NO_PATTERN, shares_of_pixels, shares_of_tiles
 from .line_scalars import LineNoise, bent_share
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
@@ -115,10 +115,13 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
         bent = expected.flicker.rms**2 * signal2 * bent_share(expected.flicker)
         row += (1.0 - expected.flicker.column_share) * bent
         column += expected.flicker.column_share * bent
-    pattern = PATTERN_PIXEL_SHARE * expected.fixed_pattern_rms**2 * signal2
-    tiles = Pattern(pixel_DN2=0.0, blocks_DN2=0.0, rows_DN2=0.0, columns_DN2=0.0)
+    changed = [NO_PATTERN]
+    if expected.gain_pattern is not None:
+        pixels = shares_of_pixels((rows, columns), expected.gain_pattern.correlation_px)
+        changed.append(pixels.times(PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2))
     if expected.tile_pattern is not None:
-        tiles = shares_of_tiles((rows, columns), expected.tile_pattern).times(expected.tile_pattern.rms**2 * signal2)
+        tiles = shares_of_tiles((rows, columns), expected.tile_pattern)
+        changed.append(tiles.times(expected.tile_pattern.rms**2 * signal2))
     # more quanta's noise in the frames is more of it in their mean
     mean_q, _ = context.areas.means(expected.quantum_variance_DN2)
     added = (mean_q - context.quantum_DN2) / context.frames
@@ -126,18 +129,22 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
     noise = context.pattern_noise
     values["fixed_pattern"] = math.sqrt(
-        max(1.0 + (pattern + tiles.pixel_DN2 + added * neighbours) / noise.pixel_DN2, 1e-3)
+        max(1.0 + (sum(one.pixel_DN2 for one in changed) + added * neighbours) / noise.pixel_DN2, 1e-3)
     )
     if noise.blocks_DN2 is not None:
-        of_blocks = ((pattern + lasting) / BLOCK_PX**2 + (tiles.blocks_DN2 or 0.0)) / noise.blocks_DN2
+        of_blocks = (sum(one.blocks_DN2 or 0.0 for one in changed) + lasting / BLOCK_PX**2) / noise.blocks_DN2
         values["fixed_pattern blocks"] = math.sqrt(max(1.0 + of_blocks, 1e-3))
     if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
-        # a pattern is no more alike along a line than across it; lines that change leave their mean
-        for name, noise_DN2, line, seams, length in (
-            (FIXED_ROWS, noise.rows_DN2, row, tiles.rows_DN2 or 0.0, columns),
-            (FIXED_COLUMNS, noise.columns_DN2, column, tiles.columns_DN2 or 0.0, rows),
+        # lines that change leave their mean
+        of_rows, of_columns = (
+            sum(one.rows_DN2 or 0.0 for one in changed),
+            sum(one.columns_DN2 or 0.0 for one in changed),
+        )
+        for name, noise_DN2, line, fixed, length in (
+            (FIXED_ROWS, noise.rows_DN2, row, of_rows, columns),
+            (FIXED_COLUMNS, noise.columns_DN2, column, of_columns, rows),
         ):
-            of_lines = ((pattern + added) / length + seams + line / context.frames) / noise_DN2
+            of_lines = (fixed + added / length + line / context.frames) / noise_DN2
             values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share

@@ -4,7 +4,7 @@ A nuisance is a response (probe,) of one prior standard deviation, not shrunk; e
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -329,18 +329,21 @@ def offset_of_later(probes: SeriesProbes) -> NDArray[np.float64]:
 
 
 def changed_gain_pattern(
-    probes: SeriesProbes, signal: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    probes: SeriesProbes, signal: NDArray[np.float64], lengths_px: Sequence[float]
+) -> tuple[NDArray[np.float64], dict[float, NDArray[np.float64]]]:
     """What 1 % of a changed gain map does by chance: responses (probe, wave) of its smooth part, variance (probe,) of the rest.
 
-    signal: expected (row, column), DN.
+    signal: expected (row, column), DN; lengths_px: over which pixels are alike in the rest, by which it is given.
     """
     waves, item, maps = _pattern_waves(signal.shape), probes.series.session, len(probes.projection)
-    smooth, rest = np.zeros((len(probes), len(waves))), np.zeros(len(probes))
+    smooth, rest = np.zeros((len(probes), len(waves))), {length: np.zeros(len(probes)) for length in lengths_px}
     if item.calibrates or not item.request.beam_on:
         return smooth, rest
     smooth[:maps] = probes.projection.apply(waves * signal.astype(np.float32)).T
-    rest[:maps] = probes.projection.pixel_noise(0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal)
+    own = 0.01 * math.sqrt(1.0 - scales.PATTERN_SMOOTH_SHARE) * signal
+    for length, variance in rest.items():
+        # the area under exp(-d^2 / (2 length^2))
+        variance[:maps] = probes.projection.field_noise(own, max(math.sqrt(2.0 * math.pi) * length, 1.0))
     return smooth, rest
 
 

@@ -36,9 +36,10 @@ class SeriesBlock:
 
     Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
     (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
-    pattern_jitter (probe,): what 1 % of a changed gain map does by chance; lines (2, probe): variance of what 1 DN of noise common to
-    rows (to columns) does; lit_lines, alike, of 1 % of the light; uneven (2, probe), by number of change: more of it on one side of
-    the panel; tiles (probe, tile), alike: what 1 % of changed gains of its tiles does by chance.
+    pattern_jitter (probe,) by length over which pixels are alike, px: what 1 % of a changed gain map does by chance; lines (2,
+    probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the light; uneven (2,
+    probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of changed gains of its
+    tiles does by chance.
     """
 
     session: SessionSeries
@@ -50,7 +51,7 @@ class SeriesBlock:
     responses: NDArray[np.float64]
     offset: NDArray[np.float64]
     pattern: NDArray[np.float64]
-    pattern_jitter: NDArray[np.float64]
+    pattern_jitter: dict[float, NDArray[np.float64]]
     lines: NDArray[np.float64]
     lit_lines: NDArray[np.float64]
     uneven: dict[int, NDArray[np.float64]]
@@ -86,7 +87,8 @@ def series_block(
     known = [(number, found) for number, found in enumerate(moved) if found is not None]
     if known:
         responses[[number for number, _ in known]] = probes.responses([found for _, found in known])
-    pattern, jitter = changed_gain_pattern(probes, signal)
+    lengths = {_values_of(item)["correlation_px"] for item in asked if _random_of(item.change.label) == "pixels"}
+    pattern, jitter = changed_gain_pattern(probes, signal, sorted(lengths))
     by_side = uneven(
         probes,
         {number: found[0] for number, found in known if _random_of(asked[number].change.label) == "sides"},
@@ -108,7 +110,7 @@ def series_block(
         responses=responses,
         offset=offset_of_later(probes) * shrink,
         pattern=pattern * shrink[:, None],
-        pattern_jitter=jitter * shrink**2,
+        pattern_jitter={length: variance * shrink**2 for length, variance in jitter.items()},
         lines=lines,
         lit_lines=lines * (0.01 * context.reference_signal_DN if context.kind in ("flat", "object") else 0.0) ** 2,
         uneven={number: columns * shrink for number, columns in by_side.items()},
@@ -120,9 +122,14 @@ def _tiles_of(asked: Asked) -> TilePattern | None:
     """Tiles whose gains a change draws; None: it has nothing to do with tiles."""
     if _random_of(asked.change.label) != "tiles":
         return None
-    (effect,) = asked.change.effects
-    numbers = EFFECTS[effect.id].values(effect.parameters)
+    numbers = _values_of(asked)
     return TilePattern(rms=0.01, side_px=numbers["side_px"], strips_share=numbers["strips_share"], seed=0)
+
+
+def _values_of(asked: Asked) -> dict[str, float]:
+    """All parameters of the one effect that a change has."""
+    (effect,) = asked.change.effects
+    return dict(EFFECTS[effect.id].values(effect.parameters))
 
 
 def _random_of(label: str) -> str:
@@ -168,7 +175,8 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
     """
     random = EFFECTS[variant.effect].variation.random
     if random == "pixels":
-        return np.concatenate([block.pattern_jitter for block in blocks])
+        length = EFFECTS[variant.effect].values(variant.parameters)["correlation_px"]
+        return np.concatenate([block.pattern_jitter[length] for block in blocks])
     if random == "lines":
         columns = variant.parameters["column_share"]
         shares = read_noise_DN**2 * np.array([1.0 - columns, columns])

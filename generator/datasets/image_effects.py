@@ -104,7 +104,11 @@ class ImageEffects:
         left = noise_pattern(base, self._through(self._open_state(), spread, None)).share
         self.gain_factor = noise_pattern(base, self._open_state()).share / left
         self.read_variance_DN2 = self._without_absorbed(self.read_variance_DN2, spread)
-        lit = self.open_charge_DN * (open_beam.signal_DN / self.open_level_DN) * open_beam.flat_factor
+        # light spreads over the borders of what stands in the beam
+        blurred, _ = spread_maps(
+            open_beam.signal_DN, open_beam.variance_DN2, state=open_beam, pattern=self.pattern, spread=base
+        )
+        lit = self.open_charge_DN * (blurred / self.open_level_DN) * open_beam.flat_factor
         self.flat_DN = lit * (1.0 - open_beam.bend_per_DN * lit)
 
     def _usable(self) -> tuple[tuple[AppliedEffect, ...], tuple[str, ...]]:

@@ -33,6 +33,7 @@ from .excess_noise import EXCESS_NOISE
 from .filtration_error import FILTRATION_ERROR
 from .focal_spot import FOCAL_SPOT
 from .gain_map_error import GAIN_MAP_ERROR
+from .grey_absorber import GREY_ABSORBER
 from .heel import HEEL
 from .image_lag import IMAGE_LAG
 from .k_fluorescence import K_FLUORESCENCE
@@ -76,6 +77,7 @@ OURS: dict[str, Effect] = {
         CROSSTALK,
         TILE_GAIN,
         LINE_FLICKER,
+        GREY_ABSORBER,
     )
 }
 EFFECTS = Catalogue(OURS)

@@ -36,6 +36,7 @@ RANDOM = {
     "output": "level and trend of each lit series",
 }
 _ASKED_OF_RANDOM = {  # parameters
+    "pixels": ("correlation_px",),
     "lines": ("column_share",),
     "lines of light": ("column_share", "together_lines"),
     "tiles": ("side_px", "strips_share"),

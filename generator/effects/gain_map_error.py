@@ -1,13 +1,13 @@
 """Gain map error: a per-pixel gain that calibration does not know.
 
-y = x (1 + eta), eta fixed from frame to frame
+y = x (1 + eta), eta fixed from frame to frame, of pixel to pixel or alike over some pixels
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
 
 from ..line.line_state import FixedPattern, LineContext, LineState
-from .effect import EVERY_SERIES, Effect, Parameter, Reading, Shows, Variation
+from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
 
 def _change_gain(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -15,14 +15,19 @@ def _change_gain(state: LineState, parameters: Mapping[str, float], context: Lin
     if parameters["strength"] == 0 or context.since == "always":
         return state
     return replace(
-        state, gain_pattern=FixedPattern(rms=parameters["strength"] / 100.0, seed=int(parameters["pattern_seed"]))
+        state,
+        gain_pattern=FixedPattern(
+            rms=parameters["strength"] / 100.0,
+            seed=int(parameters["pattern_seed"]),
+            correlation_px=parameters["correlation_px"],
+        ),
     )
 
 
 GAIN_MAP_ERROR = Effect(
     id="gain_map_error",
     title="per-pixel gain has changed",
-    law=r"y_{ij} = x_{ij}\,(1 + \eta_{ij}),\quad \mathrm{sd}(\eta) = s\ \text{(the same in every frame)}",
+    law=r"y_{ij} = x_{ij}\,(1 + \eta_{ij}),\quad \mathrm{sd}(\eta) = s,\quad \mathrm{corr}(\eta) = e^{-d^2/(2\ell^2)}",
     parameters=(
         Parameter(
             name="strength",
@@ -33,6 +38,17 @@ GAIN_MAP_ERROR = Effect(
             source="standard deviation over the pixels; flat panels between two gain calibrations",
             log=True,
             pixel_power=1.0,  # of a pattern from pixel to pixel
+        ),
+        Parameter(
+            name="correlation_px",
+            unit="px",
+            low=0.0,
+            high=16.0,
+            default=0.0,
+            source="pixels so far apart are alike by exp(-1/2); 0: each has its own. Screens and deposits are alike over some pixels",
+            log=False,
+            fitted=False,
+            pixel_power=1.0,
         ),
         Parameter(
             name="pattern_seed",
@@ -53,6 +69,8 @@ GAIN_MAP_ERROR = Effect(
     shows=Shows(series=EVERY_SERIES, axis="position", flats=False),
     absorbed="maps",
     reading=Reading(probes=("fixed_pattern",), sd=0.12),  # they hold only what differs from pixel to pixel
+    # what it does by chance hangs on how far pixels are alike: that stays as in the grid
+    grid=Grid(variants=tuple({"correlation_px": length} for length in (0.0, 1.5, 5.0)), refined=False),
     variation=Variation(random="pixels"),
     # a gain map of 0.127 % read 0.097 beside a voltage of 4.8 %
 )

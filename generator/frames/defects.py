@@ -12,7 +12,18 @@ from ..line.line_state import FixedPattern, FloatArray, LineFlicker, LineState, 
 def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
     """Factor (row, column) of a fixed pattern of the gain, mean 1."""
     rng = np.random.default_rng([0x6A17, pattern.seed])
-    return 1.0 + pattern.rms * rng.standard_normal(shape)
+    if pattern.correlation_px <= 0.0:
+        return 1.0 + pattern.rms * rng.standard_normal(shape)
+    from scipy.ndimage import gaussian_filter
+
+    # white noise through a Gaussian of width s is alike over sqrt(2) s, and 1 / (4 pi s^2) of its variance is left
+    width, beyond = pattern.correlation_px / math.sqrt(2.0), math.ceil(4.0 * pattern.correlation_px)
+    drawn = rng.standard_normal([length + 2 * beyond for length in shape])
+    kernel = np.zeros((4 * beyond + 1, 4 * beyond + 1))
+    kernel[2 * beyond, 2 * beyond] = 1.0
+    left = float(np.sum(gaussian_filter(kernel, width) ** 2))
+    smooth = gaussian_filter(drawn, width)[beyond:-beyond, beyond:-beyond]
+    return np.asarray(1.0 + pattern.rms / math.sqrt(left) * smooth)
 
 
 def tile_gain(pattern: TilePattern, shape: tuple[int, int]) -> FloatArray:

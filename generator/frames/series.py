@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..effects import AppliedEffect, Effect, effect_of, in_order
-from ..line.line_state import FloatArray, LagLaw, LineContext, LineFlicker, LineState, TilePattern
+from ..line.line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineFlicker, LineState, TilePattern
 from ..line.rounding import rounded_variance
 from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import mean_signal_energy_keV
@@ -155,7 +155,7 @@ class ExpectedSeries:
         temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
         quantisation_step_DN: of the stored numbers, before averaging; 0: none.
         bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
-        fixed_pattern_rms: relative, of a gain pattern that no map knows.
+        gain_pattern: of the pixels' gains, that no map knows; None: none.
         tile_pattern: the same of tiles; None: there is none.
         saturated_share: share of pixels whose mean lies at the end of the ADC's range.
         frames: in the series.
@@ -177,7 +177,7 @@ class ExpectedSeries:
     quantisation_step_DN: float
     bad_pixel_share: float
     hot_pixel_share: float
-    fixed_pattern_rms: float
+    gain_pattern: FixedPattern | None
     tile_pattern: TilePattern | None
     saturated_share: float
     frames: int
@@ -796,7 +796,7 @@ def expected_series(
         quantisation_step_DN=state.step_DN,
         bad_pixel_share=state.bad_share,
         hot_pixel_share=state.bad_share * state.bad_hot_share,
-        fixed_pattern_rms=0.0 if state.gain_pattern is None or not request.beam_on else state.gain_pattern.rms,
+        gain_pattern=state.gain_pattern if request.beam_on else None,
         tile_pattern=state.tile_pattern if request.beam_on else None,
         saturated_share=saturated,
         frames=request.frames,

@@ -64,10 +64,21 @@ class LagLaw:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixedPattern:
-    """A fixed relative pattern over the pixels, white, of standard deviation `rms`, drawn from `seed`."""
+    """A fixed relative pattern over the pixels, normal, drawn from `seed`.
+
+    Fields: rms; correlation_px: pixels d apart are alike by exp(-d^2 / (2 correlation_px^2)); 0: each has its own.
+    """
 
     rms: float
     seed: int
+    correlation_px: float = 0.0
+
+    def correlation(self, apart_px: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Of pixels so far apart in line."""
+        apart = np.asarray(apart_px, dtype=np.float64)
+        if self.correlation_px <= 0.0:
+            return np.asarray(apart == 0.0, dtype=np.float64)
+        return np.asarray(np.exp(-0.5 * (apart / self.correlation_px) ** 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

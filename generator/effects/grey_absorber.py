@@ -1,0 +1,143 @@
+"""Part of the beam behind an absorber that nobody declared: a foil, a mesh, a collimator that has moved.
+
+Behind it N(E) -> N(E) exp(-tau ((1 - h) + h mu_Al(E) / mu_Al(45 keV))), tau = -ln(1 - s): grey (h = 0) or a sheet of aluminium
+(h = 1). A straight border, its penumbra a Gaussian's integral.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ...errors import InputError
+from ..line.line_state import FloatArray, LineContext, LineState
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
+
+_STATED_KEV = 45.0  # of the strength: mean energy of beams between 60 and 90 kV
+_SHEET = "Al"
+_DEPTHS = (
+    0.05,
+    0.35,
+    1.0,
+)  # of sheets that are projected, ln(1 / passed) at the stated energy; between them slopes are quadratic
+_MOST = 0.999
+
+
+def _coverage(context: LineContext, parameters: Mapping[str, float], rotation_deg: float) -> FloatArray:
+    """Share of the pixel's beam that is behind the absorber (row, column), 0 to 1."""
+    from scipy.special import ndtr
+
+    angle = math.radians(parameters["direction_deg"] - rotation_deg)
+    row, column = ((np.arange(side) - 0.5 * (side - 1)) / max(side - 1, 1) for side in context.shape)
+    across = row[:, None] * math.cos(angle) + column[None, :] * math.sin(angle)
+    return np.asarray(ndtr((across - parameters["border"]) / parameters["penumbra"]), dtype=np.float64)
+
+
+def _lagrange(depth: float) -> FloatArray:
+    """Weights (sheet,) of the sheets' slopes at a depth."""
+    nodes = np.array(_DEPTHS)
+    weights = [np.prod((depth - np.delete(nodes, k)) / (nodes[k] - np.delete(nodes, k))) for k in range(nodes.size)]
+    return np.array(weights, dtype=np.float64)
+
+
+def _cover(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
+    request, model = context.request, context.model
+    absorbed = context.since == "always"
+    if parameters["strength"] == 0 or (absorbed and not context.has_scene and request.panel_rotation_deg == 0):
+        return state
+    if model is None or context.project is None or context.weights is None or context.energies_keV is None:
+        raise InputError("effect grey_absorber", received="a twin without spectral part", expected="a twin with one")
+    energies = context.energies_keV
+    mu = model.mu(_SHEET)[: energies.size]
+    relative = mu / float(np.interp(_STATED_KEV, energies, mu))
+    # the same sheets at every strength, so that scenes are projected once
+    sheets = np.exp(-np.outer((0.0, *_DEPTHS), relative))
+    rows = (context.weights[:2, None, :] * sheets).reshape(-1, energies.size)
+    depth = -math.log1p(-min(parameters["strength"] / 100.0, _MOST))
+
+    def passed(sums: FloatArray) -> FloatArray:
+        """Share that passes (2, row, column) of signal and variance, from sums behind each sheet."""
+        behind = np.maximum(sums.reshape(2, 1 + len(_DEPTHS), *sums.shape[1:]), 1e-300)
+        slopes = -np.log(behind[:, 1:] / behind[:, :1]) / np.reshape(_DEPTHS, (1, -1, *[1] * (sums.ndim - 1)))
+        thick = parameters["sheet_share"] * depth
+        slope = np.tensordot(slopes, _lagrange(thick), axes=(1, 0))
+        return np.asarray(np.exp(-(1.0 - parameters["sheet_share"]) * depth - thick * slope))
+
+    covered = _coverage(context, parameters, request.panel_rotation_deg)
+    signal, variance = 1.0 - covered * (1.0 - passed(context.project("grey_absorber", rows)))
+    if absorbed:
+        # the calibrated flat holds it as it is in the open beam of the unturned panel
+        known = _coverage(context, parameters, 0.0)
+        open_beam = passed(rows.sum(axis=1)[:, None, None])
+        signal, variance = (
+            now / (1.0 - known * (1.0 - one)) for now, one in zip((signal, variance), open_beam, strict=True)
+        )
+    return replace(state, signal_DN=state.signal_DN * signal, variance_DN2=state.variance_DN2 * variance)
+
+
+GREY_ABSORBER = Effect(
+    id="grey_absorber",
+    title="part of the beam behind an absorber that nobody declared",
+    law=r"N(E) \to N(E)\,\bigl(1 - c(u)\,(1 - e^{-\tau\,(1 - h + h\,\mu_\mathrm{Al}(E)/\mu_\mathrm{Al}(45\,\mathrm{keV}))})\bigr),"
+    r"\quad s = 1 - e^{-\tau}",
+    parameters=(
+        Parameter(
+            name="strength",
+            unit="%",
+            low=0.5,
+            high=60.0,
+            default=5.0,
+            source="share of the light that it takes at 45 keV: tape or foil 0.5-5 %, a sheet or mesh up to 60 %",
+            log=False,
+        ),
+        Parameter(
+            name="direction_deg",
+            unit="deg",
+            low=0.0,
+            high=360.0,
+            default=30.0,
+            source="from the open to the covered side: 0 along rising row index, 90 along rising column index",
+            log=False,
+        ),
+        Parameter(
+            name="border",
+            unit="",
+            low=-0.45,
+            high=0.45,
+            default=0.15,
+            source="where the border crosses that direction, in widths of the field from its middle",
+            log=False,
+        ),
+        Parameter(
+            name="penumbra",
+            unit="",
+            low=0.004,
+            high=0.15,
+            default=0.03,
+            source="standard deviation of the border's blur, in widths of the field: focal spot times the enlargement of the border",
+            log=True,
+        ),
+        Parameter(
+            name="sheet_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="0: grey, as a mesh of wires; 1: as a sheet of aluminium",
+            log=False,
+        ),
+    ),
+    stage="arrivals",
+    reference="Beer-Lambert law behind a sheet; a mesh of opaque wires takes the same share at every energy",
+    after_calibration=True,
+    change=_cover,
+    needs=("spectral",),
+    isolated_by="flats with the absorber's side of the beam uncovered, and with the panel turned by 180 degrees",
+    shows=Shows(series=LIT_SERIES, axis="position"),
+    absorbed="maps of beams",
+    grid=Grid(
+        shares=(0.5,),
+        variants=tuple({"direction_deg": angle, "sheet_share": 0.5} for angle in (0.0, 90.0, 180.0, 270.0)),
+    ),
+)

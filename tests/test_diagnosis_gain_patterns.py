@@ -1,0 +1,74 @@
+"""Patterns of the gain: what they leave in a mean frame and in projections, against panels on which they are drawn one by one."""
+
+import numpy as np
+import pytest
+
+from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics, shares_of_pixels, shares_of_tiles
+from raytwin.diagnosis.probes.map_probes import MapProjection, Template
+from raytwin.generator.frames.defects import gain_pattern, tile_gain
+from raytwin.generator.line.line_state import FixedPattern, TilePattern
+
+SHAPE = (96, 128)
+GOOD = np.ones(SHAPE, dtype=bool)
+SIGNAL = np.full(SHAPE, 1000.0)
+
+
+def of_pattern(pattern):
+    return np.array([pattern.pixel_DN2, pattern.blocks_DN2, pattern.rows_DN2, pattern.columns_DN2])
+
+
+def mean_of_drawn(factor_of_seed, count=300):
+    """Mean statistics of so many panels with a pattern of 1 % rms."""
+    found = [
+        of_pattern(pattern_statistics(SIGNAL * (factor_of_seed(seed) - 1.0), SIGNAL, clean=GOOD, good=GOOD))
+        for seed in range(count)
+    ]
+    return np.mean(found, axis=0)
+
+
+@pytest.mark.parametrize(("side_px", "strips_share"), [(32.0, 0.0), (32.0, 1.0), (21.0, 0.5)])
+def test_what_tiles_leave_in_a_pattern_is_the_mean_over_panels_with_drawn_gains(side_px, strips_share):
+    def tiles(seed):
+        return TilePattern(rms=0.01, side_px=side_px, strips_share=strips_share, seed=seed)
+
+    known = of_pattern(shares_of_tiles(SHAPE, tiles(0)).times(10.0**2))
+    # the smooth surface that is taken off first leaves a little of itself between the blocks
+    np.testing.assert_allclose(mean_of_drawn(lambda seed: tile_gain(tiles(seed), SHAPE)), known, rtol=0.08, atol=1e-3)
+
+
+@pytest.mark.parametrize("correlation_px", [0.0, 1.5, 5.0])
+def test_what_pixels_that_are_alike_leave_is_the_mean_over_panels_with_drawn_gains(correlation_px):
+    def drawn(seed):
+        return gain_pattern(FixedPattern(rms=0.01, seed=seed, correlation_px=correlation_px), SHAPE)
+
+    known = of_pattern(shares_of_pixels(SHAPE, correlation_px).times(10.0**2))
+    np.testing.assert_allclose(mean_of_drawn(drawn), known, rtol=0.12, atol=2e-3)
+    panels = np.stack([drawn(seed) for seed in range(60)]) - 1.0
+    assert panels.std() == pytest.approx(0.01, rel=0.03)
+
+
+@pytest.mark.parametrize("correlation_px", [0.0, 1.5, 5.0])
+def test_projections_vary_by_as_much_as_over_drawn_panels(correlation_px):
+    rng = np.random.default_rng(1)
+    along = np.linspace(-1.0, 1.0, SHAPE[1])[None, :] * np.ones(SHAPE)
+    edge = np.exp(-0.5 * ((np.arange(SHAPE[1]) - 60.0) / 2.0) ** 2)[None, :] * np.ones(SHAPE)
+    disc = (np.hypot(*np.meshgrid(np.arange(SHAPE[1]) - 40, np.arange(SHAPE[0]) - 50)) < 15).astype(float)
+    images = {"level": np.ones(SHAPE), "along": along, "edge": edge, "disc": disc, "pixels": rng.standard_normal(SHAPE)}
+    projection = MapProjection(
+        [Template(axis="position", name=name, unit="DN", image=image) for name, image in images.items()],
+        mask=GOOD,
+        quantum_DN2=np.zeros(SHAPE),
+        white_DN2=np.ones(SHAPE),
+        autocovariance_table=np.eye(1),
+    )
+    known = projection.field_noise(0.01 * SIGNAL, max(np.sqrt(2.0 * np.pi) * correlation_px, 1.0))
+    drawn = np.stack(
+        [
+            gain_pattern(FixedPattern(rms=0.01, seed=seed, correlation_px=correlation_px), SHAPE) - 1.0
+            for seed in range(400)
+        ]
+    )
+    seen = projection.apply(drawn * SIGNAL).var(axis=0)
+    # squares stand for areas that fade out: what is as narrow as they are varies by another factor
+    for name, one, other in zip(images, known, seen, strict=True):
+        assert one == pytest.approx(other, rel=0.35 if name in ("level", "along", "disc") else 1.5), name

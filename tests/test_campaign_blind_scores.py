@@ -47,9 +47,9 @@ from raytwin.campaign.blind_statistics import (
     session_statistics,
     write_statistics,
 )
-from raytwin.diagnosis.inference.inference.observed import Point
+from raytwin.diagnosis.inference.observed import Point
 from raytwin.diagnosis.model.curves import Curve
-from raytwin.diagnosis.problem.problem.problem import Problem
+from raytwin.diagnosis.problem.problem import Problem
 from raytwin.generator.effects import EFFECTS
 
 

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference.inference.inference import UNKNOWN, Hypothesis
-from raytwin.diagnosis.judgement.judgement.held_out import folds_of, held_out
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
+from raytwin.diagnosis.judgement.held_out import folds_of, held_out
 from raytwin.diagnosis.model.curves import Curve
-from raytwin.diagnosis.problem.problem.problem import Problem
+from raytwin.diagnosis.problem.problem import Problem
 
 
 class Bare(SimpleNamespace):

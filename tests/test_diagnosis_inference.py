@@ -6,23 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
-from raytwin.diagnosis.inference.inference.discrepancy import LEVELS, group_factors
-from raytwin.diagnosis.inference.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
-from raytwin.diagnosis.inference.inference.local_nuisances import LocalNuisances, local_columns
-from raytwin.diagnosis.inference.inference.nuisances import Nuisances
-from raytwin.diagnosis.inference.inference.observed import Observed, Point
-from raytwin.diagnosis.inference.inference.pairs import Single, weigh_pairs
-from raytwin.diagnosis.inference.inference.refine_tasks import tasks_of
-from raytwin.diagnosis.inference.inference.search import _in_turn, _Slopes, searched
-from raytwin.diagnosis.inference.inference.seen import Blocks, Seen
-from raytwin.diagnosis.inference.inference.unknown import CHANCE, beyond
-from raytwin.diagnosis.inference.inference.whitening import Whitening
-from raytwin.diagnosis.judgement.judgement.judgement import _beyond_plausible, _strained
-from raytwin.diagnosis.judgement.judgement.strengths import _outright
+from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
+from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
+from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
+from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.observed import Observed, Point
+from raytwin.diagnosis.inference.pairs import Single, weigh_pairs
+from raytwin.diagnosis.inference.refine_tasks import tasks_of
+from raytwin.diagnosis.inference.search import _in_turn, _Slopes, searched
+from raytwin.diagnosis.inference.seen import Blocks, Seen
+from raytwin.diagnosis.inference.unknown import CHANCE, beyond
+from raytwin.diagnosis.inference.whitening import Whitening
+from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
+from raytwin.diagnosis.judgement.strengths import _outright
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
-from raytwin.diagnosis.problem.problem.problem import Problem
+from raytwin.diagnosis.problem.problem import Problem
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from raytwin.cli import main
-from raytwin.diagnosis.inference.inference.curve_fits import fit_effects
-from raytwin.diagnosis.inference.inference.discrepancy import FARTHEST_LEVEL, LEVELS
-from raytwin.diagnosis.inference.inference.inference import Hypothesis, weigh_hypotheses
-from raytwin.diagnosis.inference.inference.nuisances import Nuisances
-from raytwin.diagnosis.inference.inference.observed import Observed, Point
-from raytwin.diagnosis.judgement.judgement.judgement import Verdict, _of_another_strength
+from raytwin.diagnosis.inference.curve_fits import fit_effects
+from raytwin.diagnosis.inference.discrepancy import FARTHEST_LEVEL, LEVELS
+from raytwin.diagnosis.inference.inference import Hypothesis, weigh_hypotheses
+from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.observed import Observed, Point
+from raytwin.diagnosis.judgement.judgement import Verdict, _of_another_strength
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.model.forward_model import ForwardModel
-from raytwin.diagnosis.problem.problem.known_effects import lasting, with_found
-from raytwin.diagnosis.problem.problem.problem import Problem
+from raytwin.diagnosis.problem.known_effects import lasting, with_found
+from raytwin.diagnosis.problem.problem import Problem
 from raytwin.generator.effects import AppliedEffect
 
 PROBES = 400

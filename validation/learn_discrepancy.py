@@ -23,12 +23,12 @@ import second_simulator as plain
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.inference.inference.curve_fits import CurveFit
-from raytwin.diagnosis.inference.inference.discrepancy import LEVELS
-from raytwin.diagnosis.inference.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
-from raytwin.diagnosis.inference.inference.observed import Observed
-from raytwin.diagnosis.inference.inference.unknown import LOG_DENSITY, beyond
-from raytwin.diagnosis.judgement.judgement.judgement import Weighed, verdict_of, weigh_problem
+from raytwin.diagnosis.inference.curve_fits import CurveFit
+from raytwin.diagnosis.inference.discrepancy import LEVELS
+from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
+from raytwin.diagnosis.inference.observed import Observed
+from raytwin.diagnosis.inference.unknown import LOG_DENSITY, beyond
+from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
 
 _ROUNDS = 300

@@ -16,7 +16,7 @@ from raytwin.generator.frames.present_line import present_line
 from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.generator.predictions.predict_many import predict_levels
-from raytwin.generator.twins.twin_io import write_twin
+from raytwin.generator.twins.twin_io import read_twin, write_twin
 
 MEASURED = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
 UNMEASURED = setting_from_text("kv=60,power_w=45,exposure_ms=50,filter=Cu:0.1")
@@ -90,6 +90,19 @@ def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long
     assert found.mean_DN.value / plain.mean_DN.value == pytest.approx(level, rel=1e-4)
     assert found.sd_DN.value / plain.sd_DN.value == pytest.approx(noise(with_it) / noise(without), rel=2e-3)
     assert found.mean_DN.low < found.mean_DN.value < found.mean_DN.high
+
+
+def test_what_is_not_known_of_an_effect_widens_what_it_changes(series_line, tmp_path):
+    plain = with_effect(series_line, "excess_noise", strength=50.0)
+    doubtful = replace(plain, effects=(replace(plain.effects[0], strength_sd=0.3, law_sd=0.4),))
+    write_twin(tmp_path / "twin.h5", doubtful)
+    known, wide = (predict_flatfield(twin, UNMEASURED) for twin in (plain, read_twin(tmp_path / "twin.h5")))
+    assert wide.mean_DN == known.mean_DN  # the noise alone is changed
+    assert wide.gain_DN.value == known.gain_DN.value
+    # half of the gain's change, which is a half of the gain: 0.5 / 1.5 of it
+    half = 1.96 * 0.5 * (0.5 / 1.5) * 1.5 * known.gain_DN.value
+    expected = math.hypot(known.gain_DN.high - known.gain_DN.value, half)
+    assert wide.gain_DN.high - wide.gain_DN.value == pytest.approx(expected, rel=1e-3)
 
 
 def test_before_calibration_only_effects_that_were_always_there_are_predicted(series_line):

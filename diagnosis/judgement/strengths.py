@@ -36,9 +36,14 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
     A drifting output's fit knows how much it does by chance, not how much it did: it gets the strength that was read.
     """
     strength = hypothesis.strengths[effect][0]
+    value, low, high = strength_of(problem, hypothesis, effect)
     if EFFECTS[effect].reading.frame_levels:
-        strength = strength_of(problem, hypothesis, effect)[0]
-    return replace(_applied(problem, hypothesis, effect, strength), law_sd=hypothesis.levels[effect])
+        strength = value
+    return replace(
+        _applied(problem, hypothesis, effect, strength),
+        strength_sd=math.log(high / low) / (2.0 * 1.959964),
+        law_sd=hypothesis.levels[effect],
+    )
 
 
 def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:

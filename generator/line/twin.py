@@ -49,6 +49,16 @@ class Estimate:
         """Value and interval times a known factor of 0 or more."""
         return Estimate(value=factor * self.value, low=factor * self.low, high=factor * self.high)
 
+    def widened(self, relative_sd: float) -> "Estimate":
+        """The same with an independent relative standard deviation more; the low end stays at 0 or above where it was."""
+        half = 1.959964 * relative_sd * abs(self.value)
+        low = self.value - math.hypot(self.value - self.low, half)
+        return Estimate(
+            value=self.value,
+            low=max(low, 0.0) if self.low >= 0.0 else low,
+            high=self.value + math.hypot(self.high - self.value, half),
+        )
+
     def as_dict(self) -> dict[str, float]:
         """`{value, low, high}`."""
         return {"value": self.value, "low": self.low, "high": self.high}

@@ -1,7 +1,7 @@
 """Flatfield of a twin at a setting, measured or not: mean, noise, gain, photons and dose, with 95 % intervals."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -255,7 +255,8 @@ def predict_flatfield(twin: Twin, setting: Setting, *, after_calibration: bool =
     With binning, mean, noise and photons are those of a binned pixel, gain and slope remain those of one pixel.
 
     The twin's effects are in it: those on beam and noise in its numbers (`present_line`), others by what they change in
-    `expected_series`, long after the beam was switched on. Their strengths count as known.
+    `expected_series`, long after the beam was switched on. Intervals hold what is not known of their strengths and laws
+    (`AppliedEffect.sd`), as a share of what each changes.
 
     Args:
         twin: the calibrated line.
@@ -268,6 +269,33 @@ def predict_flatfield(twin: Twin, setting: Setting, *, after_calibration: bool =
     """
     if not twin.effects:
         return _without_effects(twin, setting)
+    found = _with_effects(twin, setting, after_calibration)
+    doubtful = [item for item in twin.effects if item.sd > 0.0 and (after_calibration or item.since == "always")]
+    if not doubtful:
+        return found
+    bare = _without_effects(replace(twin, effects=()), setting)
+    alone = [(item.sd, _with_effects(replace(twin, effects=(item,)), setting, after_calibration)) for item in doubtful]
+
+    def changes(number: Callable[[Prediction], Estimate | None]) -> float:
+        """Relative standard deviation of a number by what is not known of effects; 0 where one has no such number."""
+        before, those = number(bare), [(sd, number(one)) for sd, one in alone]
+        if before is None or before.value <= 0.0:
+            return 0.0
+        return math.hypot(*(sd * (one.value / before.value - 1.0) for sd, one in those if one is not None))
+
+    photons, kerma = found.photons_absorbed, found.air_kerma_uGy
+    return replace(
+        found,
+        mean_DN=found.mean_DN.widened(changes(lambda one: one.mean_DN)),
+        sd_DN=found.sd_DN.widened(changes(lambda one: one.sd_DN)),
+        gain_DN=found.gain_DN.widened(changes(lambda one: one.gain_DN)),
+        photons_absorbed=None if photons is None else photons.widened(changes(lambda one: one.photons_absorbed)),
+        air_kerma_uGy=None if kerma is None else kerma.widened(changes(lambda one: one.air_kerma_uGy)),
+    )
+
+
+def _with_effects(twin: Twin, setting: Setting, after_calibration: bool) -> Prediction:
+    """With the twin's effects, taken as known."""
     line = present_line(twin, after_calibration=after_calibration)
     found = _without_effects(line.twin, setting)
     if line.effects:

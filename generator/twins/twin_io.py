@@ -34,6 +34,7 @@ from ..spread.psf import Spread
 FORMAT = "raytwin-twin"
 VERSION = 1
 TUBE = "tube"
+_SDS_OF_EFFECTS = ("strength_sd", "law_sd")
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
 
 
@@ -87,7 +88,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
                         "since": item.since,
                         "options": dict(item.options),
                     }
-                    | ({} if item.law_sd is None else {"law_sd": item.law_sd})
+                    | {name: getattr(item, name) for name in _SDS_OF_EFFECTS if getattr(item, name) is not None}
                     for item in twin.effects
                 ]
             )
@@ -342,7 +343,7 @@ def _effects_from_text(text: str) -> tuple[AppliedEffect, ...]:
             parameters={str(name): float(value) for name, value in item["parameters"].items()},
             since=str(item["since"]),
             options={str(name): str(value) for name, value in item.get("options", {}).items()},
-            law_sd=float(item["law_sd"]) if "law_sd" in item else None,
+            **{name: float(item[name]) for name in _SDS_OF_EFFECTS if name in item},
         )
         for item in json.loads(text)
     )

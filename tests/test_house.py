@@ -186,6 +186,44 @@ def test_the_check_of_rings_sees_a_planted_one(tmp_path):
     assert ring_in(graph) == []
 
 
+def modules_imported(path):
+    """Modules of raytwin that a file outside of it imports from."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and (node.module or "").split(".")[0] == "raytwin":
+            yield node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("raytwin."))
+
+
+def is_module(name):
+    """Whether a room or `src/raytwin` holds a module or package of a full name."""
+    parts = name.split(".")[1:]
+    places = [folder.joinpath(*parts) for folder in (ROOT, ROOT / "src" / "raytwin")]
+    return any(place.is_dir() or place.with_suffix(".py").is_file() for place in places)
+
+
+def test_modules_that_tests_and_scripts_import_exist():
+    folders = ("tests", "validation", "benchmarks", "docs/_ext", "docs/examples")
+    files = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert len(files) > 100
+    gone = [
+        f"{path.relative_to(ROOT)}: {name}" for path in files for name in modules_imported(path) if not is_module(name)
+    ]
+    assert not gone, "\n".join(gone)
+
+
+def test_the_check_of_imported_modules_sees_one_that_is_gone(tmp_path):
+    module = tmp_path / "script.py"
+    module.write_text(
+        "import raytwin as rt\nimport raytwin.pod.links\nfrom raytwin.pod.knots import f\nfrom raytwin import api\n"
+    )
+    assert [(name, is_module(name)) for name in modules_imported(module)] == [
+        ("raytwin.pod.links", True),
+        ("raytwin.pod.knots", False),
+        ("raytwin", True),
+    ]
+
+
 def imports_among_packages(graph, room):
     """The graph of a room's files with each folder below the room as one node; a file of the room itself stays one."""
     node = {path: path if path.parent == room else path.parent for path in graph if path.is_relative_to(room)}

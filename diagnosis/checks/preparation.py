@@ -55,7 +55,7 @@ class PreparedSession:
 def calibrated_twin(
     acquisition: AcquisitionFile, *, rng: np.random.Generator, progress: Callable[[str], None] | None = None
 ) -> Twin:
-    """The twin from the series that calibrate (see diagnosis.session); single-frame flats have their noise from the rest."""
+    """The twin from the series that calibrate (see `calibrating_names`); single-frame flats have their noise from the rest."""
     names = calibrating_names(acquisition.series)
     part = replace(acquisition, series=tuple(item for item in acquisition.series if item.name in names))
     rest = tuple(item for item in acquisition.series if item.name not in names)

@@ -48,10 +48,10 @@ class Curve:
             return self.low / _WEAKER, _STRONGER * self.high
         return self.low / _WEAKER, _BEYOND_NODES * max(self.high, float(self.strengths[-1]))
 
-    def log_strengths(self, count: int = STRENGTH_NODES) -> NDArray[np.float64]:
+    def log_strengths(self) -> NDArray[np.float64]:
         """Strengths at which integrals are taken: evenly in the logarithm over the reach, and the ends of the plausible range."""
         ends = np.array([self.low, self.high])
-        return np.unique(np.concatenate([np.geomspace(*self.reach, count), ends]))
+        return np.unique(np.concatenate([np.geomspace(*self.reach, STRENGTH_NODES), ends]))
 
     @property
     def by_chance_alone(self) -> bool:

@@ -116,22 +116,21 @@ def register(
     expected: Sequence[NDArray[np.floating]],
     variance: Sequence[NDArray[np.floating]],
     mask: NDArray[np.bool_],
-    *,
-    prior_px: float = 1.0,
 ) -> Placement:
     """Placement of a scene from the pictures of all its series: Gauss-Newton, level and smooth light left free.
+
+    A displacement has a standard deviation of one pixel along either side before looking.
 
     Args:
         measured, expected: signals (row, column), DN, of each series.
         variance: of the measured ones.
         mask: pixels to use; the outermost three are left out.
-        prior_px: standard deviation of a displacement before looking.
     """
     inner = mask.copy()
     for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
         edge[...] = False
     current = np.zeros(2)
-    precision = np.eye(2) / prior_px**2
+    precision = np.eye(2)
     covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
     splines = [_splines(fill(image, mask)) for image in measured]
     models = [np.asarray(model, dtype=np.float64) for model in expected]
@@ -160,8 +159,8 @@ def register(
         # along a single edge nothing shows the displacement: a weak direction stays where the prior has it
         values, vectors = np.linalg.eigh(normal - precision)
         weak = values < _WEAK * values[-1]
-        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
-        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
+        covariance = np.asarray((vectors * np.where(weak, 1.0, inverse)) @ vectors.T, dtype=np.float64)
         # where the measured picture still lies further on than the model, the residual falls along the model's slope
         step = -((vectors * inverse) @ vectors.T) @ right
         current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
@@ -201,7 +200,6 @@ def register_drawn(
     start: Placement,
     *,
     whole_cells: bool,
-    prior_px: float = 1.0,
 ) -> Placement:
     """Placement of a scene by drawing it where it may lie: nothing that was measured is resampled.
 
@@ -210,7 +208,7 @@ def register_drawn(
     only where less is left after it.
 
     Args:
-        measured, variance, mask, prior_px: as in `register`.
+        measured, variance, mask: as in `register`.
         draw: pictures (row, column) of all series with the scene displaced along rows and columns, px.
         start: where splines have it.
         whole_cells: no finer than that; a picture with little blur cannot be moved by a part of a cell without ringing.
@@ -254,7 +252,7 @@ def register_drawn(
         return _placement(current, np.diag(sds**2))
     models = draw((float(current[0]), float(current[1])))
     rest = fit.of(models)
-    covariance: NDArray[np.float64] = np.eye(2) * prior_px**2
+    covariance: NDArray[np.float64] = np.eye(2)
     slopes: list[NDArray[np.float64]] = []
     for _ in range(_DRAWN_ROUNDS):
         if not slopes:
@@ -267,8 +265,8 @@ def register_drawn(
         # along a single edge nothing shows the displacement: a weak direction stays where it is
         values, vectors = np.linalg.eigh(normal)
         weak = values < _WEAK * values[-1]
-        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0 / prior_px**2))
-        covariance = np.asarray((vectors * np.where(weak, prior_px**2, inverse)) @ vectors.T, dtype=np.float64)
+        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
+        covariance = np.asarray((vectors * np.where(weak, 1.0, inverse)) @ vectors.T, dtype=np.float64)
         step = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         for part in (1.0, 0.4, 0.1):
             there = np.clip(current + part * step, -LARGEST_PX, LARGEST_PX)

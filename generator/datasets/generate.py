@@ -233,7 +233,6 @@ class ChannelModel:
         rng: np.random.Generator,
         *,
         reference_gain: float = 1.0,
-        reference_open_DN: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float32]:
         """Counts with dark (row, column) at the target by top-up of a reference's transmission, DN.
 
@@ -242,14 +241,12 @@ class ChannelModel:
             reference: its setting.
             rng: source of randomness.
             reference_gain: quantum variance per signal when the reference was taken over that of now.
-            reference_open_DN: (row, column) open signal of one of its frames; None: this channel's scaled to its load.
         """
         noise = self.twin.noise
         plan = plan_top_up(reference=reference, target=self.target, reference_gain=reference_gain)
         effects = self.image_effects
         if effects is not None:
-            opened = self.open_signal_DN / plan.scale if reference_open_DN is None else reference_open_DN
-            straight = effects.straightened(transmission, open_signal_DN=opened)
+            straight = effects.straightened(transmission, open_signal_DN=self.open_signal_DN / plan.scale)
             if effects.changes_picture():
                 quiet = self._quiet(straight, reference)
                 straight = straight + effects.picture_change(quiet, self.thickness_behind(quiet))

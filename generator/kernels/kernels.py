@@ -63,7 +63,7 @@ def _map(name: str, values: Any, shape: tuple[int, int, int], *, low: float, uni
     return _single(full)
 
 
-def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> FloatMap:
+def _kernel(name: str, values: ArrayLike | None) -> FloatMap:
     if values is None:
         return np.ones(1, dtype=np.float32)
     kernel = np.asarray(values, dtype=np.float64)
@@ -72,7 +72,7 @@ def _kernel(name: str, values: ArrayLike | None, reach: int | None = None) -> Fl
     half = len(kernel) // 2
     # ends too small to change a pixel by 1e-7 of the kernel's norm cost time and give nothing
     share = np.cumsum(kernel[:half] ** 2 + kernel[:half:-1] ** 2)
-    cut = int(np.searchsorted(share, 1e-14 * float(np.sum(kernel**2)))) if reach is None else 0
+    cut = int(np.searchsorted(share, 1e-14 * float(np.sum(kernel**2))))
     return np.asarray(kernel[cut : len(kernel) - cut], dtype=np.float32)
 
 

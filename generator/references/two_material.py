@@ -40,7 +40,6 @@ class TwoMaterialTables:
     low_mm: Array
     step_mm: Array
     values: Array = field(repr=False)
-    highest_log: float
 
     @property
     def count(self) -> int:
@@ -132,7 +131,6 @@ def tabulate_two_materials(
         low_mm=bounds[:, 0].copy(),
         step_mm=steps,
         values=values,
-        highest_log=highest_log,
     )
 
 

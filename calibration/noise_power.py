@@ -396,7 +396,7 @@ class _PowerSum:
         self.shape = np.where(good, signal_DN, 0.0) if self.has_signal else good.astype(np.float64)
         self.norm = float(np.sum(self.shape**2))
         self.power = np.zeros((self.side // 2 + 1, self.side // 2 + 1))
-        self.lines = np.zeros(2)
+        self.lines = [np.zeros(0), np.zeros(0)]
         self.factors: list[float] = []
         self.count = 0
 
@@ -406,7 +406,8 @@ class _PowerSum:
         factor = float(np.sum(kept * self.shape)) / self.norm
         kept -= factor * self.shape
         self.power += self.squares.power(kept)
-        self.lines += [_line_variance(kept, self.good, axis) for axis in (1, 0)]
+        steps = [_line_steps(kept, self.good, axis) ** 2 for axis in (1, 0)]
+        self.lines = [last + one if self.count else one for last, one in zip(self.lines, steps, strict=True)]
         self.factors.append(factor)
         self.count += 1
 
@@ -433,10 +434,10 @@ class _PowerSum:
         weight[0] = weight[-1] = 1.0
         found = []
         for axis, line in enumerate((power[:, lowest], power[lowest])):
-            rows, columns = self.good.shape if axis == 0 else self.good.shape[::-1]
+            columns = self.good.shape[1 - axis]
             expected = float(np.nansum(weight * step * np.nan_to_num(line, nan=plateau)) / side) / columns
-            measured = float(self.lines[axis]) / (single * self.count)
-            found.append((measured - expected, math.sqrt(3.0 / (degrees * rows)) * max(measured, expected)))
+            measured, relative_sd = _line_variance(self.lines[axis] / (single * self.count), degrees)
+            found.append((measured - expected, relative_sd * max(measured, expected)))
         return NoisePower(
             power_DN2=power,
             modes=modes,
@@ -463,14 +464,31 @@ def _at_zero(power: FloatArray, modes: FloatArray) -> float:
     return float(np.exp(found[0]))
 
 
-def _line_variance(difference: FloatArray, good: NDArray[np.bool_], axis: int) -> float:
-    """Half the mean square step between the means of neighbouring lines (DN^2): rows for axis 1, columns for axis 0."""
+def _line_steps(difference: FloatArray, good: NDArray[np.bool_], axis: int) -> FloatArray:
+    """Steps between the means of neighbouring lines (step,), DN: rows for axis 1, columns for axis 0."""
     count = good.sum(axis=axis)
     means = difference.sum(axis=axis) / np.maximum(count, 1)
     usable = count > 0.5 * good.shape[axis]
-    steps = np.diff(means)[usable[1:] & usable[:-1]]
-    # robust: a line of a cluster or of a readout block may step by itself
-    return 0.5 * (1.4826 * float(np.median(np.abs(steps)))) ** 2 if steps.size else 0.0
+    return np.asarray(np.diff(means)[usable[1:] & usable[:-1]])
+
+
+def _line_variance(mean_squares_DN2: FloatArray, degrees: float) -> tuple[float, float]:
+    """Variance of one line's mean (DN^2) from mean square steps between lines (step,), and its relative standard deviation.
+
+    The median over the lines, as a line of a cluster or of a readout block may step by itself. A mean square of n differences
+    follows chi-square over n, whose median m is known; the median of N of them has the variance 1 / (4 N f(m)^2), f their
+    density. Neighbouring steps share a line: the variance is half as large again, as it is for mean squares.
+    """
+    from scipy.special import gammaincinv, gammaln
+
+    if mean_squares_DN2.size == 0:
+        return 0.0, 0.0
+    half = 0.5 * degrees
+    middle = float(gammaincinv(half, 0.5))  # of chi-square over 2
+    relative_density = math.exp(half * math.log(middle) - middle - float(gammaln(half)))  # times the median itself
+    median = float(np.median(mean_squares_DN2))
+    relative_sd = math.sqrt(1.5 / mean_squares_DN2.size) / (2.0 * relative_density)
+    return 0.5 * median * half / middle, relative_sd
 
 
 def _folded(power: FloatArray) -> FloatArray:

@@ -55,6 +55,25 @@ def test_power_is_that_of_the_noise_within_sampling_error(spread):
     assert abs(found.row_variance_DN2) < 4.0 * found.row_sd_DN2
 
 
+def test_the_variance_of_lines_is_neither_too_large_nor_surer_than_it_is():
+    """White noise and offsets of rows of a tenth of it: 150 series of small frames, mean within four standard errors."""
+    shape, rows_DN2 = (64, 64), 0.01
+    rng = np.random.default_rng(11)
+    found = []
+    for _ in range(150):
+        frames = rng.standard_normal((8, *shape)) + math.sqrt(rows_DN2) * rng.standard_normal((8, shape[0], 1))
+        power = compute_noise_power([frames], signal_DN=np.zeros(shape), good=np.ones(shape, bool))
+        found.append(
+            [power.row_variance_DN2 - rows_DN2, power.row_sd_DN2, power.column_variance_DN2, power.column_sd_DN2]
+        )
+    off_rows, sd_rows, off_columns, sd_columns = np.array(found).T
+    for off, sd in ((off_rows, sd_rows), (off_columns, sd_columns)):
+        z = off / sd
+        assert abs(z.mean()) < 4.0 / math.sqrt(z.size)
+        # the standard deviation of a sample of 150: 6 %
+        assert 0.75 < z.std() < 1.24
+
+
 def test_drift_of_level_and_shape_and_offsets_of_lines_leave_the_power_alone():
     """Level 1 %, shape 0.3 % rms and lines of half a read noise from frame to frame: summed up, forty times the noise."""
     rng = np.random.default_rng(3)

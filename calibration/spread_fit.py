@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..generator.spread.psf import CLEAR_LAYER, Spread
-from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, smeared, spread_of_bins, usable
+from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, spread_of_bins, usable
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
@@ -224,6 +224,8 @@ class _Problem:
         self.group = list(group)
         self.groups = max(group, default=-1) + 1
         self.sides = sorted({item.square_px for item in series})
+        # squares of one size show nearly the same of noise in all series: those of the series that tells most stand for them
+        self.squares = {item.square_px: item for item in sorted(series, key=lambda item: item.samples)}
         self.data: list[FloatArray] = []
         self.modes: list[FloatArray] = []
         self.independent = 0.0  # bins are correlated: so many of them would be independent
@@ -277,7 +279,7 @@ class _Problem:
 
     def shapes(self, spread: Spread) -> dict[int, FloatArray]:
         """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
-        return {side: smeared(spread.noise_power(side)) for side in self.sides}
+        return {side: self.squares[side].smeared(spread.noise_power(side)) for side in self.sides}
 
     def in_cells(self, spread: Spread) -> dict[int, FloatArray]:
         """The same (cell,)."""

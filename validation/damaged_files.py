@@ -648,6 +648,8 @@ def main() -> None:
                     f"{result.number:6d} {result.wrong or 'good':30.120s} {result.command:16s} {result.damage:60.60s}"
                 )
                 print(f"{told} {result.line:.200s}", flush=True)
+            if codes.total() % 500 == 0:
+                print(f"{codes.total()} cases in {time.monotonic() - start:.0f} s: {len(failed)} failed", flush=True)
             if options.minutes and time.monotonic() - start > 60.0 * options.minutes:
                 break
     total = sum(codes.values())

@@ -159,7 +159,7 @@ def _put_spectral(file: Any, posterior: SpectralPosterior) -> None:
 
 
 def _array(group: Any, name: str, dtype: type[Any]) -> NDArray[Any]:
-    from ..acquisition._hdf5 import real_numbers
+    from ...acquisition._hdf5 import real_numbers
 
     return real_numbers(group[name][()], dtype, where=f"twin {group.file.filename}, {group.name.strip('/')}/{name}")
 

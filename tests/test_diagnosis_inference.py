@@ -1,5 +1,6 @@
 """Weighing hypotheses on probes whose truth is planted: no data, only vectors."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import pytest
 
 from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
+from raytwin.diagnosis.inference.in_series import in_some_series
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
 from raytwin.diagnosis.inference.nuisances import Nuisances
@@ -774,3 +776,65 @@ def test_one_family_that_is_off_by_a_little_is_chance_and_several_are_an_unknown
     assert by_chance.place == "group 7"
     # never less than where nothing may be off, but for how often something is
     assert beyond(seen(residual, factors), GROUPS, NAMES).allowed > np.log1p(-CHANCE.frequency) - 1e-9
+
+
+# ---- effects in some series only
+
+
+def series_response(rng, *, series=12, each=50, size=30.0):
+    """A response of the same length in each series, and the number of each probe's series."""
+    direction = rng.standard_normal((series, each))
+    direction *= size / np.linalg.norm(direction, axis=1)[:, None]
+    return direction.ravel(), np.repeat(np.arange(series), each)
+
+
+@pytest.mark.parametrize("acting", [(2, 3, 7), (11,)])
+def test_the_series_in_which_an_effect_acts_are_found(setup, acting):
+    rng, factors, _ = setup
+    response, series_of = series_response(rng)
+    inside = np.isin(series_of, acting)
+    observed = seen(np.where(inside, 0.7 * response, 0.0) + noise(rng, factors), factors)
+    fits = fit_effects(observed, [one_node("motion", response)])
+    found = in_some_series(observed, fits, series_of)
+    assert found.series == acting
+    assert found.log_prior == pytest.approx(-math.log(12) - math.log(math.comb(12, len(acting))))
+    part = replace(
+        one_node("motion", np.where(inside, response, 0.0)), series=tuple(map(str, acting)), log_prior=found.log_prior
+    )
+    assert fit_curve(observed, part).log_evidence > fits[0].log_evidence + 20.0
+
+
+def test_an_effect_in_all_series_or_in_none_is_in_no_part_of_them(setup):
+    rng, factors, _ = setup
+    response, series_of = series_response(rng)
+    for amount in (0.7, 0.0):
+        observed = seen(amount * response + noise(rng, factors), factors)
+        fits = fit_effects(observed, [one_node("motion", response)])
+        found = in_some_series(observed, fits, series_of)
+        if found is not None:
+            # a part by chance costs more than it brings
+            inside = np.isin(series_of, found.series)
+            part = replace(one_node("motion", np.where(inside, response, 0.0)), log_prior=found.log_prior)
+            assert fit_curve(observed, part).log_evidence < max(fits[0].log_evidence, 0.0) + 3.0
+
+
+def test_a_problem_with_an_effect_in_some_series_keeps_its_names_and_its_prior():
+    views = tuple(SimpleNamespace(session=SimpleNamespace(name=name)) for name in ("first", "second", "third"))
+    variant = Variant(
+        effect="motion_blur", name="", parameters={}, sign=1.0, since="always", low=1.0, high=9.0, strengths=(2.0,)
+    )
+    problem = Problem(
+        **{
+            **dict.fromkeys(Problem.__dataclass_fields__),
+            "residual": np.zeros(6),
+            "curves": (variant.curve(np.ones((1, 6))),),
+            "variants": (variant,),
+            "series_of": np.array([0, 0, 1, 1, 2, 2]),
+            "views": views,
+            "given": (),
+        }
+    )
+    found = problem.in_series("motion_blur", "", (0, 2), -2.0)
+    assert found.variants[-1].name == "in 2 series"
+    np.testing.assert_array_equal(found.curves[-1].responses, [[1, 1, 0, 0, 1, 1]])
+    assert (found.curves[-1].series, found.curves[-1].log_prior) == (("first", "third"), -2.0)

@@ -289,6 +289,7 @@ ALWAYS = (
     "motion_blur",
     "misregistration",
     "composition_error",
+    "motion_in_some",
 )
 # effect: strength, and whether it has the catalogue's definition (else it is only asked whether it is named)
 CASES = {
@@ -311,6 +312,7 @@ CASES = {
     "bad_pixels": (0.4, True),
     "k_fluorescence": (25.0, True),
     "motion_blur": (0.8, True),
+    "motion_in_some": (4.0, True),
     "misregistration": (0.6, True),
     "heel": (5.0, True),
     "composition_error": (5.0, True),
@@ -330,6 +332,7 @@ PAIRS = (
     "nonlinearity+motion_blur",
 )
 UNKNOWN = ("tiles", "wandering_tiles")
+NAMED = {"motion_in_some": "motion_blur"}  # of products alone: the table moved there
 NOT_OF_COUNTS = (
     "row_noise",
     "dark_drift",
@@ -694,7 +697,10 @@ def make_session(
             current_mA = None if kV is None else of.current_mA[kV] * (of.copper_times if copper_mm else 1.0)
             if kV is not None:
                 mAs = current_mA * exposure_ms / 1000.0
-                lit = line.light(kV, mAs, copper_mm, scene, line.on(after), exposure_ms)
+                on = line.on(after)
+                if scene.startswith("product") and "motion_in_some" in on:
+                    on = {**on, "motion_blur": on["motion_in_some"]}
+                lit = line.light(kV, mAs, copper_mm, scene, on, exposure_ms)
             writer.add_series(
                 name,
                 kind=kind,
@@ -730,6 +736,11 @@ def make_session(
         add("dark_last", "dark", 160.0, after=True)
 
 
+def _named(case: str) -> str:
+    """The effect of the catalogue that a case is of."""
+    return NAMED.get(case, case.removesuffix("_later"))
+
+
 def judged(name: str, effect: str, seed: int, frames: int, line_of: type[Line] = Line) -> dict:
     """What the diagnosis says of one session."""
     with tempfile.TemporaryDirectory() as folder:
@@ -739,7 +750,7 @@ def judged(name: str, effect: str, seed: int, frames: int, line_of: type[Line] =
         with open_acquisition(path) as acquisition:
             found = diagnose(acquisition, rng=np.random.default_rng(seed))
     names = effect.split("+")
-    wanted = sorted(one.removesuffix("_later") for one in names if one not in ("none", *UNKNOWN))
+    wanted = sorted(_named(one) for one in names if one not in ("none", *UNKNOWN))
     verdict = {"none": "no_gap", **dict.fromkeys(UNKNOWN, "unknown_effect")}.get(effect, "explained")
     strengths = {item.effect: list(item.strength) for item in found.causes}
     return {
@@ -749,9 +760,7 @@ def judged(name: str, effect: str, seed: int, frames: int, line_of: type[Line] =
         "named": list(found.named),
         "right": found.verdict == verdict and sorted(found.named) == wanted,
         "strengths": {
-            one: strengths[one]
-            for one in (part.removesuffix("_later") for part in names if CASES[part][1])
-            if one in found.named
+            one: strengths[one] for one in (_named(part) for part in names if CASES[part][1]) if one in found.named
         },
     }
 

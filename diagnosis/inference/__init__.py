@@ -4,6 +4,7 @@ Files:
     inference         all hypotheses with their probabilities
     observed          residual and covariance, alone or together with an effect
     curve_fits        evidence and strength of one effect
+    in_series         in which series an effect acts
     pairs             two effects at once
     unknown           what no catalogue entry explains
     discrepancy       how far laws of a kind depart from ours (`discrepancy.toml`)

@@ -85,8 +85,8 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
     return CurveFit(
         curve=curve,
-        by_level=by_level,
-        log_evidence=_over_levels(by_level, frequencies),
+        by_level=by_level + curve.log_prior,
+        log_evidence=_over_levels(by_level, frequencies) + curve.log_prior,
         level=0.0 if exact else levels.levels[likeliest],
         strengths=found[likeliest][1],
         log_likelihood=found[likeliest][2],

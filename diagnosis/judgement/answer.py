@@ -27,7 +27,7 @@ _LEFT_LISTED = 5
 class Cause:
     """An effect, how probable it is, its strength and inner parameters, how far the gap shrinks with it, and what its law leaves.
 
-    level: by how much of itself its law seems to be off.
+    level: by how much of itself its law seems to be off; series: names of those in which it acts, empty: all since its onset.
     """
 
     effect: str
@@ -40,10 +40,13 @@ class Cause:
     shrinks_by: tuple[float, float, float] | None
     level: float = 0.0
     left: tuple["Place", ...] = ()
+    series: tuple[str, ...] = ()
 
     @property
-    def onset(self) -> str:
-        """`always` or `since_calibration`."""
+    def onset(self) -> str | tuple[str, ...]:
+        """`always`, `since_calibration`, or the names of the series in which it acts."""
+        if self.series:
+            return self.series
         return "always" if self.since == "always" else "since_calibration"
 
 
@@ -138,7 +141,7 @@ class Diagnosis(Result):
                 cause.effect,
                 f"{cause.probability:.2f}",
                 f"{cause.strength[0]:.3g} ({cause.strength[1]:.3g} to {cause.strength[2]:.3g}) {cause.unit}".rstrip(),
-                cause.since,
+                f"in {len(cause.series)} series" if cause.series else cause.since,
             )
             for cause in self.causes
         ]
@@ -263,7 +266,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
                 "strength": {**(interval(cause.strength) or {}), "unit": cause.unit},
                 "parameters": parameters(cause),
                 "since": cause.since,
-                "onset": cause.onset,
+                "onset": cause.onset if isinstance(cause.onset, str) else list(cause.onset),
                 "shrinks_by": interval(cause.shrinks_by),
                 "fit": {
                     "share_removed": interval(cause.shrinks_by),

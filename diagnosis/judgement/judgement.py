@@ -13,6 +13,7 @@ from ..advice.next_series import best_measurement, proposal_text
 from ..advice.plan import WORTH_IT, best_repeat, repeat_text
 from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS
+from ..inference.in_series import in_some_series
 from ..inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
@@ -54,7 +55,9 @@ def judge(
     leading, named = verdict.leading, verdict.named
     likeliest = _likeliest_known(problem, verdict, rng)
     marginal = _by_effect(verdict.hypotheses)
-    added = tuple(applied_at_best(problem, leading, effect) for effect in named)
+    # what acts in some series alone is nothing that the line has
+    lasting = [effect for effect in named if not leading.variants[effect].series]
+    added = tuple(applied_at_best(problem, leading, effect) for effect in lasting)
     ambiguous = verdict.word == "ambiguous"
     beside = replace(problem, residual=_left(problem, leading))
     return Diagnosis(
@@ -75,7 +78,7 @@ def judge(
         named=named,
         problem=problem,
         warnings=tuple(problem.skipped),
-        notes=(*_beyond_plausible(leading), *_of_another_strength(problem, verdict)),
+        notes=(*_beyond_plausible(leading), *_of_another_strength(problem, verdict), *_in_some(leading)),
         not_tested=weighed.out_of_reach,
         strained=_strained(problem, leading, nuisances),
     )
@@ -114,6 +117,13 @@ def weigh_problem(
     whitened = whitening.curves(problem.curves)
 
     fits = fit_effects(observed, whitened)
+    for effect in (effect for effect, entry in EFFECTS.items() if entry.in_some_series and not observed.has(effect)):
+        of_effect = [fit for fit in fits if fit.curve.effect == effect]
+        part = in_some_series(observed.standing(), of_effect, problem.series_of)
+        if part is not None:
+            problem = problem.in_series(effect, part.variant, part.series, part.log_prior)
+            more = whitening.curves(problem.curves[len(whitened) :])
+            whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
 
     def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, rests: bool) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
@@ -259,6 +269,7 @@ def _causes(
                 parameters=dict(curve.parameters),
                 sign=variant.sign,
                 since=variant.since,
+                series=variant.series,
                 shrinks_by=shares.get(effect),
                 level=best.levels.get(effect, 0.0),
                 left=left if effect in named else (),
@@ -319,6 +330,15 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
                 f"the twin has {effect}, and this session shows {value:.2f} ({low:.2f} to {high:.2f}) times as much of it"
             )
     return tuple(notes)
+
+
+def _in_some(leading: Hypothesis) -> tuple[str, ...]:
+    """What to say of effects that act in some series only."""
+    return tuple(
+        f"{effect} acts in {', '.join(curve.series)} only: the improved twin is left without it"
+        for effect, curve in leading.variants.items()
+        if curve.series
+    )
 
 
 def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:

@@ -74,7 +74,7 @@ class Variant:
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
     the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined.
+    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior: as of a `Curve`.
     """
 
     effect: str
@@ -88,6 +88,8 @@ class Variant:
     fitted: tuple[Parameter, ...] = ()
     refined_from: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+    series: tuple[str, ...] = ()
+    log_prior: float = 0.0
 
     def curve(
         self,
@@ -110,6 +112,8 @@ class Variant:
             spread=spread,
             jitter=jitter,
             exact=exact,
+            series=self.series,
+            log_prior=self.log_prior,
         )
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":

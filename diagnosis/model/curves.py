@@ -24,7 +24,8 @@ class Curve:
     the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
     that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
     strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
-    the strength is defined by, in which no law can be far off.
+    the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
+    probability of that, against one that acts in all.
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -40,6 +41,8 @@ class Curve:
     spread: NDArray[np.float64] | None = None
     jitter: NDArray[np.float64] | None = None
     exact: NDArray[np.bool_] | None = None
+    series: tuple[str, ...] = ()
+    log_prior: float = 0.0
 
     @property
     def reach(self) -> tuple[float, float]:

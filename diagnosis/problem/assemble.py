@@ -528,8 +528,14 @@ def _respond(
             stop = start + len(one)
             responses[[row for row, _ in moved], start:stop] = one.responses([found for _, found in moved])
         start += len(one)
+    names = np.repeat([one.series.name for one in probes], [len(one) for one in probes])
+
+    def of(variant: Variant, rows: range) -> NDArray[np.float64]:
+        found = responses[list(rows)] + done.get(variant.effect, 0.0)
+        return np.where(np.isin(names, variant.series), found, 0.0) if variant.series else found
+
     return {
-        number: responses[list(rows)] + done.get(variants[number].effect, 0.0)
+        number: of(variants[number], rows)
         for number, rows in enumerate(strength_rows(variants))
         if not any(asked[row].failed for row in rows)
     }

@@ -74,6 +74,23 @@ class Problem:
     side: int = 1
     given: tuple[Point, ...] = ()
 
+    def in_series(self, effect: str, variant: str, series: Sequence[int], log_prior: float) -> "Problem":
+        """With an effect's variant as it acts in some series (numbers of views) alone, as one more variant."""
+        names = tuple(self.views[number].session.name for number in series)
+        both = next(
+            (item, curve)
+            for item, curve in zip(self.variants, self.curves, strict=True)
+            if (item.effect, item.name) == (effect, variant)
+        )
+        own = replace(
+            both[0],
+            name=f"{variant}, in {len(names)} series".strip(", "),
+            series=names,
+            log_prior=log_prior,
+        )
+        responses = np.where(np.isin(self.series_of, series), both[1].responses, 0.0)
+        return replace(self, curves=(*self.curves, own.curve(responses)), variants=(*self.variants, own))
+
     def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
         """The residual (probe,) of the base less those of its own effects that are among these."""
         left = self.residual.copy()

@@ -228,7 +228,7 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
             f"{cause.probability:.3f}",
             strength_text(cause),
             ", ".join(f"{name} {value:.3g}" for name, value in cause.parameters.items()),
-            _SINCE.get(cause.since, "always there"),
+            f"in {', '.join(cause.series)} only" if cause.series else _SINCE.get(cause.since, "always there"),
             "" if cause.shrinks_by is None else f"{100.0 * min(cause.shrinks_by[0], 1.0):.0f} %",
             f"{100.0 * cause.level:.0f} %",
         )

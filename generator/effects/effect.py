@@ -209,7 +209,7 @@ class Effect:
         needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`.
         options: words that an applied effect may carry, with what they mean.
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
-            diagnosis tries both.
+            diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.
         absorbed: one of ABSORBED: what calibration takes in of one that was always there.
         shows, reading, grid, variation, images: see there.
         lost_in_squares: why it cannot be seen in squares of pixels; empty: it can.
@@ -229,6 +229,7 @@ class Effect:
     absorbed: str
     change: Change = field(repr=False)
     either_onset: bool = False
+    in_some_series: bool = False
     needs: tuple[str, ...] = ()
     options: Mapping[str, str] = field(default_factory=dict)
     timed: bool = False

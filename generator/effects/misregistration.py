@@ -121,6 +121,7 @@ MISREGISTRATION = Effect(
     needs=("scene",),
     isolated_by="a grid of balls, or an edge in two directions",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
+    in_some_series=True,
     absorbed="nothing",
     reading=Reading(probes=("displacement along rows", "displacement along columns")),  # where scenes lie is its shift
     grid=Grid(

@@ -53,6 +53,7 @@ MOTION_BLUR = Effect(
     needs=("scene",),
     isolated_by="an edge at several exposure times of equal charge",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
+    in_some_series=True,
     absorbed="nothing",
     timed=True,
     grid=Grid(shares=(0.0, 0.25, 0.5, 0.75, 1.0)),

@@ -644,7 +644,8 @@ def test_what_many_exposures_before_left_is_the_sum_of_what_each_left(series_lin
     frames = [found.signal_DN + sum(image * course[n] for image, course in found.trend_DN) for n in range(8)]
     # frame by frame, trap by trap
     ((_, lag, values),) = in_order(effect)
-    still = LineState(parameters=None, signal_DN=np.ones((1, 1)), variance_DN2=np.ones((1, 1)))
+    one = np.ones((1, 1))
+    still = LineState(parameters=None, signal_DN=one, variance_DN2=one, flat_factor=one)
     law = lag.change(still, values, None).lag
     times, caught = np.array(law.time_s)[:, None, None], np.array(law.trapped)[:, None, None]
     held, clock = np.zeros((4, *SHAPE)), 0.0

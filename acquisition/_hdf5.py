@@ -9,6 +9,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 
@@ -180,6 +181,19 @@ def reading(where: str) -> Iterator[None]:
             expected="a complete dataset",
             remedy="the file looks truncated or damaged: copy or make it again",
         ) from None
+
+
+def real_numbers(values: Any, dtype: Any, *, where: str) -> NDArray[Any]:
+    """An array of real numbers in a type of the caller's; what that type cannot hold becomes infinite, without a warning.
+
+    Raises:
+        FileFormatError: complex numbers, texts, tables.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise FileFormatError(where, received=f"values of type {array.dtype}", expected="real numbers")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return array.astype(dtype, copy=False)
 
 
 def check_stored(dataset: Any, *, where: str) -> None:

@@ -25,6 +25,7 @@ from ._hdf5 import (
     open_hdf5,
     plain_attributes,
     reading,
+    real_numbers,
     text_attribute,
     whole_attribute,
 )
@@ -162,7 +163,7 @@ class _ThicknessMaps(Mapping[str, NDArray[np.float32]]):
         if dataset is None:
             raise KeyError(material)
         with reading(self._where):
-            thickness_mm = np.asarray(dataset[()], dtype=np.float32)
+            thickness_mm: NDArray[np.float32] = real_numbers(dataset[()], np.float32, where=self._where)
         if not bool(np.all(np.isfinite(thickness_mm) & (thickness_mm >= 0))):
             raise FileFormatError(
                 f"{self._where}/{material}",

@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
-from ._hdf5 import check_format, check_stored, child, mark_as_pictures, open_hdf5, plain_attributes, reading
+from ._hdf5 import (
+    check_format,
+    check_stored,
+    child,
+    mark_as_pictures,
+    open_hdf5,
+    plain_attributes,
+    reading,
+    real_numbers,
+)
 
 FORMAT = "raytwin-dataset"
 VERSION = 1
@@ -144,7 +153,9 @@ class Dataset:
         return inside
 
     def _finite(self, name: str, selection: Selection) -> NDArray[np.float32]:
-        values = np.asarray(self._take(name, selection), dtype=np.float32)
+        values: NDArray[np.float32] = real_numbers(
+            self._take(name, selection), np.float32, where=f"{self.path}, {name}"
+        )
         if not bool(np.isfinite(values).all()):
             numbers = self._numbers(selection)
             stack = values.reshape(-1, *values.shape[-3:])

@@ -15,6 +15,7 @@ from .noise_of_flats import FlatNoise
 from .noise_power import correlation_of_quanta
 from .repeated_frames import beam_of
 
+_CHANCE = 1e-3  # of a warning where nothing is wrong
 _POOR_FIT = 2.0  # chi-square a degree of freedom: five standard deviations for 50 degrees
 
 
@@ -63,6 +64,17 @@ def flat_evidence(
             f"no kernel family describes the noise power (chi-square {misfit:.1f} per degree of freedom of the best, {fit.family});"
             " the intervals are widened by the misfit"
         )
+    sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
+    names = [item.name for item, _ in noise.stacks]
+    names += [""] * (len(noise.of_pairs) + len(noise.of_others))
+    names += [item.name for item, _ in darks.repeated]
+    ratios = [
+        (name, *ratio)
+        for name, ratio in zip(
+            (name for name, source in zip(names, sources, strict=True) if source.in_fit), fit.series_ratio, strict=True
+        )
+    ]
+    warnings += _uneven(ratios, degrees=len(ratios) - len(fit.gain_DN) - 1)
     dark_levels = [
         {
             "series": item.name,
@@ -73,7 +85,6 @@ def flat_evidence(
         }
         for item, total in darks.sums
     ]
-    sources = (*noise.of_stacks, *noise.of_pairs, *noise.of_others, *noise.of_darks)
     in_use = [source for source in sources if source.in_fit]
     bright = [number for number, source in enumerate(in_use) if source.group >= 0]
     correlation = correlation_of_quanta(
@@ -108,6 +119,22 @@ def flat_evidence(
         "photon_transfer": [point.as_dict() for point in points],
     }
     return evidence, warnings
+
+
+def _uneven(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> list[str]:
+    """A warning where the noise of series differs by more than chance; ratios: name, measured over fitted noise, its sd."""
+    from scipy.special import chdtri
+
+    known = [(name, ratio, (ratio - 1.0) / sd) for name, ratio, sd in ratios if math.isfinite(ratio)]
+    total = sum(z**2 for *_, z in known)
+    if degrees < 1 or total < float(chdtri(degrees, _CHANCE)):
+        return []
+    name, ratio, _ = max(known, key=lambda one: abs(one[2]))
+    farthest = f"{name} has" if name else "one has"
+    return [
+        f"the noise of the series departs from one line by more than chance (chi-square {total / degrees:.1f} a series;"
+        f" {farthest} {ratio:.3g} of the fitted noise); the intervals are widened by that"
+    ]
 
 
 def _finite_pair(route: tuple[float, float]) -> dict[str, float] | None:

@@ -27,66 +27,12 @@ SMALLEST_SQUARE_PX = 8
 _LOW_BAND = 0.25  # cycles a pixel, from which the power at 0 is extrapolated
 _LEAST_GOOD_SHARE = 0.7  # of a square's pixels, for the projection to be as in a whole one
 _LEAST_LEFT = 0.15  # of white noise, after the projection, for a frequency to be used
+_MOST_BROKEN = 256  # squares with bad pixels, from which what such squares show is known well enough
 _SLOPES_FROM_PX = (
     32  # squares from this side lose slopes too; in smaller ones these hold a quarter of all modes and more
 )
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoisePower:
-    """Temporal noise power of one series, one exposure, over the quadrant of frequencies 0 .. 1/2 (K + 1, K + 1).
-
-    Fields:
-        power_DN2: (K + 1, K + 1), row frequency first; NaN where the projection leaves too little.
-        modes: independent complex amplitudes that carry the same information (K + 1, K + 1), 0 where power is NaN.
-        signal_DN: mean signal above dark over the squares in use.
-        common_mode: variance of the factor that a whole frame shares, relative to the signal (0 where it does not stand
-            out of the pixels' own noise).
-        between_series: whether the two frames of a difference come from different series, so that slow changes of the beam's
-            shape are in it.
-        row_variance_DN2, column_variance_DN2: of offsets common to a row or to a column of one exposure, with the standard
-            deviations row_sd_DN2, column_sd_DN2.
-    """
-
-    power_DN2: FloatArray
-    modes: FloatArray
-    signal_DN: float
-    common_mode: float = 0.0
-    row_variance_DN2: float = 0.0
-    row_sd_DN2: float = 0.0
-    column_variance_DN2: float = 0.0
-    column_sd_DN2: float = 0.0
-    between_series: bool = False
-
-    @property
-    def square_px(self) -> int:
-        """Pixels along a side of the squares."""
-        return 2 * (int(self.power_DN2.shape[0]) - 1)
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Frequencies in use (K + 1, K + 1)."""
-        return np.asarray(self.modes > 0)
-
-    @property
-    def samples(self) -> float:
-        """Independent frames x pixels."""
-        return 2.0 * float(self.modes.sum())
-
-    def times(self, factor: float) -> "NoisePower":
-        """The power times a known factor."""
-        names = ("power_DN2", "row_variance_DN2", "row_sd_DN2", "column_variance_DN2", "column_sd_DN2")
-        return replace(self, **{name: factor * getattr(self, name) for name in names})
-
-    def filled(self, expected_DN2: FloatArray) -> FloatArray:
-        """Power (K + 1, K + 1), DN^2: `expected_DN2` where it was not measured."""
-        return np.asarray(np.where(self.used, self.power_DN2, expected_DN2))
-
-    def variance_DN2(self, expected_DN2: FloatArray) -> float:
-        """Variance of one pixel, DN^2: mean over frequencies, those that were not measured as expected."""
-        return float(np.sum(mode_share(self.square_px) * self.filled(expected_DN2)))
 
 
 def square_side_px(shape: tuple[int, int]) -> int:
@@ -144,28 +90,149 @@ def usable(side: int) -> NDArray[np.bool_]:
     return np.asarray(np.outer(left, left) > _LEAST_LEFT)
 
 
-@lru_cache(maxsize=16)
-def _seen_axis(side: int) -> FloatArray:
-    """What squares show at each frequency of noise at each other (shown, of noise): 1 in sum for white noise.
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """What the squares of a series show of the power that noise has.
 
-    Of the covariance at a lag a square keeps what taper and projection leave of it, over what they leave of white noise.
+    Fields: parts: share of the squares, and for rows and for columns what one of them keeps at each frequency of noise at each
+    other (shown, of noise); left: share of white noise that all of them keep (K + 1, K + 1).
     """
-    basis, taper = _removed(side), _taper(side)
-    lines = np.fft.rfft(np.diag(taper) - basis @ (basis.T * taper), axis=0)
-    order = np.arange(side // 2 + 1)
-    kept = np.stack([np.sum(lines[:, : side - lag] * lines[:, lag:].conj(), axis=1).real for lag in order], axis=1)
-    # where nothing is left of white noise the frequency is not in use
-    kept /= np.maximum(kept[:, :1], 1e-12)
+
+    parts: tuple[tuple[float, FloatArray, FloatArray], ...]
+    left: FloatArray
+
+    @classmethod
+    def of(cls, parts: Sequence[tuple[float, FloatArray, FloatArray]]) -> "Shown":
+        """The squares that these parts make up."""
+        left = sum(share * np.outer(rows.sum(axis=1), columns.sum(axis=1)) for share, rows, columns in parts)
+        return cls(tuple(parts), np.maximum(left, 1e-9))
+
+    def smeared(self, power: FloatArray) -> FloatArray:
+        """A power (K + 1, K + 1) as the squares show it after taper and projection, white noise unchanged."""
+        total = sum(share * (rows @ power @ columns.T) for share, rows, columns in self.parts)
+        return np.asarray(total / self.left)
+
+
+def _by_frequency(kept: FloatArray) -> FloatArray:
+    """Of what is kept at each frequency of a covariance at each lag (K + 1, K + 1): of noise at each frequency instead."""
+    order = np.arange(len(kept))
     weight = np.full(order.size, 2.0)
     weight[0] = weight[-1] = 1.0
+    side = 2 * (order.size - 1)
     cosine = np.cos(2.0 * np.pi * np.outer(order, order) / side)
     return np.asarray((kept * weight) @ (cosine * weight) / side)
 
 
+def _kept_of_lags(lines: FloatArray, lags: NDArray[np.intp]) -> FloatArray:
+    """Power (frequency, lag) that an operator (M, M) on lines leaves of a covariance of 1 at a lag either way."""
+    side = lines.shape[-1]
+    spectra = np.fft.rfft(lines, axis=0)
+    kept = [np.sum(spectra[:, : side - lag] * spectra[:, lag:].conj(), axis=1).real for lag in lags]
+    return np.asarray(np.stack(kept, axis=1) / np.sum(_taper(side) ** 2))
+
+
+@lru_cache(maxsize=16)
+def whole_squares(side: int) -> Shown:
+    """What squares without bad pixels show."""
+    basis, taper = _removed(side), _taper(side)
+    axis = _by_frequency(_kept_of_lags(np.diag(taper) - basis @ (basis.T * taper), np.arange(side // 2 + 1)))
+    return Shown.of([(1.0, axis, axis)])
+
+
+def _pairs(line: FloatArray) -> FloatArray:
+    """Products of a line's (M,) elements summed over pairs at each lag (M / 2 + 1,)."""
+    spectrum = np.fft.rfft(line, n=2 * len(line))
+    return np.asarray(np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[: len(line) // 2 + 1])
+
+
+@lru_cache(maxsize=8)
+def _kept_with_holes(side: int, good: bytes) -> FloatArray:
+    """What squares with bad pixels keep along their last axis at each frequency of noise at each other (K + 1, K + 1).
+
+    A line with fewer pixels loses more of its noise to the same terms: a hundredth of the power of a panel with 3 % of bad
+    pixels. Lines are taken one by one; as in `_Squares`, a missing pixel is filled once with what is projected out, and lags are
+    weighted by the pairs of pixels of whole lines over those that there are.
+    """
+    basis, taper = _removed(side), _taper(side)
+    weight = np.tile(taper**2, len(good) // side**2)
+    kinds, place = np.unique(np.frombuffer(good, dtype=np.bool_).reshape(-1, side), axis=0, return_inverse=True)
+    projector = np.eye(side) - basis @ basis.T
+    order = np.arange(side // 2 + 1)
+    kept, pairs, whole = np.zeros((order.size, order.size)), np.zeros(order.size), np.zeros(order.size)
+    for mask, times in zip(kinds, np.bincount(place.reshape(-1), weights=weight), strict=True):
+        lines = (projector - (projector * ~mask) @ projector) * (taper * mask)
+        kept += times * _kept_of_lags(lines * mask[:, None], order)
+        pairs += times * _pairs(taper * mask)
+        whole += times * _pairs(taper)
+    scale = (whole / np.maximum(pairs, 1e-9 * whole))[np.minimum(np.arange(side), side - np.arange(side))]
+    scaled = np.fft.rfft(np.fft.irfft(kept, n=side, axis=0) * scale[:, None], axis=0).real
+    return _by_frequency(scaled / weight.sum())
+
+
 def smeared(power: FloatArray) -> FloatArray:
-    """A power (K + 1, K + 1) as squares show it after taper and projection, white noise unchanged."""
-    axis = _seen_axis(2 * (power.shape[0] - 1))
-    return np.asarray(axis @ power @ axis.T)
+    """A power (K + 1, K + 1) as squares without bad pixels show it after taper and projection, white noise unchanged."""
+    return whole_squares(2 * (power.shape[0] - 1)).smeared(power)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoisePower:
+    """Temporal noise power of one series, one exposure, over the quadrant of frequencies 0 .. 1/2 (K + 1, K + 1).
+
+    Fields:
+        power_DN2: (K + 1, K + 1), row frequency first; NaN where the projection leaves too little.
+        modes: independent complex amplitudes that carry the same information (K + 1, K + 1), 0 where power is NaN.
+        signal_DN: mean signal above dark over the squares in use.
+        common_mode: variance of the factor that a whole frame shares, relative to the signal (0 where it does not stand
+            out of the pixels' own noise).
+        between_series: whether the two frames of a difference come from different series, so that slow changes of the beam's
+            shape are in it.
+        shown: what the squares show of noise; None: what whole ones do.
+        row_variance_DN2, column_variance_DN2: of offsets common to a row or to a column of one exposure, with the standard
+            deviations row_sd_DN2, column_sd_DN2.
+    """
+
+    power_DN2: FloatArray
+    modes: FloatArray
+    signal_DN: float
+    common_mode: float = 0.0
+    row_variance_DN2: float = 0.0
+    row_sd_DN2: float = 0.0
+    column_variance_DN2: float = 0.0
+    column_sd_DN2: float = 0.0
+    between_series: bool = False
+    shown: Shown | None = None
+
+    @property
+    def square_px(self) -> int:
+        """Pixels along a side of the squares."""
+        return 2 * (int(self.power_DN2.shape[0]) - 1)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Frequencies in use (K + 1, K + 1)."""
+        return np.asarray(self.modes > 0)
+
+    @property
+    def samples(self) -> float:
+        """Independent frames x pixels."""
+        return 2.0 * float(self.modes.sum())
+
+    def times(self, factor: float) -> "NoisePower":
+        """The power times a known factor."""
+        names = ("power_DN2", "row_variance_DN2", "row_sd_DN2", "column_variance_DN2", "column_sd_DN2")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
+    def smeared(self, power: FloatArray) -> FloatArray:
+        """A power (K + 1, K + 1) as the squares of this series show it, white noise unchanged."""
+        return (self.shown or whole_squares(self.square_px)).smeared(power)
+
+    def filled(self, expected_DN2: FloatArray) -> FloatArray:
+        """Power (K + 1, K + 1), DN^2: `expected_DN2` where it was not measured."""
+        return np.asarray(np.where(self.used, self.power_DN2, expected_DN2))
+
+    def variance_DN2(self, expected_DN2: FloatArray) -> float:
+        """Variance of one pixel, DN^2: mean over frequencies, those that were not measured as expected."""
+        return float(np.sum(mode_share(self.square_px) * self.filled(expected_DN2)))
 
 
 @lru_cache(maxsize=16)
@@ -198,6 +265,7 @@ class _Squares:
     level: FloatArray  # mean signal of each square
     pixels: float  # independent pixels in all of them
     pairs: FloatArray | None = None  # whole squares' pairs of pixels over those of squares with holes, by lag
+    shown: Shown | None = None  # what they show of noise, once it is asked for
 
     @classmethod
     def of(
@@ -255,9 +323,21 @@ class _Squares:
             # a missing pixel takes the value of what is projected out, so that it leaves no hole in a slope
             filled = np.where(masks, stack[holes], stack[holes] - left[holes] / window)
             power += self._power_with_holes(_projected(filled * window, basis) * masks)
+        if self.shown is None:
+            self.shown = self._shown()
         folded = _folded(power) / (len(self.corners) * float(np.sum(_taper(side) ** 2)) ** 2)
-        remaining = np.outer(left_of_white_noise(side), left_of_white_noise(side))
-        return np.where(usable(side), folded / np.maximum(remaining, 1e-9), 0.0)
+        return np.where(usable(side), folded / self.shown.left, 0.0)
+
+    def _shown(self) -> Shown:
+        """What these squares show of noise."""
+        holes = [mask for mask in self.masks if mask is not None]
+        whole = whole_squares(self.side)
+        if not holes:
+            return whole
+        share = len(holes) / len(self.corners)
+        masks = np.stack(holes[:: 1 + len(holes) // _MOST_BROKEN])
+        rows, columns = (_kept_with_holes(self.side, one.tobytes()) for one in (masks.swapaxes(1, 2), masks))
+        return Shown.of([*((1.0 - share, one, other) for _, one, other in whole.parts), (share, rows, columns)])
 
     def _power_with_holes(self, squares: FloatArray) -> FloatArray:
         """Summed power (M, M/2 + 1) of squares in which pixels are missing, as if none were.
@@ -396,7 +476,7 @@ class _PowerSum:
         self.shape = np.where(good, signal_DN, 0.0) if self.has_signal else good.astype(np.float64)
         self.norm = float(np.sum(self.shape**2))
         self.power = np.zeros((self.side // 2 + 1, self.side // 2 + 1))
-        self.lines = np.zeros(2)
+        self.lines = [np.zeros(0), np.zeros(0)]
         self.factors: list[float] = []
         self.count = 0
 
@@ -406,7 +486,8 @@ class _PowerSum:
         factor = float(np.sum(kept * self.shape)) / self.norm
         kept -= factor * self.shape
         self.power += self.squares.power(kept)
-        self.lines += [_line_variance(kept, self.good, axis) for axis in (1, 0)]
+        steps = [_line_steps(kept, self.good, axis) ** 2 for axis in (1, 0)]
+        self.lines = [last + one if self.count else one for last, one in zip(self.lines, steps, strict=True)]
         self.factors.append(factor)
         self.count += 1
 
@@ -433,10 +514,10 @@ class _PowerSum:
         weight[0] = weight[-1] = 1.0
         found = []
         for axis, line in enumerate((power[:, lowest], power[lowest])):
-            rows, columns = self.good.shape if axis == 0 else self.good.shape[::-1]
+            columns = self.good.shape[1 - axis]
             expected = float(np.nansum(weight * step * np.nan_to_num(line, nan=plateau)) / side) / columns
-            measured = float(self.lines[axis]) / (single * self.count)
-            found.append((measured - expected, math.sqrt(3.0 / (degrees * rows)) * max(measured, expected)))
+            measured, relative_sd = _line_variance(self.lines[axis] / (single * self.count), degrees)
+            found.append((measured - expected, relative_sd * max(measured, expected)))
         return NoisePower(
             power_DN2=power,
             modes=modes,
@@ -446,6 +527,7 @@ class _PowerSum:
             row_sd_DN2=found[0][1],
             column_variance_DN2=found[1][0],
             column_sd_DN2=found[1][1],
+            shown=self.squares.shown,
         )
 
 
@@ -463,14 +545,31 @@ def _at_zero(power: FloatArray, modes: FloatArray) -> float:
     return float(np.exp(found[0]))
 
 
-def _line_variance(difference: FloatArray, good: NDArray[np.bool_], axis: int) -> float:
-    """Half the mean square step between the means of neighbouring lines (DN^2): rows for axis 1, columns for axis 0."""
+def _line_steps(difference: FloatArray, good: NDArray[np.bool_], axis: int) -> FloatArray:
+    """Steps between the means of neighbouring lines (step,), DN: rows for axis 1, columns for axis 0."""
     count = good.sum(axis=axis)
     means = difference.sum(axis=axis) / np.maximum(count, 1)
     usable = count > 0.5 * good.shape[axis]
-    steps = np.diff(means)[usable[1:] & usable[:-1]]
-    # robust: a line of a cluster or of a readout block may step by itself
-    return 0.5 * (1.4826 * float(np.median(np.abs(steps)))) ** 2 if steps.size else 0.0
+    return np.asarray(np.diff(means)[usable[1:] & usable[:-1]])
+
+
+def _line_variance(mean_squares_DN2: FloatArray, degrees: float) -> tuple[float, float]:
+    """Variance of one line's mean (DN^2) from mean square steps between lines (step,), and its relative standard deviation.
+
+    The median over the lines, as a line of a cluster or of a readout block may step by itself. A mean square of n differences
+    follows chi-square over n, whose median m is known; the median of N of them has the variance 1 / (4 N f(m)^2), f their
+    density. Neighbouring steps share a line: the variance is half as large again, as it is for mean squares.
+    """
+    from scipy.special import gammaincinv, gammaln
+
+    if mean_squares_DN2.size == 0:
+        return 0.0, 0.0
+    half = 0.5 * degrees
+    middle = float(gammaincinv(half, 0.5))  # of chi-square over 2
+    relative_density = math.exp(half * math.log(middle) - middle - float(gammaln(half)))  # times the median itself
+    median = float(np.median(mean_squares_DN2))
+    relative_sd = math.sqrt(1.5 / mean_squares_DN2.size) / (2.0 * relative_density)
+    return 0.5 * median * half / middle, relative_sd
 
 
 def _folded(power: FloatArray) -> FloatArray:
@@ -511,7 +610,7 @@ def correlation_of_quanta(
         side = item.square_px
         order = np.arange(side // 2 + 1)
         share = mode_share(side)
-        shown = smeared(fitted)
+        shown = item.smeared(fitted)
         seen = item.used & (shown > 0)
         raised = fitted / np.where(seen, shown, 1.0)
         quanta = np.where(seen, fitted + raised * (item.filled(expected) - expected), fitted)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..generator.spread.psf import CLEAR_LAYER, Spread
-from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, smeared, spread_of_bins, usable
+from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, spread_of_bins, usable
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
@@ -30,6 +30,8 @@ _LOW_BAND = 0.2  # cycles a pixel, up to which the second route extrapolates to 
 _SILENT = 1e-6  # of the brightest series' power: below that a series is known as well as can be used
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
+_MOST_ROUNDS = 4  # of fits with a scatter of series that is known better each time
+_CHANCE = 1e-3  # that series which agree look as if they did not
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
 _BOUNDS = {
     "sigma_px2": (0.0, (0.1 * LARGEST_SQUARE_PX) ** 2),
@@ -91,7 +93,8 @@ class SpreadFit:
     slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
     white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
     in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
-    excess_DN2: slow changes left, one a series; other_route: gains by extrapolated power over those of the fit, with its
+    excess_DN2: slow changes left, one a series; series_ratio: noise of each series over the fitted, with its standard
+    deviation; other_route: gains by extrapolated power over those of the fit, with its
     standard deviation; criteria (family -> twice the logarithm of the best family's evidence over its own); expected_DN2: power of
     each series as squares show it; quanta_DN2: that of what follows the signal, not smeared; slow_DN2:
     that of slow changes, which expected_DN2 leaves out.
@@ -113,6 +116,7 @@ class SpreadFit:
     chi_square: float
     degrees: float
     excess_DN2: FloatArray
+    series_ratio: tuple[tuple[float, float], ...]
     other_route: tuple[float, float]
     criteria: dict[str, float]
     expected_DN2: tuple[FloatArray, ...] = field(repr=False)
@@ -224,6 +228,8 @@ class _Problem:
         self.group = list(group)
         self.groups = max(group, default=-1) + 1
         self.sides = sorted({item.square_px for item in series})
+        # squares of one size show nearly the same of noise in all series: those of the series that tells most stand for them
+        self.squares = {item.square_px: item for item in sorted(series, key=lambda item: item.samples)}
         self.data: list[FloatArray] = []
         self.modes: list[FloatArray] = []
         self.independent = 0.0  # bins are correlated: so many of them would be independent
@@ -277,7 +283,7 @@ class _Problem:
 
     def shapes(self, spread: Spread) -> dict[int, FloatArray]:
         """Power of unit quanta on each side's frequencies (K + 1, K + 1), as tapered squares show it."""
-        return {side: smeared(spread.noise_power(side)) for side in self.sides}
+        return {side: self.squares[side].smeared(spread.noise_power(side)) for side in self.sides}
 
     def in_cells(self, spread: Spread) -> dict[int, FloatArray]:
         """The same (cell,)."""
@@ -665,8 +671,10 @@ def fit_spread(
     """Spread, gains and read noise from the noise power of series (weighted least squares, weights from the fit itself).
 
     The spread is the simplest of those that are likely and whose gains are near the mean of all. Standard deviations hold:
-    sampling; the misfit, by chi-square where it is above its expectation; what other spreads say, by their evidence (model
-    averaging); and for gains the second route, where it differs by more than its own noise.
+    sampling; the misfit, by chi-square where it is above its expectation, over all frequencies or from series to series; what
+    other spreads say, by their evidence (model averaging); and for gains the second route, where it differs by more than its own
+    noise. Where the noise of series departs from the lines by more than chance, a variance that all share is added to each, and
+    all is fitted anew.
 
     Args:
         series: noise powers, darks included (signal 0).
@@ -676,11 +684,33 @@ def fit_spread(
     Raises:
         FitError: no series with signal, or the least-squares problem has no solution.
 
-    Source: model averaging: Buckland, Burnham, Augustin, Biometrics 53 (1997) 603; test of two routes: Hausman,
-    Econometrica 46 (1978) 1251. Checked against: noise of known spread, tests/test_calibration_spread_fit.py.
+    Source: scatter of series: Birge, Phys. Rev. 40 (1932) 207; Paule and Mandel, J. Res. NBS 87 (1982) 377; model averaging:
+    Buckland, Burnham, Augustin, Biometrics 53 (1997) 603; test of two routes: Hausman, Econometrica 46 (1978) 1251. Checked
+    against: noise of known spread, tests/test_calibration_spread_fit.py.
     """
     if not any(index >= 0 for index in group):
         raise FitError("the noise fit needs at least one flat series with two or more frames")
+    fit = _fit_of(series, group, most_read_DN2)
+    degrees = len(series) - len(fit.gain_DN) - 1
+    scatter = 0.0
+    for _ in range(_MOST_ROUNDS):
+        last, scatter = scatter, _scatter_of_series(fit.series_ratio, degrees)
+        if scatter <= last * 1.1:
+            break
+        # where series differ by more than chance, none of them tells more than that lets it
+        shares = [1.0 / (1.0 + scatter * float(item.modes.sum())) for item in series]
+        fit = _fit_of(
+            [replace(item, modes=share * item.modes) for item, share in zip(series, shares, strict=True)],
+            group,
+            most_read_DN2,
+        )
+        sampling = zip(fit.series_ratio, shares, strict=True)
+        fit = replace(fit, series_ratio=tuple((ratio, sd * math.sqrt(share)) for (ratio, sd), share in sampling))
+    return fit
+
+
+def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None) -> SpreadFit:
+    """`fit_spread` with series that are believed as far as their modes say."""
     problem = _Problem(series, group, most_read_DN2)
     members = _members(problem)
     drifting = _drifting(problem, _likeliest(members))
@@ -697,24 +727,26 @@ def fit_spread(
     chosen = _representative(candidates, weights, (least, inflation))
     if not np.all(np.isfinite(chosen.coefficients)):
         raise FitError("the noise power has no fit; look for saturated, constant or processed frames")
+    expected = _expected(problem, chosen)
+    ratios = _of_series(problem, chosen, expected)
+    scatter = max(inflation, _scatter(ratios, len(ratios) - groups - 1))
     gain, slope = chosen.gains, chosen.slopes
     gain_variance, slope_variance = np.zeros(groups), np.zeros(groups)
-    spread_variance = dict.fromkeys(_spread_variances(chosen, inflation), 0.0)
+    spread_variance = dict.fromkeys(_spread_variances(chosen, scatter), 0.0)
     evidence: dict[str, float] = {}
     for share, item in zip(weights, candidates, strict=True):
         evidence[item.family] = evidence.get(item.family, 0.0) + float(share)
-        own_gain, own_slope = _variances(item, groups, inflation)
+        own_gain, own_slope = _variances(item, groups, scatter)
         # scales are averaged by their logarithms
         gain_variance += share * (own_gain + (gain * _log_ratio(item.gains, gain)) ** 2)
         slope_variance += share * (own_slope + (slope * _log_ratio(item.slopes, slope)) ** 2)
-        for name, own in _spread_variances(item, inflation).items():
+        for name, own in _spread_variances(item, scatter).items():
             moved = getattr(item.spread, name) - getattr(chosen.spread, name)
             reach_of_none = name == "tail_px" and min(item.spread.tail_share, chosen.spread.tail_share) == 0
             spread_variance[name] += float(share) * (own + (0.0 if reach_of_none else moved**2))
     gain_moved, slope_moved, read_moved = _slow_as_power(problem, chosen)
     gain_variance += gain_moved**2
     slope_variance += slope_moved**2
-    expected = _expected(problem, chosen)
     other = _other_route(problem, chosen, expected)
     gain_variance = gain_variance + max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2) * gain**2
     quantum, white = chosen.coefficients[:groups], chosen.coefficients[groups : 2 * groups]
@@ -733,7 +765,7 @@ def fit_spread(
         white_fraction=white / np.where(quantum > 0, quantum, np.nan),
         read_variance_DN2=read + rows + columns,
         read_sd_DN2=math.hypot(
-            math.sqrt(max(inflation * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd, read_moved
+            math.sqrt(max(scatter * float(chosen.covariance[2 * groups, 2 * groups]), 0.0)), lines_sd, read_moved
         ),
         most_read_DN2=problem.most_read_DN2,
         row_variance_DN2=max(rows, 0.0),
@@ -741,6 +773,7 @@ def fit_spread(
         chi_square=chosen.chi_square,
         degrees=problem.independent,
         excess_DN2=excess,
+        series_ratio=tuple(ratios),
         other_route=other,
         criteria={
             family: -2.0 * math.log(max(value, 1e-300) / max(evidence.values())) for family, value in evidence.items()
@@ -749,6 +782,47 @@ def fit_spread(
         quanta_DN2=_quanta(problem, chosen),
         slow_DN2=_slow_changes(problem, chosen),
     )
+
+
+def _of_series(problem: _Problem, item: _Candidate, expected: Sequence[FloatArray]) -> list[tuple[float, float]]:
+    """Whole power of each series over what is fitted, and the standard deviation of that; nan where nothing is fitted."""
+    found = []
+    for one, power, slow in zip(problem.series, expected, _slow_changes(problem, item), strict=True):
+        fitted = np.where(one.used, power + slow, 0.0)
+        lit = fitted > 0
+        if lit.any():
+            ratio = float(np.average(one.power_DN2[lit] / fitted[lit], weights=one.modes[lit]))
+            found.append((ratio, 1.0 / math.sqrt(float(one.modes[lit].sum()))))
+        else:
+            found.append((math.nan, math.nan))
+    return found
+
+
+def _scatter(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
+    """Chi-square a degree of freedom of the series' whole power; 1 where no degree is left.
+
+    Where frames of a series are averages, or its level bends, its frequencies agree with each other: only the series differ.
+    """
+    known = [((ratio - 1.0) / sd) ** 2 for ratio, sd in ratios if math.isfinite(ratio)]
+    return sum(known) / degrees if degrees > 0 else 1.0
+
+
+def _scatter_of_series(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
+    """Relative variance that series have besides their sampling, which makes their chi-square what it should be; 0 where that
+    is within chance.
+
+    Args:
+        ratios: noise of each series over the fitted, and its standard deviation by sampling.
+        degrees: series less what was fitted to them.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import chdtri
+
+    known = np.array([one for one in ratios if math.isfinite(one[0])]).reshape(-1, 2)
+    square, sampling = (known[:, 0] - 1.0) ** 2, known[:, 1] ** 2
+    if degrees < 1 or float(np.sum(square / sampling)) < float(chdtri(degrees, _CHANCE)):
+        return 0.0
+    return float(brentq(lambda more: float(np.sum(square / (sampling + more))) - degrees, 0.0, float(square.sum())))
 
 
 def _likeliest(members: Sequence[tuple[float, _Candidate]]) -> _Candidate:

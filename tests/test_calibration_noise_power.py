@@ -55,6 +55,57 @@ def test_power_is_that_of_the_noise_within_sampling_error(spread):
     assert abs(found.row_variance_DN2) < 4.0 * found.row_sd_DN2
 
 
+@pytest.mark.parametrize("blurred", [False, True], ids=["white", "blurred"])
+def test_bad_pixels_take_nothing_from_the_power(blurred):
+    """A dead column, a cluster and 2 % single bad pixels: the power at low and at other frequencies within its scatter.
+
+    The same noise with and without holes: 60 frames of 64 x 64; the holes' own scatter is about 0.1 % at all frequencies and
+    0.7 % at the lowest lines in use. Without account of the holes they are 1 % and 8 % too low.
+    """
+    shape = (64, 64)
+    good = np.random.default_rng(1).random(shape) > 0.02
+    good[:, 27] = False
+    good[40:46, 10:16] = False
+    spread = Spread(sigma_px=0.8, tail_share=0.1, tail_px=1.5)
+    rng = np.random.default_rng(2)
+    if blurred:
+        noise = {"gain_DN": 1.0, "white_fraction": 0.0, "read_variance_DN2": 0.0, "spread": spread, "rng": rng}
+        frames = np.stack([sample_frame_noise(np.ones(shape), **noise) for _ in range(60)])
+    else:
+        frames = rng.standard_normal((60, *shape))
+    everywhere = np.ones(shape, bool)
+    whole = compute_noise_power([frames], signal_DN=np.zeros(shape), good=everywhere)
+    broken = compute_noise_power([np.where(good, frames, 0.0)], signal_DN=np.zeros(shape), good=good)
+    power = spread.noise_power(whole.square_px) if blurred else np.ones_like(whole.power_DN2)
+    shown = [item.smeared(power) for item in (whole, broken)]
+    used = whole.used & broken.used
+    order = np.arange(power.shape[0])
+    lowest = np.minimum(order[:, None], order[None, :])
+    for chosen, most in ((used, 0.004), (used & (lowest == 1), 0.025)):
+        found = [np.sum(item.power_DN2[chosen]) for item in (whole, broken)]
+        expected = [np.sum(item[chosen]) for item in shown]
+        assert found[1] / found[0] == pytest.approx(expected[1] / expected[0], abs=most)
+
+
+def test_the_variance_of_lines_is_neither_too_large_nor_surer_than_it_is():
+    """White noise and offsets of rows of a tenth of it: 150 series of small frames, mean within four standard errors."""
+    shape, rows_DN2 = (64, 64), 0.01
+    rng = np.random.default_rng(11)
+    found = []
+    for _ in range(150):
+        frames = rng.standard_normal((8, *shape)) + math.sqrt(rows_DN2) * rng.standard_normal((8, shape[0], 1))
+        power = compute_noise_power([frames], signal_DN=np.zeros(shape), good=np.ones(shape, bool))
+        found.append(
+            [power.row_variance_DN2 - rows_DN2, power.row_sd_DN2, power.column_variance_DN2, power.column_sd_DN2]
+        )
+    off_rows, sd_rows, off_columns, sd_columns = np.array(found).T
+    for off, sd in ((off_rows, sd_rows), (off_columns, sd_columns)):
+        z = off / sd
+        assert abs(z.mean()) < 4.0 / math.sqrt(z.size)
+        # the standard deviation of a sample of 150: 6 %
+        assert 0.75 < z.std() < 1.24
+
+
 def test_drift_of_level_and_shape_and_offsets_of_lines_leave_the_power_alone():
     """Level 1 %, shape 0.3 % rms and lines of half a read noise from frame to frame: summed up, forty times the noise."""
     rng = np.random.default_rng(3)

@@ -55,6 +55,26 @@ def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(sp
     assert fit.chi_square < 1.6 * fit.degrees
 
 
+def test_a_series_with_the_noise_of_averages_widens_what_it_spoils():
+    """One flat of three holds means of three exposures: no frequency shows it, the series do, and the interval holds the gain."""
+    spread, gain = SPREADS["narrow"], 8.0
+    rng = np.random.default_rng(5)
+    found = []
+    for signal, averaged in ((500.0, 1), (1000.0, 1), (2000.0, 3), (0.0, 1), (0.0, 1)):
+        level = np.full(SHAPE, signal)
+        noise = {"gain_DN": gain, "white_fraction": WHITE, "read_variance_DN2": READ_DN2, "spread": spread, "rng": rng}
+        frames = [
+            np.mean([level + sample_frame_noise(level, **noise) for _ in range(averaged)], axis=0) for _ in range(8)
+        ]
+        found.append(compute_noise_power([np.stack(frames)], signal_DN=level, good=GOOD))
+    fit = fit_spread(found, group=[0, 0, 0, -1, -1])
+    without = fit_spread([*found[:2], *found[3:]], group=[0, 0, -1, -1])
+    assert abs(fit.gain_DN[0] - gain) < 1.96 * fit.gain_sd_DN[0]
+    assert fit.gain_sd_DN[0] > 2.0 * without.gain_sd_DN[0]
+    ratios = [ratio for ratio, _ in fit.series_ratio]
+    assert np.argmax(np.abs(np.array(ratios[:3]) - 1.0)) == 2
+
+
 def test_interference_in_the_electronics_is_noise_of_the_darks_and_no_reason_to_know_nothing():
     spread, amplitude = SPREADS["narrow"], 20.0
     fit = fit_spread(powers(spread, seed=3, interference_DN=amplitude), group=GROUPS)

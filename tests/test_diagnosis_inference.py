@@ -518,7 +518,9 @@ def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
 
 
 def test_reach_is_sought_before_shape_and_effects_of_a_leading_pair_alone_as_well():
-    reach, shape, angle = (SimpleNamespace(name=name) for name in ("length_mm", "order", "direction_deg"))
+    reach, shape, angle = (
+        SimpleNamespace(name=name, sought_last=name == "order") for name in ("length_mm", "order", "direction_deg")
+    )
     assert _in_turn([reach, shape]) == [[reach], [reach, shape]]
     assert _in_turn([reach, angle]) == [[reach, angle]]
     assert _in_turn([shape]) == [[shape]]

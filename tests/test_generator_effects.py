@@ -737,16 +737,16 @@ def test_a_kV_error_is_the_model_at_the_other_voltage(series_line):
 
 
 def test_large_kV_errors_go_on_where_small_ones_end(series_line):
-    """At 5.5 % the count changes to a voltage 5 % off: no step in level, gain or hardness."""
+    """At 6 % sums go on to higher energies: no step in level, gain or hardness."""
     for asked in (request(), request(**BEHIND)):
-        below, above = (expect(series_line, asked, applied("kv_error", value)) for value in (5.4999, 5.5001))
+        below, above = (expect(series_line, asked, applied("kv_error", value)) for value in (5.9999, 6.0001))
         np.testing.assert_allclose(above.mean_DN, below.mean_DN, rtol=1e-4)
         np.testing.assert_allclose(above.quantum_variance_DN2, below.quantum_variance_DN2, rtol=1e-4)
 
 
 def test_a_kV_error_beyond_the_tables_is_refused(series_line):
-    with pytest.raises(InputError, match=r"strength of kv_error: got 12 %"):
-        expect(series_line, request(), applied("kv_error", 12.0))
+    with pytest.raises(InputError, match=r"strength of kv_error: got 25 %"):
+        expect(series_line, request(), applied("kv_error", 25.0))
 
 
 def test_a_filtration_error_is_another_sheet_of_aluminium(series_line):

@@ -155,6 +155,12 @@ def damage(path, edit):
         edit(file)
 
 
+def replaced(file, name, values):
+    """Put other values in the place of an array."""
+    del file[name]
+    file[name] = values
+
+
 DAMAGES = {
     "another format": (lambda file: file.attrs.modify("format", "other"), "other version 1"),
     "another version": (lambda file: file.attrs.modify("version", 2), "raytwin-twin version 2"),
@@ -172,6 +178,20 @@ DAMAGES = {
     "a map of text": (
         lambda file: [file["maps"].pop("dark_DN"), file["maps"].create_dataset("dark_DN", data="abc")],
         "one shape|damaged file",
+    ),
+    "a map of complex numbers": (
+        lambda file: replaced(file, "maps/gain_relative", np.ones(SHAPE, np.complex64)),
+        "values of type complex64; expected real numbers",
+    ),
+    "complex draws": (
+        lambda file: replaced(file, "spectral/best", file["spectral/best"][()] * 1j),
+        "values of type complex128; expected real numbers",
+    ),
+    "draws that no number holds": (
+        lambda file: replaced(
+            file, "spectral/samples", np.full(file["spectral/samples"].shape, np.longdouble("1e4000"))
+        ),
+        "not finite",
     ),
 }
 

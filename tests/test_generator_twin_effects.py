@@ -10,6 +10,7 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.calibration.validate import validate_twin
 from raytwin.cli import main
+from raytwin.errors import InputError
 from raytwin.files import sha256_of_file
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.frames.present_line import present_line
@@ -67,9 +68,14 @@ def test_excess_noise_raises_the_quantum_variance_by_its_strength_and_leaves_the
 
 @pytest.mark.parametrize("effect", sorted(EFFECTS))
 @pytest.mark.parametrize("setting", [MEASURED, UNMEASURED], ids=["measured", "unmeasured"])
-def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(make_model_twin, effect, setting):
+@pytest.mark.parametrize("size", ["weak", "strong", "beyond"])
+def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long_flat(
+    make_model_twin, effect, setting, size
+):
     twin = make_model_twin((24, 24), readout_ms=2.0)
-    applied = AppliedEffect(id=effect, parameters={}, since="calibration")
+    known = EFFECTS[effect].strength
+    strength = {"weak": known.low, "strong": known.high, "beyond": 1.8 * known.high}[size]
+    applied = AppliedEffect(id=effect, parameters={"strength": strength}, since="calibration")
     found = predict_flatfield(replace(twin, effects=(applied,)), setting)
     plain = predict_flatfield(twin, setting)
     asked = SeriesRequest(kind="flat", setting=setting, frames=1, exposure_ms=setting.exposure_ms)
@@ -150,9 +156,9 @@ def test_an_effect_that_cannot_be_predicted_is_named_in_one_warning(series_line)
     assert "effect kv_error is left out: the twin has no spectral part" in found.warnings
 
 
-def test_a_voltage_beyond_the_tables_is_said(series_line):
-    line = present_line(with_effect(series_line, "kv_error", strength=8.0))
-    assert line.warnings == ("effect kv_error: 8 % off in all is taken as 6 %, where the tables of spectra end",)
+def test_a_voltage_beyond_the_tables_is_refused(series_line):
+    with pytest.raises(InputError, match="within 20 % of the tube voltage"):
+        present_line(with_effect(series_line, "kv_error", strength=25.0))
 
 
 def test_worked_in_effects_are_off_the_twin_and_others_stay(series_line):

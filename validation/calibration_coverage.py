@@ -29,6 +29,7 @@ from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.errors import InputError, RaytwinError
+from raytwin.files import whole_file
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.lab.families import FAMILIES
 from raytwin.lab.protocols import run_protocol, truth_path
@@ -158,6 +159,24 @@ def print_table(table: list[dict[str, Any]]) -> None:
         )
 
 
+def kept_rows(path: Path | None, drawn: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows and failures of systems that an earlier run of the same options left in the file."""
+    if path is None or not path.exists():
+        return [], []
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    if kept["drawn"] != drawn:
+        raise SystemExit(f"{path} holds systems drawn otherwise: {kept['drawn']}")
+    return kept["rows"], kept["failed"]
+
+
+def keep(path: Path, drawn: dict[str, Any], rows: list[dict[str, Any]], failed: list[dict[str, Any]]) -> None:
+    """Write what there is, so that a stopped run goes on from there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    answer = {"drawn": drawn, "table": summarise(rows), "rows": rows, "failed": failed}
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> int:
     """Run the seeds and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -170,15 +189,26 @@ def main() -> int:
     parser.add_argument("--family", action="append", help="draw from these families alone; none: the plain line")
     parser.add_argument("--leave-out", action="append", default=[], help="families not to draw from")
     parser.add_argument("--no-unkindness", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--minutes", type=float, help="begin no system after so long")
+    parser.add_argument("--json", type=Path, help="results; a stopped run goes on from what stands there")
     arguments = parser.parse_args()
     families = None if arguments.family is None else tuple(name for name in arguments.family if name != "none")
     if arguments.leave_out:
         families = tuple(name for name in families or FAMILIES if name not in arguments.leave_out)
-    rows: list[dict[str, Any]] = []
-    failed: list[dict[str, Any]] = []
+    drawn = {
+        "size": arguments.size,
+        "frames": arguments.frames,
+        "protocol": arguments.protocol,
+        "families": None if families is None else list(families),
+        "unkind": not arguments.no_unkindness,
+    }
+    rows, failed = kept_rows(arguments.json, drawn)
+    done = {row["seed"] for row in (*rows, *failed)}
+    wanted = range(arguments.first, arguments.first + arguments.seeds)
     started = time.perf_counter()
-    for seed in tqdm(range(arguments.first, arguments.first + arguments.seeds), disable=None, file=sys.stderr):
+    for seed in tqdm([seed for seed in wanted if seed not in done], disable=None, file=sys.stderr):
+        if arguments.minutes is not None and time.perf_counter() - started > 60.0 * arguments.minutes:
+            break
         try:
             rows += measure_seed(
                 seed,
@@ -191,19 +221,17 @@ def main() -> int:
             )
         except RaytwinError as error:
             failed.append({"seed": seed, "error": str(error)})
+        if arguments.json is not None:
+            keep(arguments.json, drawn, rows, failed)
     table = summarise(rows)
+    systems = len({row["seed"] for row in (*rows, *failed)})
     print(
-        f"{arguments.seeds} hidden systems, {arguments.size} x {arguments.size} pixels, {arguments.frames} frames a"
+        f"{systems} hidden systems, {arguments.size} x {arguments.size} pixels, {arguments.frames} frames a"
         f" series, {time.perf_counter() - started:.0f} s"
     )
     print_table(table)
     for one in failed:
         print(f"seed {one['seed']}: {one['error']}")
-    if arguments.json is not None:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(
-            json.dumps({"table": table, "rows": rows, "failed": failed}, indent=1) + "\n", encoding="utf-8"
-        )
     return 0
 
 

@@ -28,4 +28,5 @@ def order_parameter(usual: float) -> Parameter:
         default=usual,
         source="1/2: exponential over distance, 1: Lorentzian, large: Gaussian",
         log=True,
+        sought_last=True,
     )

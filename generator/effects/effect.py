@@ -51,6 +51,7 @@ class Parameter:
     Fields: name; unit (empty: none); low, high (plausible range of its size); default; source (of the range); log
     (fitted in its logarithm); signed (may be negative with the same size); fitted (False: states a condition of the
     session, such as its length, and is not estimated); fitted_if_later (estimated where the effect came after the calibration);
+    sought_last (a shape that can stand for another parameter's size far off: sought once these are found);
     tried_without_times (values from which it is estimated where a session does not state its pauses); pixel_power: a number
     found in squares of n x n pixels times n to this power is that of pixels (1: a length in pixels); most: beyond which there is
     nothing (100 % of the pixels).
@@ -66,6 +67,7 @@ class Parameter:
     signed: bool = False
     fitted: bool = True
     fitted_if_later: bool = False
+    sought_last: bool = False
     tried_without_times: tuple[float, ...] = ()
     pixel_power: float = 0.0
     most: float = math.inf

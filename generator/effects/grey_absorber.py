@@ -117,6 +117,7 @@ GREY_ABSORBER = Effect(
             default=0.03,
             source="standard deviation of the border's blur, in widths of the field: focal spot times the enlargement of the border",
             log=True,
+            sought_last=True,
         ),
         Parameter(
             name="sheet_share",
@@ -126,6 +127,7 @@ GREY_ABSORBER = Effect(
             default=0.0,
             source="0: grey, as a mesh of wires; 1: as a sheet of aluminium",
             log=False,
+            sought_last=True,
         ),
     ),
     stage="arrivals",
@@ -136,8 +138,12 @@ GREY_ABSORBER = Effect(
     isolated_by="flats with the absorber's side of the beam uncovered, and with the panel turned by 180 degrees",
     shows=Shows(series=LIT_SERIES, axis="position"),
     absorbed="maps of beams",
+    # a wide penumbra tells from afar which way its border lies; it narrows as the border is found
     grid=Grid(
         shares=(0.5,),
-        variants=tuple({"direction_deg": angle, "sheet_share": 0.5} for angle in (0.0, 90.0, 180.0, 270.0)),
+        variants=tuple(
+            {"direction_deg": angle, "border": 0.0, "penumbra": 0.12, "sheet_share": 0.5}
+            for angle in (0.0, 90.0, 180.0, 270.0)
+        ),
     ),
 )

@@ -1,19 +1,14 @@
 """Tube voltage that differs from the calibrated one: kV (1 + d)."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 from ...errors import InputError
 from ..line.line_state import LineContext, LineState
+from ..line.spectral_signal import LARGEST_KV_ERROR
 from ..line.twin import Twin
 from ..line.twin_numbers import moved, with_spectrum
 from ._spectrum import shifted_parameter
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows
-
-# the spectral model's table of tube voltage errors ends at 6 %; larger ones are counted from a voltage 5 % off
-_TABLE_END = 0.055
-_REBASED = 0.05
 
 
 def _shift_kV(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -22,33 +17,31 @@ def _shift_kV(state: LineState, parameters: Mapping[str, float], context: LineCo
     before = 0.0
     if context.model is not None and state.parameters is not None:
         before = float(state.parameters[context.model.names.index("kV_error")])
-    total = (1.0 + before) * (1.0 + parameters["strength"] / 100.0) - 1.0
-    factor = 1.0 if abs(total) <= _TABLE_END else 1.0 + math.copysign(_REBASED, total)
-    rest = (1.0 + total) / factor - 1.0
-    if abs(rest) > _TABLE_END:
+    total = _total(before, parameters["strength"])
+    return shifted_parameter(state, context, "kV_error", total - before, "kv_error")
+
+
+def _total(before: float, strength: float) -> float:
+    """Relative error of the voltage in all.
+
+    Raises:
+        InputError: beyond the tables of spectra.
+    """
+    total = (1.0 + before) * (1.0 + strength / 100.0) - 1.0
+    if abs(total) > LARGEST_KV_ERROR:
         raise InputError(
             "strength of kv_error",
-            received=f"{parameters['strength']:g} % on top of a calibrated {100 * before:.2g} %",
-            expected="together within 10 % of the tube voltage",
+            received=f"{strength:g} % on top of a calibrated {100 * before:.2g} %",
+            expected=f"together within {100 * LARGEST_KV_ERROR:g} % of the tube voltage",
         )
-    return replace(
-        shifted_parameter(state, context, "kV_error", rest - before, "kv_error"), kV_factor=state.kV_factor * factor
-    )
-
-
-_MODEL_END = 0.06  # of the tube voltage: the spectral model's tables of other voltages end there
+    return total
 
 
 def _in_numbers(twin: Twin, strength: float) -> tuple[Twin, list[str]]:
-    told: list[str] = []
     after = moved(twin, "kV_error", lambda values: (1.0 + values) * (1.0 + strength / 100.0) - 1.0)
-    total = float(after.best[after.names.index("kV_error")])
-    if abs(total) > _MODEL_END:
-        told.append(
-            f"effect kv_error: {100 * total:.2g} % off in all is taken as {math.copysign(100 * _MODEL_END, total):g} %,"
-            " where the tables of spectra end"
-        )
-    return with_spectrum(twin, after), told
+    if twin.spectral is not None:
+        _total(float(twin.spectral.best[twin.spectral.names.index("kV_error")]), strength)
+    return with_spectrum(twin, after), []
 
 
 KV_ERROR = Effect(

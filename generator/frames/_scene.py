@@ -163,7 +163,7 @@ class ModelCache:
         """The twin's spectral model, or None where it has none."""
         if twin.spectral is None or request.setting is None:
             return None
-        return spectral_model_of(twin, highest_kV=1.1 * request.setting.kV)
+        return spectral_model_of(twin, highest_kV=request.setting.kV)
 
     def projection(
         self,
@@ -173,7 +173,6 @@ class ModelCache:
         parameters: FloatArray | None,
         attenuation_scale: Mapping[str, float],
         *,
-        kV_factor: float,
         use_measured_level: bool,
     ) -> BeamProjection:
         """Signal and variance of one exposure behind the request's scene, under even illumination."""
@@ -182,10 +181,8 @@ class ModelCache:
             return self._without_spectrum(twin, request, level)
         beam = OpenBeam(kV=request.setting.kV, filters=request.setting.filters)
         shape, scales = self._split(model, parameters, beam)
-        # the tube gives what its true voltage gives; what is known of this setting stays with the stated one
-        true_beam = beam if kV_factor == 1.0 else OpenBeam(kV=beam.kV * kV_factor, filters=beam.filters)
-        key = (id(model), true_beam, shape.tobytes(), tuple(sorted(attenuation_scale.items())))
-        weights = self._shape_weights(model, shape, true_beam)
+        key = (id(model), beam, shape.tobytes(), tuple(sorted(attenuation_scale.items())))
+        weights = self._shape_weights(model, shape, beam)
         signal_scale, gain_scale, secondary = self._level(twin, request, model, beam, level, scales)
         scene = None
         if request.thickness_mm:

@@ -407,7 +407,6 @@ def _drawn(
             model,
             state.parameters,
             state.attenuation_scale,
-            kV_factor=state.kV_factor,
             use_measured_level=choice.use_measured_level,
         )
         state = replace(

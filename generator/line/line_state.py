@@ -132,7 +132,6 @@ class LineState:
 
     Fields:
         parameters: (parameter,) of the spectral model, or None where the twin has none.
-        kV_factor: on the tube voltage, beyond what the parameters say of it.
         attenuation_scale: material of the scene -> factor on its attenuation.
         signal_DN, variance_DN2: mean and quantum variance (secondary quanta in it) of one exposure, above dark, under
             even illumination, before any spread.
@@ -161,7 +160,6 @@ class LineState:
     """
 
     parameters: FloatArray | None
-    kV_factor: float = 1.0
     attenuation_scale: Mapping[str, float] = field(default_factory=dict)
     signal_DN: FloatArray
     variance_DN2: FloatArray

@@ -79,7 +79,10 @@ OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
 _OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
 _ABSORBER = "absorber_mm:"
-_KV_ERRORS = np.linspace(-0.09, 0.06, 31)  # nodes of the tube voltage error; between them linear, 3e-6 of the signal
+# nodes of the tube voltage error; between them linear, 3e-6 of the signal
+_KV_ERRORS: NDArray[np.float64] = np.linspace(-0.2, 0.2, 81)
+LARGEST_KV_ERROR = 0.2
+_USUAL_KV_ERROR = 0.06  # up to it sums end 7 % above the voltage
 _ALL_NODES = slice(None)
 _LOWEST_KEV = (
     5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
@@ -204,7 +207,7 @@ class SpectralModel:
             every += [table_share_name(table, material) for table in OTHER_TABLES]
         self._named(every if names is None else names)
         self.highest_kV = min(highest_kV, MAXIMUM_KV_OF_ANODE.get(anode, MAXIMUM_KV))
-        self.energies_keV = energy_grid_keV(1.07 * self.highest_kV)
+        self.energies_keV = energy_grid_keV((1.01 + LARGEST_KV_ERROR) * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
         self._departures: dict[tuple[str, str], NDArray[np.float64]] = {}
         self._fluence: dict[float, NDArray[np.float64]] = {}
@@ -356,7 +359,9 @@ class SpectralModel:
 
     def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
-        top = min(int(np.searchsorted(self.energies_keV, 1.07 * beam.kV)) + 1, self.energies_keV.size)
+        usual = float(np.max(self._kV_error(samples, beam.kV), initial=0.0)) <= _USUAL_KV_ERROR
+        end_keV = (1.01 + (_USUAL_KV_ERROR if usual else LARGEST_KV_ERROR)) * beam.kV
+        top = min(int(np.searchsorted(self.energies_keV, end_keV)) + 1, self.energies_keV.size)
         energies = self.energies_keV[:top]
         factors, rows = [], []
         for layer, thickness in (

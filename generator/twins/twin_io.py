@@ -161,7 +161,9 @@ def _put_spectral(file: Any, posterior: SpectralPosterior) -> None:
 
 
 def _array(group: Any, name: str, dtype: type[Any]) -> NDArray[Any]:
-    return np.asarray(group[name][()], dtype=dtype)
+    from ...acquisition._hdf5 import real_numbers
+
+    return real_numbers(group[name][()], dtype, where=f"twin {group.file.filename}, {group.name.strip('/')}/{name}")
 
 
 def read_twin(path: str | os.PathLike[str]) -> Twin:
@@ -357,7 +359,7 @@ def _correction(group: Any) -> SpectrumCorrection | None:
     stored = group["log_correction"]
     return SpectrumCorrection(
         kV=tuple(float(value) for value in stored.attrs["kV"]),
-        log_ratio=np.asarray(stored[()], dtype=np.float64),
+        log_ratio=_array(group, "log_correction", np.float64),
         relative=bool(stored.attrs["relative"]),
     )
 

@@ -24,12 +24,11 @@ from raytwin.generator.frames.series import (
     SeriesRequest,
     beam_conditions,
     expected_series,
-    final_state,
     sample_series,
     session_conditions,
     with_conditions,
 )
-from raytwin.generator.line.line_state import STAGES
+from raytwin.generator.line.line_state import STAGES, LineState
 from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding
 from raytwin.generator.line.spectral_signal import OpenBeam
 from raytwin.generator.predictions.predict import spectral_model_of
@@ -644,7 +643,10 @@ def test_what_many_exposures_before_left_is_the_sum_of_what_each_left(series_lin
     found = expect(series_line, asked, effect)
     frames = [found.signal_DN + sum(image * course[n] for image, course in found.trend_DN) for n in range(8)]
     # frame by frame, trap by trap
-    law = final_state(series_line, asked, effects=effect).lag
+    ((_, lag, values),) = in_order(effect)
+    one = np.ones((1, 1))
+    still = LineState(parameters=None, signal_DN=one, variance_DN2=one, flat_factor=one)
+    law = lag.change(still, values, None).lag
     times, caught = np.array(law.time_s)[:, None, None], np.array(law.trapped)[:, None, None]
     held, clock = np.zeros((4, *SHAPE)), 0.0
     for one in earlier:

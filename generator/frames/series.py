@@ -35,7 +35,6 @@ __all__ = [
     "SeriesRequest",
     "beam_conditions",
     "expected_series",
-    "final_state",
     "sample_series",
     "session_conditions",
     "with_conditions",
@@ -255,24 +254,6 @@ def _context(
         options={} if applied is None else applied.options,
         made_of=cache.made_of,
     )
-
-
-def final_state(
-    twin: Twin,
-    request: SeriesRequest,
-    *,
-    effects: Sequence[AppliedEffect] | None = None,
-    parameters: NDArray[np.float64] | None = None,
-    cache: ModelCache | None = None,
-    use_measured_level: bool = True,
-) -> LineState:
-    """The state of the line for one series after all stages: what expectation and samples are computed from.
-
-    Args: as in `expected_series`.
-    """
-    cache = ModelCache() if cache is None else cache
-    lit, late = _lit(twin, request, _Choice(effects, parameters, use_measured_level), cache)
-    return _read_out(twin, request, lit.at_load(), late, cache)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,14 @@
 """Patterns of the gain: what they leave in a mean frame and in projections, against panels on which they are drawn one by one."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics, shares_of_pixels, shares_of_tiles
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
+from raytwin.diagnosis.problem.nuisance_columns import changed_tiles
 from raytwin.generator.frames.defects import gain_pattern, tile_gain
 from raytwin.generator.line.line_state import FixedPattern, TilePattern
 
@@ -72,3 +76,42 @@ def test_projections_vary_by_as_much_as_over_drawn_panels(correlation_px):
     # squares stand for areas that fade out: what is as narrow as they are varies by another factor
     for name, one, other in zip(images, known, seen, strict=True):
         assert one == pytest.approx(other, rel=0.35 if name in ("level", "along", "disc") else 1.5), name
+
+
+@pytest.mark.parametrize("strips_share", [0.0, 1.0, 0.4])
+def test_what_tiles_do_to_a_mean_frame_by_chance_has_the_covariance_of_drawn_panels(strips_share):
+    rng = np.random.default_rng(4)
+    signal = 1000.0 + 3.0 * np.arange(SHAPE[1]) * np.ones((SHAPE[0], 1))
+    # what projections weigh pixels with; none sees the level that all tiles share
+    rows = rng.standard_normal((5, *SHAPE)) + np.linspace(-1.0, 1.0, SHAPE[1])
+    rows -= (rows * signal).mean(axis=(1, 2), keepdims=True) / signal.mean()
+
+    class Projection:
+        def __len__(self):
+            return len(rows)
+
+        def apply(self, images):
+            return np.tensordot(images, rows, axes=((1, 2), (1, 2)))
+
+    class Probes:
+        projection = Projection()
+
+        def __len__(self):
+            return len(rows) + 2  # two scalars besides
+
+    def probes(*, calibrates, beam_on=True):
+        found = Probes()
+        session = SimpleNamespace(calibrates=calibrates, request=SimpleNamespace(beam_on=beam_on))
+        found.series = SimpleNamespace(session=session)
+        return found
+
+    tiles = TilePattern(rms=0.01, side_px=32.0, strips_share=strips_share, seed=0)
+    found = changed_tiles(probes(calibrates=False), signal, tiles)
+    assert not found[len(rows) :].any()
+    assert not changed_tiles(probes(calibrates=True), signal, tiles).any()
+    assert not changed_tiles(probes(calibrates=False, beam_on=False), signal, tiles).any()
+    drawn = np.stack([signal * (tile_gain(replace(tiles, seed=seed), SHAPE) - 1.0) for seed in range(2000)])
+    seen = Projection().apply(drawn)
+    known = (found @ found.T)[: len(rows), : len(rows)]
+    size = np.sqrt(np.outer(np.diag(known), np.diag(known)))
+    np.testing.assert_allclose(seen.T @ seen / len(seen) / size, known / size, atol=5.0 * np.sqrt(2.0 / 2000))

@@ -319,6 +319,27 @@ def test_lines_give_each_series_that_has_them_chance_by_their_direction(since, c
     assert jitter_of(SimpleNamespace(effect="kv_error"), blocks, 3.0) is None
 
 
+@pytest.mark.parametrize(("since", "calibrating"), [("always", 1.0), ("calibration", 0.0)])
+def test_lines_of_light_give_lit_series_chance_the_more_the_more_lines_go_together(since, calibrating):
+    def block(calibrates):
+        lines = np.array([[1.0, 2.0, 0.0], [10.0, 20.0, 0.0]])
+        return SimpleNamespace(lit_lines=lines, session=SimpleNamespace(calibrates=calibrates))
+
+    blocks = [block(True), block(False)]
+
+    def jitter(share, together):
+        parameters = {"column_share": share, "together_lines": together}
+        return jitter_of(SimpleNamespace(effect="line_flicker", since=since, parameters=parameters), blocks, 3.0)
+
+    # of a sum over lines that are alike over L of them the variance is coth(1 / 2 L) times that of lines of their own
+    for share, one in ((0.0, 1.0), (1.0, 10.0)):
+        for together in (0.3, 6.0):
+            more = one / np.tanh(0.5 / together)
+            assert jitter(share, together) == pytest.approx(
+                [more * calibrating, 2 * more * calibrating, 0, more, 2 * more, 0]
+            )
+
+
 def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
     """Lost bits that came after the calibration lower later levels; those that were always there do not."""
     always = curve("quantisation", axis(0))

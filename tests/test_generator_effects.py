@@ -60,7 +60,7 @@ CATALOGUE = {
     "gain_map_error": ("%", 0.1, 3),
     "composition_error": ("%", 0.5, 5),
     "crosstalk": ("%", 3, 40),
-    "tile_gain": ("%", 0.1, 3),
+    "tile_gain": ("%", 0.2, 3),
     "line_flicker": ("%", 0.03, 1),
     "grey_absorber": ("%", 0.5, 60),
 }

@@ -31,7 +31,7 @@ TILE_GAIN = Effect(
         Parameter(
             name="strength",
             unit="%",
-            low=0.1,
+            low=0.2,
             high=3.0,
             default=0.5,
             source="standard deviation over the tiles; amplifiers and bias between two gain calibrations",

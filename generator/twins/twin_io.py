@@ -4,7 +4,9 @@ The twin of a tube alone has `part = "tube"` among its root attributes and no gr
 """
 
 import json
+import math
 import os
+import sys
 from dataclasses import fields
 from typing import Any
 
@@ -33,6 +35,7 @@ from ..spread.psf import Spread
 
 FORMAT = "raytwin-twin"
 VERSION = 1
+_LARGEST_EXPONENT = math.log(sys.float_info.max)
 TUBE = "tube"
 _SDS_OF_EFFECTS = ("strength_sd", "law_sd")
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
@@ -109,6 +112,8 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
                 _put_estimate(noise, f"{name}_interval", spread.intervals[name])
         noise.attrs["white_fraction"] = twin.noise.white_fraction
         noise.attrs["quantised"] = twin.noise.quantised
+        if twin.noise.shared_gain_sd is not None:
+            noise.attrs["shared_gain_sd"] = twin.noise.shared_gain_sd
         exact = Estimate(value=spread.value.sigma_px, low=spread.value.sigma_px, high=spread.value.sigma_px)
         _put_estimate(noise, "psf_sigma_px", spread.intervals.get("sigma_px", exact))
         _put_estimate(noise, "read_noise_DN", twin.noise.read_noise_DN)
@@ -276,6 +281,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             white_fraction=float(noise.attrs["white_fraction"]),
             read_noise_DN=_required(_get_estimate(noise, "read_noise_DN"), "read_noise_DN", path),
             quantised=bool(noise.attrs["quantised"]),
+            shared_gain_sd=_optional_float(noise, "shared_gain_sd"),
         ),
         dark_DN=_required(_get_estimate(noise, "dark_DN"), "dark_DN", path),
         levels=tuple(levels),
@@ -328,11 +334,12 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
     wide = len(spectral.names)
     samples, best = spectral.samples, spectral.best
     whole = samples.ndim == 2 and len(samples) > 0 and samples.shape[1] == wide and best.shape == (wide,)
-    if not (whole and bool(np.isfinite(samples).all()) and bool(np.isfinite(best).all())):
+    # parameters are exponents of what is computed from them; not finite ones fail, too
+    if not (whole and all(bool((np.abs(values) < _LARGEST_EXPONENT).all()) for values in (samples, best))):
         raise FileFormatError(
             f"twin {path}, spectral",
             received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
-            expected=f"finite draws (n, {wide}) and best ({wide},)",
+            expected=f"finite draws (n, {wide}) and best ({wide},), all below {_LARGEST_EXPONENT:.0f}",
             remedy="calibrate again",
         )
     return spectral

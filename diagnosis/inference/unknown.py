@@ -22,7 +22,11 @@ _SWEEPS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chance:
-    """One family of probes that is off where there is no effect: how often, and by how much at most (standard deviations)."""
+    """One family of probes that is off where there is no effect: how often, and by how much at most.
+
+    Fields: frequency; largest: root of the sum of the extra variances of all its probes, standard deviations. The least of `SIZES`,
+    noise that is known to an eighth, may be in a family of any number of probes.
+    """
 
     frequency: float
     largest: float
@@ -41,21 +45,15 @@ CHANCE = _learnt()
 class Beyond:
     """What a residual shows beyond what may vary.
 
-    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_size (size,): log
-    evidence over none of one family that is off, by each of `SIZES`; length: root of the sum of the extra variances of all probes, in
-    standard deviations of the first probes.
+    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_chance: log
+    evidence over none of one family that is off by as much as chance does at most; length: root of the sum of the extra variances of
+    all probes, in standard deviations of the first probes.
     """
 
     log_evidence: float
     place: str
     length: float
-    by_size: NDArray[np.float64]
-
-    @property
-    def by_chance(self) -> float:
-        """Log evidence over none of one family that is off by as much as chance does at most."""
-        small = self.by_size[np.less_equal(SIZES, CHANCE.largest)]
-        return float(np.logaddexp.reduce(small)) - math.log(len(small))
+    by_chance: float
 
     @property
     def allowed(self) -> float:
@@ -113,12 +111,16 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
         place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
     else:
         place = int(np.argmax(tau2 * sizes))
-    by_size = np.logaddexp.reduce(own, axis=0) - math.log(count)
+    largest = np.maximum(CHANCE.largest / np.sqrt(np.maximum(sizes, 1)), SIZES[0])
+    possible = [own[g, largest[g] >= SIZES] for g in range(len(members)) if sizes[g]]
+    by_chance = float(np.logaddexp.reduce([np.logaddexp.reduce(one) - math.log(len(one)) for one in possible]))
     units = observed.units
     length = math.sqrt(
         sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
     )
-    return Beyond(log_evidence=best - base, place=str(names[place]), length=length, by_size=by_size)
+    return Beyond(
+        log_evidence=best - base, place=str(names[place]), length=length, by_chance=by_chance - math.log(count)
+    )
 
 
 def _price(shown: int, count: int) -> float:

@@ -148,13 +148,14 @@ PIXEL_LAWS: tuple[EffectLaw, ...] = (
         build=_crosstalk,
     ),
     EffectLaw(
-        id="tile_gain",
+        id="unknown:tile_gain",
         title="gains of tiles or readout channels",
         unit="%",
         low=0.2,
         high=3.0,
         since="calibration",
         build=_tile_gain,
+        known=False,
     ),
     EffectLaw(
         id="line_flicker",

@@ -1,6 +1,8 @@
 """Patterns of the gain: what they leave in a mean frame and in projections, against panels on which they are drawn one by one."""
 
 from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +12,7 @@ from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics, shares_of
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
 from raytwin.diagnosis.problem.nuisance_columns import changed_tiles
 from raytwin.generator.frames.defects import gain_pattern, tile_gain
-from raytwin.generator.line.line_state import FixedPattern, TilePattern
+from raytwin.generator.line.line_state import FixedPattern, LineState, TilePattern
 
 SHAPE = (96, 128)
 GOOD = np.ones(SHAPE, dtype=bool)
@@ -115,3 +117,18 @@ def test_what_tiles_do_to_a_mean_frame_by_chance_has_the_covariance_of_drawn_pan
     known = (found @ found.T)[: len(rows), : len(rows)]
     size = np.sqrt(np.outer(np.diag(known), np.diag(known)))
     np.testing.assert_allclose(seen.T @ seen / len(seen) / size, known / size, atol=5.0 * np.sqrt(2.0 / 2000))
+
+
+def test_the_example_of_tiles_declares_what_the_diagnosis_draws():
+    path = Path(__file__).parents[1] / "docs" / "examples" / "tile_gain.py"
+    module = module_from_spec(spec := spec_from_file_location("tile_gain_example", path))
+    spec.loader.exec_module(module)
+    effect = module.TILE_GAIN
+    assert effect.variation.random == "tiles" and effect.onsets == ("calibration",)
+    state = SimpleNamespace(tile_pattern=None)
+    values = effect.values({"strength": 0.5, "side_px": 48.0})
+    assert effect.change(state, values, SimpleNamespace(since="always")) is state
+    one = np.ones((1, 1))
+    lit = LineState(parameters=None, signal_DN=one, variance_DN2=one, flat_factor=one)
+    found = effect.change(lit, values, SimpleNamespace(since="calibration")).tile_pattern
+    assert found == TilePattern(rms=0.005, side_px=48.0, strips_share=0.0, seed=0)

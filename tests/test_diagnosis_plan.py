@@ -278,7 +278,6 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         "kv_error",
         "filtration_error",
         "gain_map_error",
-        "tile_gain",
         "excess_noise",
         "bad_pixels",
         "mtf_tail",

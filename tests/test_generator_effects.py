@@ -60,7 +60,6 @@ CATALOGUE = {
     "gain_map_error": ("%", 0.1, 3),
     "composition_error": ("%", 0.5, 5),
     "crosstalk": ("%", 3, 40),
-    "tile_gain": ("%", 0.2, 3),
     "line_flicker": ("%", 0.03, 1),
     "grey_absorber": ("%", 0.5, 60),
 }
@@ -142,7 +141,6 @@ def numbers(found):
                 0.0 if found.gain_pattern is None else found.gain_pattern.rms,
             ]
         ),
-        np.array([0.0 if found.tile_pattern is None else found.tile_pattern.rms]),
         np.zeros(3)
         if found.flicker is None
         else found.flicker.rms * 1000 * np.array([1.0, found.flicker.column_share, found.flicker.correlation(1)]),
@@ -211,8 +209,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     """Strength at the top of its range; expected and sampled read one state, and this shows that both read all of it."""
     earlier = request(frames=50)
     asked = request(**BEHIND, frames=300, start_s=1.2, previous=(earlier,))
-    smaller = {"side_px": 16.0} if name == "tile_gain" else {}  # tiles that fit on the panel
-    effects = applied(name, EFFECTS[name].strength.high, **smaller)
+    effects = applied(name, EFFECTS[name].strength.high)
     expected = expect(series_line, asked, effects)
     rng = np.random.default_rng(7)
     frames = np.stack(
@@ -237,14 +234,6 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         pattern = residual.mean(axis=0) / expected.signal_DN
         assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
         residual = residual - residual.mean(axis=0)
-    if name == "tile_gain":
-        gains = (residual.mean(axis=0) / expected.signal_DN)[:32, :32].reshape(2, 16, 2, 16).mean(axis=(1, 3))
-        whole = np.kron(gains, np.ones((16, 16)))
-        left = (residual.mean(axis=0) / expected.signal_DN)[:32, :32] - whole
-        assert np.mean(left**2) < 0.05 * np.mean(whole**2)  # steps at the seams, nothing inside
-        # four gains of nine whose mean is taken off
-        assert np.mean(gains**2) == pytest.approx(expected.tile_pattern.rms**2 * 8 / 9, rel=4 * math.sqrt(2 / 4))
-        residual = residual - residual.mean(axis=0)
     if name == "output_drift":
         factor = (residual / expected.signal_DN).mean(axis=(1, 2))
         rho = expected.frame_factor_correlation
@@ -260,7 +249,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         independent = SHAPE[0]
     if name == "line_flicker":
         independent = SHAPE[0] * (1 - flicker.correlation(1)) / (1 + flicker.correlation(1))
-    if name not in ("gain_map_error", "tile_gain", "output_drift"):
+    if name not in ("gain_map_error", "output_drift"):
         z = residual.mean(axis=0) / np.sqrt(variance / count)
         if name == "image_lag":
             z = z / math.sqrt(1 + 2 * expected.temporal_correlation.sum())
@@ -276,7 +265,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         known = known + light[left] * light[beside] * (1.0 if flicker is None else flicker.correlation(down))
         size = np.sqrt(variance[left] * variance[beside])
         pair = good[left] & good[beside]
-        bias = 0.004 if name in ("gain_map_error", "tile_gain") else 0.0  # eta^2 of the variance
+        bias = 0.004 if name == "gain_map_error" else 0.0  # eta^2 of the variance
         assert abs(((seen - known) / size)[pair].mean()) < 4 / math.sqrt(count * independent) + bias
     between = (spread[1:] * spread[:-1]).mean(axis=0)
     known = expected.temporal_correlation[0] * quantum

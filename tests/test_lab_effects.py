@@ -335,7 +335,7 @@ def test_crosstalk_moves_its_share_of_the_quanta_out_of_their_pixel_and_loses_no
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_gains_of_tiles_have_their_rms_and_steps_only_at_the_seams(seed):
-    effect = planted("tile_gain=1.5", seed=seed)
+    effect = planted("unknown:tile_gain=1.5", seed=seed)
     maps = detector_maps(system_on("coarse"))
     gain = effect.maps(maps).DN_per_electron.astype(float) / maps.DN_per_electron
     assert gain.mean() == pytest.approx(1.0, abs=1e-6)

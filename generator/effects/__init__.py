@@ -47,7 +47,6 @@ from .object_scatter import OBJECT_SCATTER
 from .output_drift import OUTPUT_DRIFT
 from .quantisation import QUANTISATION
 from .row_noise import ROW_NOISE
-from .tile_gain import TILE_GAIN
 from .veiling_glare import VEILING_GLARE
 
 # within a stage effects act in this order, those of other packages after ours
@@ -75,7 +74,6 @@ OURS: dict[str, Effect] = {
         GAIN_MAP_ERROR,
         COMPOSITION_ERROR,
         CROSSTALK,
-        TILE_GAIN,
         LINE_FLICKER,
         GREY_ABSORBER,
     )

@@ -1,13 +1,16 @@
 """Gains of detector tiles or readout channels that calibration does not know: blocks with a step at their seams.
 
 y = x (1 + eta_tile), eta fixed from frame to frame; a share of its variance belongs to strips over whole columns
+
+For panels that are made of tiles. It is not in raytwin's own catalogue: beside a strong change of the gain map from pixel to pixel
+with a smooth part, tiles would be named that are not there.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ..line.line_state import LineContext, LineState, TilePattern
-from .effect import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from raytwin.generator.effects import LIT_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
+from raytwin.generator.line.line_state import LineContext, LineState, TilePattern
 
 
 def _change_tiles(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:

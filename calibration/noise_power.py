@@ -94,22 +94,28 @@ def usable(side: int) -> NDArray[np.bool_]:
 class Shown:
     """What the squares of a series show of the power that noise has.
 
-    Fields: parts: share of the squares, and for rows and for columns what one of them keeps at each frequency of noise at each
-    other (shown, of noise); left: share of white noise that all of them keep (K + 1, K + 1).
+    Fields: parts: for rows and for columns, what squares of a kind keep at each frequency of noise at each other (shown, of
+    noise); shares (part, K + 1, K + 1): of the squares, 0 where a kind keeps too little of white noise while another does not;
+    left: share of white noise that those in use keep (K + 1, K + 1).
     """
 
-    parts: tuple[tuple[float, FloatArray, FloatArray], ...]
+    parts: tuple[tuple[FloatArray, FloatArray], ...]
+    shares: FloatArray
     left: FloatArray
 
     @classmethod
     def of(cls, parts: Sequence[tuple[float, FloatArray, FloatArray]]) -> "Shown":
-        """The squares that these parts make up."""
-        left = sum(share * np.outer(rows.sum(axis=1), columns.sum(axis=1)) for share, rows, columns in parts)
-        return cls(tuple(parts), np.maximum(left, 1e-9))
+        """The squares that these parts (share, rows, columns) make up."""
+        white = np.stack([np.outer(rows.sum(axis=1), columns.sum(axis=1)) for _, rows, columns in parts])
+        enough = white > _LEAST_LEFT
+        shares = np.array([share for share, *_ in parts])[:, None, None] * (enough | ~enough.any(axis=0))
+        left = np.maximum(np.sum(shares * white, axis=0), 1e-9)
+        return cls(tuple((rows, columns) for _, rows, columns in parts), shares, left)
 
     def smeared(self, power: FloatArray) -> FloatArray:
         """A power (K + 1, K + 1) as the squares show it after taper and projection, white noise unchanged."""
-        total = sum(share * (rows @ power @ columns.T) for share, rows, columns in self.parts)
+        kept = zip(self.shares, self.parts, strict=True)
+        total = sum(share * (rows @ power @ columns.T) for share, (rows, columns) in kept)
         return np.asarray(total / self.left)
 
 
@@ -314,19 +320,20 @@ class _Squares:
             np.multiply(difference[row : row + side, column : column + side], self.scale[number], out=stack[number])
         left = _projected(stack * window, basis)
         holes = [number for number, mask in enumerate(self.masks) if mask is not None]
-        power = np.zeros((side, side // 2 + 1))
+        if self.shown is None:
+            self.shown = self._shown()
+        power = np.zeros((side // 2 + 1, side // 2 + 1))
         if len(holes) < len(self.corners):
             spectra = rfft2(np.delete(left, holes, axis=0), axes=(1, 2), overwrite_x=True)
-            power += np.sum(spectra.real**2 + spectra.imag**2, axis=0)
+            power += _folded(np.sum(spectra.real**2 + spectra.imag**2, axis=0)) * (self.shown.shares[0] > 0)
         if holes:
             masks = np.stack([mask for mask in self.masks if mask is not None])
             # a missing pixel takes the value of what is projected out, so that it leaves no hole in a slope
             filled = np.where(masks, stack[holes], stack[holes] - left[holes] / window)
-            power += self._power_with_holes(_projected(filled * window, basis) * masks)
-        if self.shown is None:
-            self.shown = self._shown()
-        folded = _folded(power) / (len(self.corners) * float(np.sum(_taper(side) ** 2)) ** 2)
-        return np.where(usable(side), folded / self.shown.left, 0.0)
+            broken = _folded(self._power_with_holes(_projected(filled * window, basis) * masks))
+            power += broken * (self.shown.shares[-1] > 0)
+        power /= len(self.corners) * float(np.sum(_taper(side) ** 2)) ** 2
+        return np.where(usable(side), power / self.shown.left, 0.0)
 
     def _shown(self) -> Shown:
         """What these squares show of noise."""
@@ -337,7 +344,8 @@ class _Squares:
         share = len(holes) / len(self.corners)
         masks = np.stack(holes[:: 1 + len(holes) // _MOST_BROKEN])
         rows, columns = (_kept_with_holes(self.side, one.tobytes()) for one in (masks.swapaxes(1, 2), masks))
-        return Shown.of([*((1.0 - share, one, other) for _, one, other in whole.parts), (share, rows, columns)])
+        kinds = [(1.0 - share, *whole.parts[0]), (share, rows, columns)]
+        return Shown.of([kind for kind in kinds if kind[0] > 0])
 
     def _power_with_holes(self, squares: FloatArray) -> FloatArray:
         """Summed power (M, M/2 + 1) of squares in which pixels are missing, as if none were.
@@ -497,6 +505,8 @@ class _PowerSum:
         used = usable(side)
         power = np.where(used, self.power / (single * self.count), np.nan)
         modes = np.where(used, 0.5 * mode_share(side) * self.squares.pixels * degrees, 0.0)
+        if self.squares.shown is not None:
+            modes *= self.squares.shown.shares.sum(axis=0)
         # a plateau's height, for what the pixels' own noise adds to whole frames and lines
         lowest = int(np.argmax(used.any(axis=1))) + 1
         plateau = _at_zero(power, modes)

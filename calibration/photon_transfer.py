@@ -402,6 +402,7 @@ def _assembled(session: _Session, darks: DarkFrames, flats: _Flats, noise: FlatN
             white_fraction=float(np.clip(np.nan_to_num(np.nanmean(fit.white_fraction)), 0.0, None)),
             read_noise_DN=_root_estimate(read_DN2, fit.read_sd_DN2, fit.most_read_DN2),
             quantised=quantised,
+            shared_gain_sd=fit.shared_gain_sd,
         ),
         dark_DN=dark_DN,
         levels=levels_of(session.acquisition, noise, darks, good, points=points, saturation_DN=flats.saturation_DN),

@@ -418,15 +418,10 @@ def _data(
     def number(kV: float, filters: tuple[Filter, ...]) -> int:
         return beams.setdefault(OpenBeam(kV=kV, filters=filters), len(beams))
 
-    # The slope of a photon-transfer line is known better than the gain, which also wants the spread; their ratio is nearly
-    # one for all levels, so that slopes carry the gains' dependence on the spectrum.
+    # A gain also wants the spread, by which all of them are off alike: slopes over one ratio carry the gains' dependence on
+    # the spectrum, and what the ratio is known less by is added to predictions, where no average over beams lowers it.
     sloped = [level for level in levels if level.photon_transfer_slope_DN.value > 0 and level.gain_DN.value > 0]
-    share: dict[int, float] = {}
-    if sloped:
-        slope_sd = np.median([_relative_sd(level.photon_transfer_slope_DN) for level in sloped])
-        gain_sd = np.median([_relative_sd(level.gain_DN) for level in sloped])
-        if slope_sd < gain_sd:
-            share = dict(zip(map(id, levels), _shares(levels, noise), strict=True))
+    share = dict(zip(map(id, levels), _shares(levels, noise), strict=True)) if sloped else {}
     data = []
     for level in levels:
         beam = number(level.kV or 0.0, level.filters)

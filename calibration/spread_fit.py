@@ -91,11 +91,12 @@ class SpreadFit:
     Fields: spread; family (in words); spread_sd (parameter -> standard deviation, of sigma_px, aspect, tail_share and
     tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the spread's share restored;
     slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
-    white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets
-    in it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
-    excess_DN2: slow changes left, one a series; series_ratio: noise of each series over the fitted, with its standard
-    deviation; other_route: gains by extrapolated power over those of the fit, with its
-    standard deviation; criteria (family -> twice the logarithm of the best family's evidence over its own); expected_DN2: power of
+    shared_gain_sd: relative standard deviation of gain over slope, by which all gains are off alike; white_fraction (group,): the
+    white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets in it, read_sd_DN2, most_read_DN2
+    that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees; excess_DN2: slow changes left, one a
+    series; series_ratio: noise of each series over the fitted, with its standard deviation; other_route: gains by extrapolated
+    power over those of the fit, with its standard deviation; criteria (family -> twice the logarithm of the best family's
+    evidence over its own); expected_DN2: power of
     each series as squares show it; quanta_DN2: that of what follows the signal, not smeared; slow_DN2:
     that of slow changes, which expected_DN2 leaves out.
     """
@@ -116,6 +117,7 @@ class SpreadFit:
     chi_square: float
     degrees: float
     excess_DN2: FloatArray
+    shared_gain_sd: float
     series_ratio: tuple[tuple[float, float], ...]
     other_route: tuple[float, float]
     criteria: dict[str, float]
@@ -734,7 +736,10 @@ def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: f
     gain_variance, slope_variance = np.zeros(groups), np.zeros(groups)
     spread_variance = dict.fromkeys(_spread_variances(chosen, scatter), 0.0)
     evidence: dict[str, float] = {}
+    logs_covariance = np.zeros((2 * groups, 2 * groups))  # of the logarithms of gains and slopes
     for share, item in zip(weights, candidates, strict=True):
+        moved_logs = np.concatenate([_log_ratio(item.gains, gain), _log_ratio(item.slopes, slope)])
+        logs_covariance += share * (_log_covariance(item, groups, scatter) + np.outer(moved_logs, moved_logs))
         evidence[item.family] = evidence.get(item.family, 0.0) + float(share)
         own_gain, own_slope = _variances(item, groups, scatter)
         # scales are averaged by their logarithms
@@ -748,7 +753,11 @@ def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: f
     gain_variance += gain_moved**2
     slope_variance += slope_moved**2
     other = _other_route(problem, chosen, expected)
-    gain_variance = gain_variance + max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2) * gain**2
+    route = max(0.0, (other[0] - 1.0) ** 2 - other[1] ** 2)
+    gain_variance = gain_variance + route * gain**2
+    both = np.concatenate([gain_moved / np.maximum(gain, 1e-300), slope_moved / np.maximum(slope, 1e-300)])
+    logs_covariance += np.outer(both, both)
+    logs_covariance[:groups, :groups] += route
     quantum, white = chosen.coefficients[:groups], chosen.coefficients[groups : 2 * groups]
     rows, columns, lines_sd = _line_variances(series, group)
     read = float(chosen.coefficients[2 * groups])
@@ -773,6 +782,7 @@ def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: f
         chi_square=chosen.chi_square,
         degrees=problem.independent,
         excess_DN2=excess,
+        shared_gain_sd=_sd_of_gain_over_slope(logs_covariance),
         series_ratio=tuple(ratios),
         other_route=other,
         criteria={
@@ -890,6 +900,25 @@ def _variances(item: _Candidate, groups: int, inflation: float) -> tuple[FloatAr
         direction[linear:] = item.coefficients[g] * item.share_slopes
         pixel.append(max(float(direction @ item.covariance @ direction), 0.0))
     return inflation * np.array(gains), inflation * np.array(pixel)
+
+
+def _log_covariance(item: _Candidate, groups: int, inflation: float) -> FloatArray:
+    """Sampling covariance of the logarithms of gains and slopes (2 x group, 2 x group)."""
+    size, linear = len(item.covariance), len(item.coefficients)
+    rows = np.zeros((2 * groups, size))
+    for g in range(groups):
+        rows[g, g] = rows[g, groups + g] = 1.0 / max(item.gains[g], 1e-300)
+        per_slope = 1.0 / max(item.slopes[g], 1e-300)
+        rows[groups + g, g], rows[groups + g, groups + g] = item.variance_share * per_slope, per_slope
+        rows[groups + g, linear:] = item.coefficients[g] * item.share_slopes * per_slope
+    return np.asarray(inflation * rows @ item.covariance @ rows.T)
+
+
+def _sd_of_gain_over_slope(covariance: FloatArray) -> float:
+    """Standard deviation of the logarithm of gain over slope, the same for all beams, from the covariance of both logarithms."""
+    groups = len(covariance) // 2
+    ratio = np.hstack([np.eye(groups), -np.eye(groups)])
+    return math.sqrt(max(float(np.mean(np.diag(ratio @ covariance @ ratio.T))), 0.0))
 
 
 def _spread_variances(item: _Candidate, inflation: float) -> dict[str, float]:

@@ -163,7 +163,11 @@ def test_behind_objects_the_gain_is_harder_and_its_interval_says_so(tmp_path):
 def test_objects_that_nobody_maps_are_read_away_from_steps(tmp_path):
     blind = transfer_of(write_session(tmp_path / "blind.h5", with_maps=False, exposures_ms=(20.0,)))
     assert [row["where"] for row in blind.evidence["repeated_frames"]] == ["behind objects"]
-    assert blind.levels[0].gain_DN.value == pytest.approx(GAIN, rel=0.08)
+    # half of the frame lies behind the object, where the beam is harder
+    mixed = 0.5 * (1.0 + HARDER) * GAIN
+    gain_DN = blind.levels[0].gain_DN
+    assert gain_DN.low < mixed < gain_DN.high
+    assert gain_DN.value == pytest.approx(mixed, rel=0.12)
 
 
 def test_repeated_flats_held_back_for_evaluation_give_the_whole_field(tmp_path):

@@ -150,13 +150,16 @@ class NoiseModel:
     """Noise of the detector: see generator.spread.psf for the optical spread.
 
     Fields: spread; white_fraction: signal-following white variance over the quantum variance before
-    the spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN.
+    the spread; read_noise_DN: electronic noise of one frame without the ADC's rounding; quantised: whole DN;
+    shared_gain_sd: relative standard deviation of gain over photon-transfer slope, by which the gains of all beams are off alike;
+    None: not known apart from the levels' intervals.
     """
 
     spread: SpreadEstimate
     white_fraction: float
     read_noise_DN: Estimate
     quantised: bool
+    shared_gain_sd: float | None = None
 
     @property
     def read_variance_DN2(self) -> float:

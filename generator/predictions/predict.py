@@ -183,6 +183,8 @@ def binned_over_single(twin: Twin, binning: int) -> float:
 
 def _restored_sd(twin: Twin) -> float:
     """Relative standard deviation of what restoring the spread does to all gains alike: what they are known less by than slopes."""
+    if twin.noise.shared_gain_sd is not None:
+        return twin.noise.shared_gain_sd
     excess = [
         _relative_sd(level.gain_DN) ** 2 - _relative_sd(level.photon_transfer_slope_DN) ** 2
         for level in twin.levels

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from .._guard import bounded
 from ..errors import FileFormatError, InputError
 
 # What h5py and HDF5 raise at bytes that are not what they should be: whatever they like. `MemoryError` is an extent that
@@ -33,6 +34,9 @@ NEXUS_WORDS = frozenset({"NX_class", "default", "signal", "axes", "auxiliary_sig
 
 # a dataset; HDF5 2 would keep 8 MiB of each, and frames are read once and in whole chunks
 _CHUNK_CACHE_BYTES = 2**20
+_ATTRIBUTE_S = (
+    10.0  # of processor time, for what takes microseconds: a heap of texts whose sizes are 0 is read for ever
+)
 
 
 def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
@@ -135,7 +139,8 @@ def whole_attribute(node: Any, name: str, *, where: str, lowest: int | None = No
 
 def _attribute(node: Any, name: str, *, where: str) -> Any:
     try:
-        value = node.attrs.get(name)
+        with bounded(_ATTRIBUTE_S):
+            value = node.attrs.get(name)
     except HDF5_ERRORS as error:
         raise FileFormatError(
             f"{where}, attribute {name}", received=_reason(error), expected="a readable attribute"

@@ -187,6 +187,10 @@ DAMAGES = {
         lambda file: replaced(file, "spectral/best", file["spectral/best"][()] * 1j),
         "values of type complex128; expected real numbers",
     ),
+    "draws that no exponent holds": (
+        lambda file: replaced(file, "spectral/samples", 1e7 * file["spectral/samples"][()]),
+        "all below 710",
+    ),
     "draws that no number holds": (
         lambda file: replaced(
             file, "spectral/samples", np.full(file["spectral/samples"].shape, np.longdouble("1e4000"))

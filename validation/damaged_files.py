@@ -45,7 +45,7 @@ from raytwin.cli import main as raytwin
 
 SHAPE = (20, 24)
 EXPOSURE_MS = 20.0
-BRIEF_S, LONG_S, CASE_S, ANSWER_S = 1.0, 10.0, 60.0, 900.0  # processor time; the last by the clock
+BRIEF_S, LONG_S, CASE_S, ANSWER_S = 1.0, 10.0, 60.0, 240.0  # processor time; the last by the clock
 LONG, LONG_SHARE = ("diagnose", "calibrate"), 0.1
 PAIR = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=40,exposure_ms=20"]
 TABLE = "size_mm,hit\n" + "".join(f"{0.1 * k:.1f},{int(k % 3 != 0 and k > 8)}\n" for k in range(1, 31))

@@ -4,7 +4,9 @@ The twin of a tube alone has `part = "tube"` among its root attributes and no gr
 """
 
 import json
+import math
 import os
+import sys
 from dataclasses import fields
 from typing import Any
 
@@ -33,6 +35,7 @@ from ..spread.psf import Spread
 
 FORMAT = "raytwin-twin"
 VERSION = 1
+_LARGEST_EXPONENT = math.log(sys.float_info.max)
 TUBE = "tube"
 _SDS_OF_EFFECTS = ("strength_sd", "law_sd")
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
@@ -331,11 +334,12 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
     wide = len(spectral.names)
     samples, best = spectral.samples, spectral.best
     whole = samples.ndim == 2 and len(samples) > 0 and samples.shape[1] == wide and best.shape == (wide,)
-    if not (whole and bool(np.isfinite(samples).all()) and bool(np.isfinite(best).all())):
+    # parameters are exponents of what is computed from them; not finite ones fail, too
+    if not (whole and all(bool((np.abs(values) < _LARGEST_EXPONENT).all()) for values in (samples, best))):
         raise FileFormatError(
             f"twin {path}, spectral",
             received=f"draws of shape {samples.shape} and best of {best.shape}, or values that are not finite",
-            expected=f"finite draws (n, {wide}) and best ({wide},)",
+            expected=f"finite draws (n, {wide}) and best ({wide},), all below {_LARGEST_EXPONENT:.0f}",
             remedy="calibrate again",
         )
     return spectral

@@ -250,6 +250,23 @@ def test_an_unmeasured_setting_is_the_model_at_its_draws(twin):
     assert found.mean_DN.low < found.mean_DN.value < found.mean_DN.high
 
 
+def test_what_all_gains_are_off_by_alike_is_in_gain_and_photons_and_not_in_the_noise(tmp_path, twin):
+    """Draws of the spectrum know gains over slopes as exact: a ratio known to 10 % makes gains and photons as uncertain."""
+    setting = setting_from_text("kv=60,current_ma=1,exposure_ms=20,filter=Cu:0.05")
+    exact, unsure = (replace(twin, noise=replace(twin.noise, shared_gain_sd=relative_sd)) for relative_sd in (0.0, 0.1))
+    write_twin(tmp_path / "twin.h5", unsure)
+    before, after = (predict_flatfield(item, setting) for item in (exact, read_twin(tmp_path / "twin.h5")))
+
+    def log_sd(estimate):
+        return math.log(estimate.high / estimate.low) / (2 * 1.959964)
+
+    for name in ("gain_DN", "photons_absorbed"):
+        own, found = (log_sd(getattr(item, name)) for item in (before, after))
+        assert found == pytest.approx(math.hypot(own, 0.1), rel=0.1)
+    assert log_sd(after.sd_DN) == pytest.approx(log_sd(before.sd_DN), rel=1e-9)
+    assert after.mean_DN == before.mean_DN
+
+
 @pytest.mark.parametrize(
     "outside",
     [

@@ -16,7 +16,7 @@ import pytest
 from raytwin.cli import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
-BASE = {"errors", "files", "results"}
+BASE = {"_guard", "errors", "files", "results"}
 # room -> the rooms below it; a new room is one line here and one in each table of pyproject.toml
 BELOW = {
     "acquisition": set(),

@@ -402,6 +402,8 @@ class SpectralModel:
             photons *= np.exp(self.correction.at(beam.kV, top))
         return np.asarray(photons)
 
+    # draws that no beam has give infinities, which the caller refuses in words
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def signal(
         self, samples: NDArray[np.float64], beam: OpenBeam, through: NDArray[np.float64] | None = None
     ) -> BeamSignal:

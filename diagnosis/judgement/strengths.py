@@ -66,7 +66,7 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
     value, low, high = hypothesis.strengths[effect] if found is None else found
     sd = reading.law_sd if found is None or reading.sd is None else reading.sd
     below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
-    return value, value * math.exp(-below), value * math.exp(above)
+    return value, value * math.exp(-below), max(min(value * math.exp(above), curve.most), value)
 
 
 def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:

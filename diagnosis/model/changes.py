@@ -74,7 +74,7 @@ class Variant:
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
     the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior: as of a `Curve`.
+    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior, most: as of a `Curve`.
     """
 
     effect: str
@@ -90,6 +90,7 @@ class Variant:
     options: Mapping[str, str] = field(default_factory=dict)
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
+    most: float = math.inf
 
     def curve(
         self,
@@ -114,6 +115,7 @@ class Variant:
             exact=exact,
             series=self.series,
             log_prior=self.log_prior,
+            most=self.most,
         )
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
@@ -197,6 +199,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
                 high=high,
                 strengths=nodes,
                 fitted=(*inner, *later),
+                most=strength.most,
             )
         )
     return result

@@ -1,5 +1,6 @@
 """What an effect would do to the probes at any strength: its responses at a few, and how they are joined."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -25,7 +26,7 @@ class Curve:
     that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
     strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
     the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
-    probability of that, against one that acts in all.
+    probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %).
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -43,13 +44,14 @@ class Curve:
     exact: NDArray[np.bool_] | None = None
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
+    most: float = math.inf
 
     @property
     def reach(self) -> tuple[float, float]:
         """Strengths between which the curve is tried: beyond the plausible range on both sides."""
         if len(self.strengths) == 1:
-            return self.low / _WEAKER, _STRONGER * self.high
-        return self.low / _WEAKER, _BEYOND_NODES * max(self.high, float(self.strengths[-1]))
+            return self.low / _WEAKER, min(_STRONGER * self.high, self.most)
+        return self.low / _WEAKER, min(_BEYOND_NODES * max(self.high, float(self.strengths[-1])), self.most)
 
     def log_strengths(self) -> NDArray[np.float64]:
         """Strengths at which integrals are taken: evenly in the logarithm over the reach, and the ends of the plausible range."""

@@ -71,6 +71,7 @@ CROSSTALK = Effect(
             default=12.0,
             source="share of the quanta of a pixel that another one counts; 3-8 % to each of four neighbours in pixelated CT screens",
             log=False,
+            most=100.0,
         ),
         Parameter(
             name="reach_px",

@@ -90,6 +90,7 @@ GREY_ABSORBER = Effect(
             default=5.0,
             source="share of the light that it takes at 45 keV: tape or foil 0.5-5 %, a sheet or mesh up to 60 %",
             log=False,
+            most=100.0,
         ),
         Parameter(
             name="direction_deg",

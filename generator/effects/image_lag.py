@@ -55,6 +55,7 @@ IMAGE_LAG = Effect(
             default=1.0,
             source="first beam-off frame over the last exposed one",
             log=True,
+            most=100.0,
         ),
         Parameter(
             name="release_s",

@@ -89,6 +89,7 @@ K_FLUORESCENCE = Effect(
             default=15.0,
             source="share of the photons above the K edge; K yield of I and Cs 0.88, jump ratio 6, half of it caught",
             log=False,
+            most=100.0,
         ),
         Parameter(
             name="range_mm",

@@ -38,6 +38,7 @@ MTF_TAIL = Effect(
             default=10.0,
             source="share w of the light in the Lorentzian part of the transfer function",
             log=False,
+            most=100.0,
         ),
         Parameter(
             name="reach_px",

@@ -44,6 +44,7 @@ VEILING_GLARE = Effect(
             default=2.0,
             source="share of the light that leaves its place; flat panels and image intensifiers",
             log=False,
+            most=100.0,
         ),
         Parameter(
             name="length_mm",

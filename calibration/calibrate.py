@@ -10,7 +10,7 @@ from ..acquisition.acquisition_io import AcquisitionFile, Series
 from ..acquisition.cut_off import without_cut_off_darks
 from ..acquisition.setting import Filter
 from ..errors import FitError
-from ..generator.line.spectral_signal import OTHER_TABLES, OpenBeam
+from ..generator.line.spectral_signal import KV_STEP, OTHER_TABLES, OpenBeam
 from ..generator.line.twin import BAD_PIXEL_CODES, BAD_PIXEL_MAP, Twin
 from ..generator.twins.twin_answer import calibration_answer
 from ..spectra import (
@@ -183,7 +183,9 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
             for_sums=name == DEFAULT_MODEL,
         )
     materials = [layer.material for item in flats for layer in item.filters]
-    wanted = dict.fromkeys(measured, -PRIORS["kV_error"].low)
+    # as far as errors of the voltage go, their tilt between voltages, and what a varying voltage takes to both sides
+    farthest = -PRIORS["kV_error"].low + 6.0 * PRIORS["kV_tilt"].sd + KV_STEP
+    wanted = dict.fromkeys(measured, farthest)
     for kV in voltages_within_reach(measured, anode) if advise else ():
         wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
     for highest_kV in sorted({measured[-1], max(wanted)}):

@@ -87,7 +87,7 @@ _ALL_NODES = slice(None)
 _LOWEST_KEV = (
     5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
 )
-_KV_STEP = 0.02  # relative, of the second difference that a varying voltage takes
+KV_STEP = 0.02  # relative, of the second difference that a varying voltage takes
 _TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of a node
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
@@ -801,9 +801,9 @@ def _node_shares(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray
 
 def _second_difference_shares(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shares (draw, node) of the fluence's nodes in half of its second derivative by the logarithm of the voltage."""
-    inside = np.clip(kV_error, _KV_ERRORS[0] + _KV_STEP, _KV_ERRORS[-1] - _KV_STEP)
-    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-_KV_STEP, 0.0, _KV_STEP))
-    return np.asarray((above + below - 2.0 * middle) / (2.0 * _KV_STEP**2))
+    inside = np.clip(kV_error, _KV_ERRORS[0] + KV_STEP, _KV_ERRORS[-1] - KV_STEP)
+    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-KV_STEP, 0.0, KV_STEP))
+    return np.asarray((above + below - 2.0 * middle) / (2.0 * KV_STEP**2))
 
 
 def _interpolate(

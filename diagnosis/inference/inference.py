@@ -112,9 +112,6 @@ def _weighed(
     none = beside.none
     nothing = beside.no_effect(rests)
     weighed = [(nothing, math.log(priors.none))]
-    of_given = _left_by_given(observed, singles)
-    if of_given is not None:
-        weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     of_single = math.log(priors.single / count)
     alike, whole = [], {}
     for effect in ranked:
@@ -126,6 +123,9 @@ def _weighed(
             alike.append(beside.of_another(single))
         weighed.append((found, of_single))
         whole[effect] = found
+    of_given = _left_by_given(observed, singles, whole)
+    if of_given is not None:
+        weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
     for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
@@ -148,14 +148,22 @@ def _weighed(
     return weighed
 
 
-def _left_by_given(observed: Observed, singles: Mapping[str, Single]) -> float | None:
-    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none."""
-    others = [single for effect, single in singles.items() if not observed.has(effect)]
+def _left_by_given(
+    observed: Observed, singles: Mapping[str, Single], weighed: Mapping[str, Hypothesis]
+) -> float | None:
+    """Log evidence over none of what laws of the twin's own effects leave in the shape of another; None: the twin has none.
+
+    weighed: each effect alone, with a rest or without.
+    """
+    others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
     length = math.hypot(*(observed.length(point.curve, point.strength) for point in observed.given))
     levels = [(1.0, observed.given[0].level)]
-    return max(single.log_evidence + left_in_place(observed, single.best, length, levels) for single in others)
+    return max(
+        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, length, levels)
+        for effect in others
+    )
 
 
 def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis, ...]:

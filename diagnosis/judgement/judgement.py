@@ -12,7 +12,7 @@ from ...generator.line.twin import Twin
 from ..advice.next_series import best_measurement, proposal_text
 from ..advice.plan import WORTH_IT, best_repeat, repeat_text
 from ..inference.curve_fits import CurveFit, fit_effects
-from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS
+from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
 from ..inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from ..inference.local_nuisances import LocalNuisances
@@ -350,7 +350,14 @@ def _left(problem: Problem, leading: Hypothesis) -> NDArray[np.float64]:
 
 def _strained(problem: Problem, leading: Hypothesis, nuisances: LocalNuisances) -> tuple[tuple[str, float], ...]:
     """Nuisances that lie far from what is known of them, once the leading explanation is taken off."""
-    found = zip(problem.factor_names, nuisances.fitted(_left(problem, leading)), strict=True)
+    left = _left(problem, leading)
+    if problem.given:
+        # what laws of the twin's own effects leave is none of these
+        laws = [law_terms(one.curve, one.strength, problem.groups, problem.places, one.level) for one in problem.given]
+        root = np.sqrt(1.0 + sum(own for _, own in laws))
+        factors = np.concatenate([problem.factors, *(law for law, _ in laws)], axis=1)
+        nuisances, left = LocalNuisances(factors / root[:, None], problem.blocks), left / root
+    found = zip(problem.factor_names, nuisances.fitted(left), strict=False)
     far = [
         (name, float(value))
         for name, value in found

@@ -37,7 +37,9 @@ def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.
 
 
 def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, count: int = 4) -> list[Picture]:
-    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after, the series with most gap first.
+    """Residual mean frames in units of one pixel's noise, 5 x 5 average: before and after.
+
+    Series of which the effects take most away come first; where there are none, those with most gap.
 
     Args:
         diagnosis: with what was compared.
@@ -46,7 +48,7 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, cou
     """
     views = diagnosis.compared.views
     pictures = []
-    for index in _worst_views(diagnosis, count):
+    for index in _telling_views(diagnosis, after, count):
         view = views[index]
         before = _smoothed_z(view, view.residual_DN)
         limit = max(3.0, float(np.nanquantile(np.abs(before), 0.98)))
@@ -68,13 +70,17 @@ def gap_maps(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], *, cou
     return pictures
 
 
-def _worst_views(diagnosis: Diagnosis, count: int) -> list[int]:
+def _telling_views(diagnosis: Diagnosis, after: Sequence[NDArray[np.floating]], count: int) -> list[int]:
     problem = diagnosis.compared
     power = np.zeros(len(problem.views))
     is_map = np.array([name.statistic == "mean frame" for name in problem.names])
     for index in range(len(problem.views)):
         chosen = (problem.series_of == index) & is_map
         power[index] = float(np.mean(problem.residual[chosen] ** 2)) if chosen.any() else 0.0
+        view = problem.views[index]
+        if diagnosis.added and view.mask.any():
+            taken = (view.residual_DN**2 - after[index] ** 2) / np.maximum(view.noise_DN, 1e-12) ** 2
+            power[index] = float(np.mean(taken[view.mask]))
     seen: set[tuple[Any, ...]] = set()
     result = []
     for index in np.argsort(-power):

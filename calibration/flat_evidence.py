@@ -14,8 +14,8 @@ from .flat_levels import SeriesPoint, load_mAs_of
 from .noise_of_flats import FlatNoise
 from .noise_power import correlation_of_quanta
 from .repeated_frames import beam_of
+from .spread_fit import series_differ
 
-_CHANCE = 1e-3  # of a warning where nothing is wrong
 _POOR_FIT = 2.0  # chi-square a degree of freedom: five standard deviations for 50 degrees
 
 
@@ -123,12 +123,10 @@ def flat_evidence(
 
 def _uneven(ratios: Sequence[tuple[str, float, float]], *, degrees: int) -> list[str]:
     """A warning where the noise of series differs by more than chance; ratios: name, measured over fitted noise, its sd."""
-    from scipy.special import chdtri
-
+    if not series_differ([(ratio, sd) for _, ratio, sd in ratios], degrees):
+        return []
     known = [(name, ratio, (ratio - 1.0) / sd) for name, ratio, sd in ratios if math.isfinite(ratio)]
     total = sum(z**2 for *_, z in known)
-    if degrees < 1 or total < float(chdtri(degrees, _CHANCE)):
-        return []
     name, ratio, _ = max(known, key=lambda one: abs(one[2]))
     farthest = f"{name} has" if name else "one has"
     return [

@@ -31,7 +31,7 @@ _SILENT = 1e-6  # of the brightest series' power: below that a series is known a
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
 _MOST_ROUNDS = 4  # of fits with a scatter of series that is known better each time
-_CHANCE = 1e-3  # that series which agree look as if they did not
+_CHANCE = 1e-3  # that series which agree look as if they did not, and a warning stands where nothing is wrong
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
 _BOUNDS = {
     "sigma_px2": (0.0, (0.1 * LARGEST_SQUARE_PX) ** 2),
@@ -817,6 +817,13 @@ def _scatter(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
     return sum(known) / degrees if degrees > 0 else 1.0
 
 
+def series_differ(ratios: Sequence[tuple[float, float]], degrees: int) -> bool:
+    """Whether the noise of series departs from what is fitted by more than chance; arguments as of `_scatter_of_series`."""
+    from scipy.special import chdtri
+
+    return degrees > 0 and _scatter(ratios, degrees) * degrees >= float(chdtri(degrees, _CHANCE))
+
+
 def _scatter_of_series(ratios: Sequence[tuple[float, float]], degrees: int) -> float:
     """Relative variance that series have besides their sampling, which makes their chi-square what it should be; 0 where that
     is within chance.
@@ -826,12 +833,11 @@ def _scatter_of_series(ratios: Sequence[tuple[float, float]], degrees: int) -> f
         degrees: series less what was fitted to them.
     """
     from scipy.optimize import brentq
-    from scipy.special import chdtri
 
+    if not series_differ(ratios, degrees):
+        return 0.0
     known = np.array([one for one in ratios if math.isfinite(one[0])]).reshape(-1, 2)
     square, sampling = (known[:, 0] - 1.0) ** 2, known[:, 1] ** 2
-    if degrees < 1 or float(np.sum(square / sampling)) < float(chdtri(degrees, _CHANCE)):
-        return 0.0
     return float(brentq(lambda more: float(np.sum(square / (sampling + more))) - degrees, 0.0, float(square.sum())))
 
 

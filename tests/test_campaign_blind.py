@@ -636,7 +636,9 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
 @pytest.fixture(scope="module")
 def many(tmp_path_factory):
     folder = tmp_path_factory.mktemp("many") / "check"
-    options = BlindOptions(cases=300, seed=FRESH, train_cases=150)
+    options = BlindOptions(
+        cases=300, seed=FRESH, train_cases=172
+    )  # seven sessions and more of each effect to learn from
     _, check = checked(folder, options)
     return check, score_check(check)
 
@@ -674,8 +676,7 @@ def test_baselines_that_learn_beat_the_commonest_and_are_not_the_diagnosis(many)
     assert always["unknown"]["auroc"]["value"] == pytest.approx(0.5)
     for name in ("nearest_signature", "classifier"):
         assert baselines[name]["top1"]["single"]["share"] > always["top1"]["single"]["share"] + 0.15
-    # some seven sessions of each effect to learn from: no worse than a coin, within what so few say
-    assert baselines["classifier"]["leading_hypothesis"]["brier"] < 0.28
+    assert baselines["classifier"]["leading_hypothesis"]["brier"] < 0.25
 
 
 def test_the_table_and_the_page_hold_every_case_and_nothing_from_outside(many, tmp_path):

@@ -1132,6 +1132,13 @@ def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(ser
         assert abs(seen - known) < 4 * math.sqrt(max(known, 1e-6) / count), lag
 
 
+def test_crosstalk_of_more_quanta_than_leave_their_pixel_is_refused(series_line):
+    most = 100.0 * leaving_share(0.5)
+    expect(series_line, request(**BEHIND), applied("crosstalk", 0.99 * most, reach_px=0.5))
+    with pytest.raises(InputError, match="at a reach of 0.5 px; expected at most"):
+        expect(series_line, request(**BEHIND), applied("crosstalk", 1.01 * most, reach_px=0.5))
+
+
 def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise_and_flats_alone(series_line):
     """Quanta are drawn on both sides of an edge, moved and spread by light; no transfer function is used."""
     strength, reach_px, count = 30.0, 1.2, 4_000_000

@@ -69,7 +69,7 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         observed: what is weighed.
         curve: in its units.
         levels: of discrepancy.
-        exact: the law is taken as exact, and nothing about it as random: a first look, at a fraction of the cost.
+        exact: the law is taken as exact: a first look, at a fraction of the cost.
     """
     coarse = curve.log_strengths()
     sharp = _Terms(observed, curve)

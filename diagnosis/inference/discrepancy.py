@@ -31,10 +31,10 @@ class Levels:
     levels: tuple[float, ...]
     of_kind: tuple[float, ...]
     of_another: tuple[float, ...]
-    rest_of_kind: float = 0.0
-    rest_of_another: float = 0.0
-    rest_sd_of_kind: float = 0.5
-    rest_of_another_log: tuple[float, float] = (0.0, 1.0)
+    rest_of_kind: float
+    rest_of_another: float
+    rest_sd_of_kind: float
+    rest_of_another_log: tuple[float, float]
 
     def up_to(self, level: float) -> "Levels":
         """Those up to a level, with frequencies as they are."""
@@ -69,7 +69,7 @@ LEAK_SHARE = 0.5
 # beyond it a law does not carry the probes: what is off by more than half of itself explains anything
 FARTHEST_LEVEL = 0.4
 USUAL_LEVEL = 0.1  # of refinement, of laws that a twin has, and of what is fitted on half of a session
-USUAL = Levels(levels=(USUAL_LEVEL,), of_kind=(1.0,), of_another=(1.0,))
+USUAL = replace(LEVELS, levels=(USUAL_LEVEL,), of_kind=(1.0,), of_another=(1.0,))
 PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by

@@ -48,11 +48,6 @@ class LocalNuisances:
         return np.asarray(self.solve(vector) / np.sqrt(np.maximum(self.precision, 1e-12)))
 
     @property
-    def variance(self) -> NDArray[np.float64]:
-        """Variance (factor,) of nuisances once the probes are seen, prior variance 1."""
-        return np.asarray(np.sum(self._halved(np.eye(self.factors.shape[1])) ** 2, axis=0))
-
-    @property
     def precision(self) -> NDArray[np.float64]:
         """Diagonal (probe,) of C^-1: what of each probe's variance the others do not tell."""
         return np.asarray(1.0 - self.known_of(self.factors))

@@ -15,17 +15,19 @@ from .nuisances import Nuisances
 
 # of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
 FREE_SD = 1.0
-# of that of an effect which the twin has, besides its law: as far as intervals of strengths are widened for real laws
-GIVEN_SD = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """An effect at a strength, its law off by a level; the curve is in the units of the probes before any effect is taken off."""
+    """An effect at a strength, its law off by a level; the curve is in the units of the probes before any effect is taken off.
+
+    strength_sd: of the logarithm of the strength, a Gaussian: how free it is beside something else that is sought.
+    """
 
     curve: Curve
     strength: float
     level: float
+    strength_sd: float = FREE_SD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +78,7 @@ class Observed:
             found = replace(self, given=()) if self.given else self
             for point in self.given:
                 if point.curve.effect not in left_out:
-                    found = found.beside(point, sd=GIVEN_SD)
+                    found = found.beside(point)
             self._standing[left_out] = found
         return self._standing[left_out]
 
@@ -114,11 +116,11 @@ class Observed:
             root=self.units * root,
         )
 
-    def beside(self, point: Point, *, sd: float = FREE_SD) -> "Observed":
-        """What is left once an effect stands there, its strength free about that by `sd` in its logarithm, as a Gaussian."""
+    def beside(self, point: Point) -> "Observed":
+        """What is left once an effect stands there, its strength about as it says."""
         wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
         own = wide.scaled(point.curve)
-        free = sd * slope(own, point.strength)[:, None]
+        free = point.strength_sd * slope(own, point.strength)[:, None]
         nuisances = wide.nuisances
         if np.any(free):
             nuisances = nuisances.over(np.ones(len(free)), free, csc_array((0, len(free))))

@@ -429,7 +429,9 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
         since=effect.since,
     )
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
-    return Point(curve=curve, strength=strength, level=level)
+    # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
+    sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
+    return Point(curve=curve, strength=strength, level=level, strength_sd=sd)
 
 
 def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:

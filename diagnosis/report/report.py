@@ -173,7 +173,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
         "Use the improved twin that lies beside this page; every command takes it.",
         "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
     )
-    return [use, *measured, *_confirmed_by(_leading(diagnosis))]
+    return [*([use] if diagnosis.added else []), *measured, *_confirmed_by(_leading(diagnosis))]
 
 
 def _confirmed_by(causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:

@@ -16,6 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState
 from ._light_spread import spread_transfer
 from .effect import Effect, Grid, Parameter, Shows
@@ -49,7 +50,14 @@ def _move_quanta(state: LineState, parameters: Mapping[str, float], context: Lin
     if not context.has_scene or parameters["strength"] == 0:
         return state
     reach_px = parameters["reach_px"]
-    moved = parameters["strength"] / 100.0 / leaving_share(reach_px)
+    leaving = leaving_share(reach_px)
+    moved = parameters["strength"] / 100.0 / leaving
+    if moved > 1.0:
+        raise InputError(
+            "strength of crosstalk",
+            received=f"{parameters['strength']:g} % at a reach of {reach_px:g} px",
+            expected=f"at most {100.0 * leaving:.3g} %, where all quanta move",
+        )
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
         passed = spread_transfer(f_row, f_column, reach_px=reach_px, order=_EXPONENTIAL, usual_order=_EXPONENTIAL)

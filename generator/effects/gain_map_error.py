@@ -6,6 +6,7 @@ y = x (1 + eta), eta fixed from frame to frame, of pixel to pixel or alike over 
 from collections.abc import Mapping
 from dataclasses import replace
 
+from ...errors import InputError
 from ..line.line_state import FixedPattern, LineContext, LineState
 from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows, Variation
 
@@ -14,6 +15,10 @@ def _change_gain(state: LineState, parameters: Mapping[str, float], context: Lin
     # a pattern that calibration saw is in its maps
     if parameters["strength"] == 0 or context.since == "always":
         return state
+    if parameters["correlation_px"] < 0.0:
+        raise InputError(
+            "correlation_px of gain_map_error", received=parameters["correlation_px"], expected="0 px or more"
+        )
     return replace(
         state,
         gain_pattern=FixedPattern(

@@ -1135,7 +1135,7 @@ def test_the_texture_of_the_noise_is_that_of_light_followed_photon_by_photon(ser
 def test_crosstalk_of_more_quanta_than_leave_their_pixel_is_refused(series_line):
     most = 100.0 * leaving_share(0.5)
     expect(series_line, request(**BEHIND), applied("crosstalk", 0.99 * most, reach_px=0.5))
-    with pytest.raises(InputError, match="at a reach of 0.5 px; expected at most"):
+    with pytest.raises(InputError, match=r"at a reach of 0\.5 px; expected at most"):
         expect(series_line, request(**BEHIND), applied("crosstalk", 1.01 * most, reach_px=0.5))
 
 

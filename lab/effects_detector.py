@@ -393,21 +393,23 @@ def _excess_noise(request: Asked, site: Site) -> Planted:
 
 def _row_noise(request: Asked, site: Site) -> Planted:
     along_rows = bool(site.rng.random() < 0.7)
+    bands = int(site.rng.choice((1, 1, 2, 4)))  # lines that go up and down together: a running mean of so many
     degrees = 6.0
     scale_DN = request.strength * site.system.read_noise_DN / math.sqrt(degrees / (degrees - 2.0))
 
     def lines(level_DN: Map, context: FrameContext) -> Map:
         rng = frame_rng(context, 11)
         count = level_DN.shape[0 if along_rows else 1]
-        drawn = np.asarray(rng.standard_t(degrees, size=count), dtype=np.float32)
+        each = rng.standard_t(degrees, size=count + bands - 1)
+        drawn = np.asarray(np.convolve(each, np.ones(bands), "valid") / math.sqrt(bands), dtype=np.float32)
         offsets = drawn * np.float32(scale_DN / math.sqrt(context.summed))
         out: Map = level_DN + (offsets[:, None] if along_rows else offsets[None, :])
         return out
 
     return _told(
         request,
-        "offsets of lines with long tails (Student's t, 6 degrees)",
-        {"axis": "row" if along_rows else "column"},
+        "offsets of lines with long tails (Student's t, 6 degrees), each its own or in bands",
+        {"axis": "row" if along_rows else "column", "bands": bands},
         stages=(("readout", Stage(name="row_noise", apply=lines)),),
     )
 

@@ -701,10 +701,7 @@ def test_the_evidence_of_a_pair_is_the_joint_one_of_both_strengths():
     rng = np.random.default_rng(3)
     residual = 2.0 * made[0].response(1.0) + 3.0 * made[1].response(1.0) + rng.standard_normal(PROBES)
     observed = seen(residual)
-    singles = {
-        fit.curve.effect: Single(fits=[fit], best=fit, log_evidence=fit.log_evidence)
-        for fit in fit_effects(observed, made)
-    }
+    singles = {fit.curve.effect: Single.of([fit]) for fit in fit_effects(observed, made)}
     (pair,) = weigh_pairs(observed, singles, leading=2)
     # exact laws: a Gaussian in both strengths, under priors that are even in their logarithms
     wanted = 2.0 * np.log(LEVELS.of_kind[0])

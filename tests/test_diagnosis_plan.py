@@ -310,11 +310,15 @@ def test_lines_give_each_series_that_has_them_chance_by_their_direction(since, c
         return SimpleNamespace(lines=lines, session=SimpleNamespace(calibrates=calibrates))
 
     blocks = [block(True), block(False)]
-    rows, columns = (
-        SimpleNamespace(effect="row_noise", since=since, parameters={"column_share": share}) for share in (0.0, 1.0)
-    )
-    assert jitter_of(rows, blocks, 3.0) == pytest.approx([9 * calibrating, 18 * calibrating, 0, 9, 18, 0])
-    assert jitter_of(columns, blocks, 3.0) == pytest.approx([90 * calibrating, 180 * calibrating, 0, 90, 180, 0])
+
+    def jitter(share, **bands):
+        parameters = {"column_share": share, **bands}
+        return jitter_of(SimpleNamespace(effect="row_noise", since=since, parameters=parameters), blocks, 3.0)
+
+    of_rows = np.array([9 * calibrating, 18 * calibrating, 0, 9, 18, 0])
+    assert jitter(0.0) == pytest.approx(of_rows, rel=1e-3)
+    assert jitter(1.0) == pytest.approx(10 * of_rows, rel=1e-3)
+    assert jitter(0.0, together_lines=2.0) == pytest.approx(of_rows / np.tanh(0.25))
     assert jitter_of(SimpleNamespace(effect="kv_error"), blocks, 3.0) is None
 
 

@@ -821,6 +821,22 @@ def test_nonlinearity_refers_to_the_full_scale_of_the_adc_unless_told(series_lin
     np.testing.assert_allclose(expect(series_line, request(), applied("nonlinearity", 2.0)).mean_DN, stated.mean_DN)
 
 
+@pytest.mark.parametrize(("columns", "together"), [(0.0, 0.1), (0.0, 2.0), (1.0, 5.0)])
+def test_row_noise_of_frames_fades_from_line_to_line_as_expected(series_line, columns, together):
+    asked = replace(request("dark", setting=None, frames=400), after_calibration=True)
+    effect = applied("row_noise", 2.0, since="calibration", column_share=columns, together_lines=together)
+    expected = expect(series_line, asked, effect)
+    assert expected.offsets_together_lines == together
+    frames = np.stack(list(sample_series(series_line, asked, effects=effect, rng=np.random.default_rng(4))))
+    lines = (frames - frames.mean(axis=0)).mean(axis=1 if columns else 2)
+    variance = (
+        expected.row_variance_DN2 + expected.column_variance_DN2 + np.mean(expected.white_variance_DN2) / SHAPE[0]
+    )
+    seen = [np.mean(lines[:, lag:] * lines[:, : lines.shape[1] - lag]) / variance for lag in (1, 2, 4)]
+    known = np.exp(-np.array([1, 2, 4]) / together)
+    np.testing.assert_allclose(seen, known, atol=5 * math.sqrt(2 * max(together, 0.5) / lines.size) + 0.02)
+
+
 def test_row_noise_is_so_many_read_noises_in_rows_or_columns(series_line):
     since = {"since": "calibration"}
     asked = replace(request("dark", setting=None), after_calibration=True)

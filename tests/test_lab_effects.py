@@ -464,18 +464,22 @@ def test_excess_noise_multiplies_the_quantum_variance_and_leaves_the_level():
     assert ratio == pytest.approx(1.4, abs=5 * 1.4 * math.sqrt(4.0 / with_it.size))
 
 
-def test_row_noise_has_its_rms_in_every_frame_anew():
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_row_noise_has_its_rms_in_every_frame_anew_in_lines_or_bands(seed):
     system = system_on("coarse")
-    line = line_with("row_noise=1.5", system=system)
+    line = line_with("row_noise=1.5", system=system, seed=seed)
     darks = np.array([frame for frame, _ in line.dark(10.0, frames=80)], dtype=float)
     axis = 2 if line.active[0].parameters["axis"] == "row" else 1
     lines = (darks - darks.mean(axis=0)).mean(axis=axis)
     white = system.read_noise_DN**2 / SIZE
     rms = math.sqrt(lines.var(ddof=0) * 80 / 79 - white)
     # A Student's t of 6 degrees has an excess kurtosis of 3.
-    assert rms / system.read_noise_DN == pytest.approx(1.5, rel=5 * 0.5 * math.sqrt(5.0 / lines.size))
+    bands = line.active[0].parameters["bands"]
+    assert rms / system.read_noise_DN == pytest.approx(1.5, rel=5 * 0.5 * math.sqrt(5.0 * bands / lines.size))
     correlation = np.corrcoef(lines[:-1].ravel(), lines[1:].ravel())[0, 1]
-    assert abs(correlation) < 5 / math.sqrt(lines.size)
+    assert abs(correlation) < 5 * math.sqrt(bands / lines.size)
+    beside = np.corrcoef(lines[:, :-1].ravel(), lines[:, 1:].ravel())[0, 1]
+    assert abs(beside - (bands - 1) / bands) < 5 * math.sqrt(bands / lines.size)
 
 
 def test_quantisation_gives_multiples_of_its_step():

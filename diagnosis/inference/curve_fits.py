@@ -26,7 +26,7 @@ class CurveFit:
     """One curve against a residual.
 
     Fields: curve; by_level (level,): log evidence over none with the law off by each level; log_evidence: the same, averaged over the
-    levels' frequencies; level: the likeliest; strengths and log_likelihood (node,) over none at that level.
+    levels' frequencies; level: the likeliest; strengths and log_likelihood (node,) over none at that level; share: as of a `Point`.
     """
 
     curve: Curve
@@ -35,6 +35,7 @@ class CurveFit:
     level: float
     strengths: NDArray[np.float64]
     log_likelihood: NDArray[np.float64]
+    share: float = 0.0
 
     @property
     def best(self) -> float:
@@ -44,11 +45,11 @@ class CurveFit:
     @property
     def point(self) -> Point:
         """Where the likelihood is highest."""
-        return Point(curve=self.curve, strength=self.best, level=self.level)
+        return self.at_level(self.level)
 
     def at_level(self, level: float) -> Point:
         """Where the likelihood is highest, the law off by another level."""
-        return Point(curve=self.curve, strength=self.best, level=level)
+        return Point(curve=self.curve, strength=self.best, level=level, share=self.share)
 
     def averaged(self, frequencies: Sequence[float]) -> float:
         """Log evidence over none with levels of these frequencies."""

@@ -267,11 +267,4 @@ def _singles(fits: Sequence[CurveFit]) -> dict[str, Single]:
     by_effect: dict[str, list[CurveFit]] = {}
     for fit in fits:
         by_effect.setdefault(fit.curve.effect, []).append(fit)
-    return {
-        effect: Single(
-            fits=own,
-            best=max(own, key=lambda fit: fit.log_evidence),
-            log_evidence=float(log_mean_exp(np.array([fit.log_evidence for fit in own]))),
-        )
-        for effect, own in by_effect.items()
-    }
+    return {effect: Single.of(own) for effect, own in by_effect.items()}

@@ -21,13 +21,15 @@ FREE_SD = 1.0
 class Point:
     """An effect at a strength, its law off by a level; the curve is in the units of the probes before any effect is taken off.
 
-    strength_sd: of the logarithm of the strength, a Gaussian: how free it is beside something else that is sought.
+    strength_sd: of the logarithm of the strength, a Gaussian: how free it is beside something else that is sought; share: log of the
+    mean likelihood of all the effect's variants over this one's.
     """
 
     curve: Curve
     strength: float
     level: float
     strength_sd: float = FREE_SD
+    share: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

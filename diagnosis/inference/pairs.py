@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..model.curves import Curve
-from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral
+from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral, log_mean_exp
 from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
 from .observed import FREE_SD, Observed, Point
 
@@ -28,6 +28,13 @@ class Single:
     fits: Sequence[CurveFit]
     best: CurveFit
     log_evidence: float
+
+    @staticmethod
+    def of(fits: Sequence[CurveFit]) -> "Single":
+        """From the fits of all its variants."""
+        best = max(fits, key=lambda fit: fit.log_evidence)
+        mean = float(log_mean_exp(np.array([fit.log_evidence for fit in fits])))
+        return Single(fits=fits, best=replace(best, share=mean - best.log_evidence), log_evidence=mean)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +86,7 @@ def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Cur
     for turn in range(_TURNS):
         start, beside = _beside_first(observed, point, other)
         fit = _beside(beside, curves[other])
-        second = Point(curve=_own(curves[other], fit), strength=fit.best, level=fit.level)
+        second = replace(fit.point, curve=_own(curves[other], fit))
         evidence = start + log_prior(point) + fit.log_evidence
         fits[other] = replace(fit, curve=second.curve)
         before, best = best, max(best, evidence)
@@ -112,7 +119,7 @@ def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     fits = [fit_curve(beside, beside.scaled(curves[number]), levels=_CARRIED) for _, number in likely]
     best = max(fits, key=lambda fit: fit.log_evidence)
     total = float(np.logaddexp.reduce([fit.log_evidence for fit in fits])) - math.log(len(curves))
-    return replace(best, log_evidence=total)
+    return replace(best, log_evidence=total, share=total - best.log_evidence)
 
 
 def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
@@ -151,7 +158,7 @@ def left_in_place(observed: Observed, second: CurveFit, length: float, levels: S
 
 
 def log_prior(point: Point, *, another: bool = False) -> float:
-    """Log of what a point takes of the prior: how often laws (of the kind, or of `another`) are off by its level, and its strengths'.
+    """Log of what a point takes of the prior: its curve's, how often laws (of `another` kind) are off by its level, its strengths'.
 
     Strengths are even in their logarithm; those about the point are as free as `Observed.beside` leaves them.
     """
@@ -161,4 +168,5 @@ def log_prior(point: Point, *, another: bool = False) -> float:
     else:
         low, high = curve.reach
         density = IMPLAUSIBLE / (log(high / low) - log(curve.high / curve.low))
-    return log_frequency(point.level, another=another) + log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)
+    strengths = log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)
+    return curve.log_prior + point.share + log_frequency(point.level, another=another) + strengths

@@ -28,6 +28,9 @@ ATTENUATION_OF_BEAM_SD = 0.004  # the part of that which changes with the tube v
 LEVEL_OF_BEAM_SD = 0.003  # of the level of a kV and filter
 OF_BEAMS_GROWS = 2.0  # how much more beams may differ by, over each further prior sd of the largest departure
 LEVEL_OF_SERIES_SD = 0.001  # of the level of one series
+EXPOSURE_SD_MS = (
+    0.02  # of the length of all exposures: resets, shutters and pulses take as long as a line's readout, 10-100 us
+)
 GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
 GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
 POSITION_SD_PX = 0.15  # of a scene against its thickness maps
@@ -45,6 +48,9 @@ ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to 
 TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
+READ_TEXTURE_SD = (
+    0.05  # of the read noise's correlation at each lag: what an amplifier keeps that settles for three time constants
+)
 TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
 # always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
 SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape in a series

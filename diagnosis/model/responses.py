@@ -311,10 +311,11 @@ def _context(
 
 def _lines_of_noise(model: ExpectedSeries) -> tuple[float, float]:
     """Variance of rows and of columns from frame to frame, DN^2, as second differences of lines show it."""
-    rows, columns, flicker = model.row_variance_DN2, model.column_variance_DN2, model.flicker
+    flicker, of_bends = model.flicker, bent_share(model.offsets_together_lines)
+    rows, columns = of_bends * model.row_variance_DN2, of_bends * model.column_variance_DN2
     if flicker is None:
         return rows, columns
-    of_light = flicker.rms**2 * float(np.mean(model.signal_DN)) ** 2 * bent_share(flicker)
+    of_light = flicker.rms**2 * float(np.mean(model.signal_DN)) ** 2 * bent_share(flicker.together_lines)
     return rows + (1.0 - flicker.column_share) * of_light, columns + flicker.column_share * of_light
 
 

@@ -1,12 +1,13 @@
 """What noise of lines adds to scalar probes: offsets of rows and columns, and lines that flicker with the light."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
-from ...generator.line.line_state import LineFlicker
+from ...generator.line.line_state import EACH_LINE, LineFlicker, between_lines
 from .scalar_context import ScalarContext
 
 
@@ -14,13 +15,14 @@ from .scalar_context import ScalarContext
 class LineNoise:
     """Variances, DN^2, of what rows and columns of one frame have in common.
 
-    Fields: row, column: of offsets, the same with and without light; flicker: of lines with the light, None: none; squares: mean
-    square of the signal over all good pixels and over those of each label; of_rows, of_columns: mean square of the signal's means
-    along rows and columns.
+    Fields: row, column: of offsets, the same with and without light; together_lines: over which these fade; flicker: of lines with
+    the light, None: none; squares: mean square of the signal over all good pixels and over those of each label; of_rows, of_columns:
+    mean square of the signal's means along rows and columns.
     """
 
     row: float
     column: float
+    together_lines: float = EACH_LINE
     flicker: LineFlicker | None = None
     squares: tuple[float, ...] = (0.0,)
     of_rows: float = 0.0
@@ -29,15 +31,19 @@ class LineNoise:
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "LineNoise":
         """Of a series as the model expects it."""
-        row, column, flicker = expected.row_variance_DN2, expected.column_variance_DN2, expected.flicker
+        flicker = expected.flicker
+        alone = LineNoise(
+            row=expected.row_variance_DN2,
+            column=expected.column_variance_DN2,
+            together_lines=expected.offsets_together_lines,
+        )
         if flicker is None:
-            return LineNoise(row=row, column=column)
+            return alone
         signal = np.asarray(expected.signal_DN, dtype=np.float64)
         whole, labels = context.areas.means(signal**2)
         of_rows, of_columns = (float(np.mean(signal.mean(axis=axis) ** 2)) for axis in (1, 0))
-        return LineNoise(
-            row=row,
-            column=column,
+        return replace(
+            alone,
             flicker=flicker,
             squares=(whole, *map(float, labels)),
             of_rows=of_rows,
@@ -50,7 +56,8 @@ class LineNoise:
 
     def together(self, down: int, right: int, label: int | None = None) -> float:
         """Covariance of pixels so many rows and columns apart."""
-        found = (self.row if down == 0 else 0.0) + (self.column if right == 0 else 0.0)
+        found = self.row * between_lines(down, self.together_lines)
+        found += self.column * between_lines(right, self.together_lines)
         if self.flicker is None:
             return found
         fades = np.array([self.flicker.correlation(down), self.flicker.correlation(right)])
@@ -66,12 +73,12 @@ class LineNoise:
 
     def block(self, side: int) -> float:
         """Of means over side x side pixels."""
-        found = (self.row + self.column) / side
+        found = (self.row + self.column) * of_mean(side, self.together_lines)
         return found + float(self._shares(self._square(None)).sum()) * self._of_mean(side)
 
     def frame(self, rows: int, columns: int) -> float:
         """Of means over a frame."""
-        found = self.row / rows + self.column / columns
+        found = self.row * of_mean(rows, self.together_lines) + self.column * of_mean(columns, self.together_lines)
         if self.flicker is None:
             return found
         by_row, by_column = self._shares(self._square(None))
@@ -89,14 +96,18 @@ class LineNoise:
 
     def _of_mean(self, count: int) -> float:
         """Variance of the mean of so many lines' factors over that of one."""
-        if self.flicker is None:
-            return 1.0 / count
-        lag = np.arange(1, count)
-        fades = np.exp(-lag / self.flicker.together_lines)
-        return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * fades)) / count
+        return 1.0 / count if self.flicker is None else of_mean(count, self.flicker.together_lines)
 
 
-def bent_share(flicker: LineFlicker) -> float:
-    """A sixth of the variance of second differences of lines' factors over their variance."""
-    one, two = flicker.correlation(1), flicker.correlation(2)
+@lru_cache(maxsize=64)
+def of_mean(count: int, together_lines: float) -> float:
+    """Variance of the mean of so many lines over that of one, what is common to each fading over `together_lines`."""
+    lag = np.arange(1, count)
+    fades = np.exp(-lag / together_lines)
+    return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * fades)) / count
+
+
+def bent_share(together_lines: float) -> float:
+    """A sixth of the variance of second differences of lines over their variance, what is common to each fading so."""
+    one, two = between_lines(1, together_lines), between_lines(2, together_lines)
     return (6.0 - 8.0 * one + 2.0 * two) / 6.0

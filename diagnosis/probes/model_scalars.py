@@ -109,10 +109,11 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     """What stands in the mean frame of a flat or dark that does not calibrate: pattern, its blocks and lines, outliers."""
     values: dict[str, float] = {}
     rows, columns = context.good.shape
-    row, column = expected.row_variance_DN2, expected.column_variance_DN2
+    of_bends = bent_share(expected.offsets_together_lines)
+    row, column = of_bends * expected.row_variance_DN2, of_bends * expected.column_variance_DN2
     signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
     if expected.flicker is not None:
-        bent = expected.flicker.rms**2 * signal2 * bent_share(expected.flicker)
+        bent = expected.flicker.rms**2 * signal2 * bent_share(expected.flicker.together_lines)
         row += (1.0 - expected.flicker.column_share) * bent
         column += expected.flicker.column_share * bent
     changed = [NO_PATTERN]

@@ -18,7 +18,7 @@ from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
 from ..probes.registration import CELL_SD_PX, gradient
 from ..session.even_maps import Map
 from ..session.session import SessionSeries
-from ..session.summaries import BLOCK_PX, LAGS
+from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .point_maps import blurred_between_points, sampled_at_points
 from .series_probes import SeriesProbes
 
@@ -49,6 +49,7 @@ def local_nuisances(
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
     }
+    columns |= {f"read noise {lag}": _read_texture(probes, lag) for lag in LAGS}
     images: _Images = {}  # of nuisances that change the mean frame alone
     if item.request.beam_on:
         columns |= _of_beam(probes, beams_differ)
@@ -140,6 +141,35 @@ def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
     )
 
 
+def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:
+    """READ_TEXTURE_SD of correlation in the read noise at a lag: of neighbours, and of means over lines and blocks.
+
+    The variance of a mean of n pixels in line is 1 + 2 sum_d (1 - d / n) rho_d times that of independent ones.
+    """
+    expected, context = probes.series.expected, probes.series.context
+    down, across = lag[0], abs(lag[1])
+    rows, columns = context.good.shape
+    (of_quanta, of_labels), (white, whites) = map(
+        context.areas.means, (expected.quantum_variance_DN2, expected.white_variance_DN2)
+    )
+    shares = dict(zip(context.label_names, whites / np.maximum(of_labels + whites, LEAST_NOISE_DN2), strict=True))
+    share = white / max(of_quanta + white, LEAST_NOISE_DN2)
+    within = {
+        "row_ratio": (down == 0) * (1.0 - across / columns),
+        "column_ratio": (across == 0) * (1.0 - down / rows),
+        "block_ratio": (1.0 - down / BLOCK_PX) * (1.0 - across / BLOCK_PX),
+    }
+
+    def of(name: str) -> float:
+        if name in within:
+            return float(2.0 * share * within[name] / math.exp(probes.series.scalars[name]))
+        known, _, ending = name.rpartition(" ")
+        label = known.removeprefix("correlation ")
+        return float(shares[label]) if label != known and ending == f"({lag[0]},{lag[1]})" else 0.0
+
+    return scales.READ_TEXTURE_SD * probes.of_scalars(lambda probe: of(probe.name))
+
+
 def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
     """Level of beam and series, and gradient of the field."""
     rows, columns = signal.shape
@@ -148,6 +178,7 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
         level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
+        "length of exposures": scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal,
     }
     for number, shape in enumerate(_shapes(signal.shape)):
         images[f"shape {number} of {item.name}"] = shape * signal

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ...generator.line.line_state import LineFlicker, TilePattern
+from ...generator.line.line_state import TilePattern, between_lines
 from ..model import changes as scales
 from ..model.changes import Variant
 from ..model.responses import Asked, Moved, SessionModel
@@ -177,22 +177,20 @@ def jitter_of(variant: Variant, blocks: Sequence[SeriesBlock], read_noise_DN: fl
     if random == "pixels":
         length = EFFECTS[variant.effect].values(variant.parameters)["correlation_px"]
         return np.concatenate([block.pattern_jitter[length] for block in blocks])
-    if random == "lines":
-        columns = variant.parameters["column_share"]
-        shares = read_noise_DN**2 * np.array([1.0 - columns, columns])
-        every = variant.since == "always"
-        return np.concatenate([shares @ block.lines * float(every or not block.session.calibrates) for block in blocks])
-    if random == "lines of light":
-        numbers = EFFECTS[variant.effect].values(variant.parameters)
-        flicker = LineFlicker(rms=0.01, column_share=numbers["column_share"], together_lines=numbers["together_lines"])
-        # in smooth shapes, of which most probes are, lines that go together count as fewer
-        fewer = (1.0 + flicker.correlation(1)) / (1.0 - flicker.correlation(1))
-        shares = fewer * np.array([1.0 - flicker.column_share, flicker.column_share])
-        every = variant.since == "always"
-        return np.concatenate(
-            [shares @ block.lit_lines * float(every or not block.session.calibrates) for block in blocks]
-        )
-    return None
+    if random not in ("lines", "lines of light"):
+        return None
+    numbers, every = EFFECTS[variant.effect].values(variant.parameters), variant.since == "always"
+    # in smooth shapes, of which most probes are, lines that go together count as fewer
+    next_to = between_lines(1, numbers["together_lines"])
+    columns = numbers["column_share"]
+    shares = (1.0 + next_to) / (1.0 - next_to) * np.array([1.0 - columns, columns])
+    of_lines = [block.lit_lines if random == "lines of light" else read_noise_DN**2 * block.lines for block in blocks]
+    return np.concatenate(
+        [
+            shares @ lines * float(every or not block.session.calibrates)
+            for lines, block in zip(of_lines, blocks, strict=True)
+        ]
+    )
 
 
 def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: float | None) -> NDArray[np.float64] | None:

@@ -18,7 +18,7 @@ from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
 from ..frames._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
-from ..frames.defects import gain_pattern, new_bad_pixels, sample_flicker, tile_gain
+from ..frames.defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
 from ..frames.flat_change import has_always_bent, is_in_noise
 from ..kernels.projection import project_polychromatic
 from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
@@ -382,10 +382,7 @@ class ImageEffects:
         if bad is not None:
             value = np.where(bad.dead, 0.0, value)
         value = value + self.dark_DN + electronic
-        if state.row_variance_DN2 > 0:
-            value = value + math.sqrt(state.row_variance_DN2 / averaged) * rng.standard_normal((shape[0], 1))
-        if state.column_variance_DN2 > 0:
-            value = value + math.sqrt(state.column_variance_DN2 / averaged) * rng.standard_normal((1, shape[1]))
+        value = value + sample_offsets(state, shape, rng) / math.sqrt(averaged)
         if bad is not None:
             read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
             value = np.where(bad.hot, value + _HOT_SIGMAS * (read_DN + 1.0), value)

@@ -37,7 +37,7 @@ RANDOM = {
 }
 _ASKED_OF_RANDOM = {  # parameters
     "pixels": ("correlation_px",),
-    "lines": ("column_share",),
+    "lines": ("column_share", "together_lines"),
     "lines of light": ("column_share", "together_lines"),
     "tiles": ("side_px", "strips_share"),
     "output": ("correlation_s", "jitter_share"),

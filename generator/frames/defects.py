@@ -1,4 +1,4 @@
-"""Defects that calibration has not seen, drawn from the effect's own seed, so that every frame has the same; lines that flicker."""
+"""Defects that calibration has not seen, drawn from the effect's own seed, so that every frame has the same; noise of lines."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line.line_state import FixedPattern, FloatArray, LineFlicker, LineState, TilePattern
+from ..line.line_state import FixedPattern, FloatArray, LineFlicker, LineState, TilePattern, between_lines
 
 
 def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
@@ -39,17 +39,30 @@ def tile_gain(pattern: TilePattern, shape: tuple[int, int]) -> FloatArray:
 
 def sample_flicker(flicker: LineFlicker, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
     """Factor (row, column) of the lines of one exposure."""
+    shares = flicker.rms**2 * (1.0 - flicker.column_share), flicker.rms**2 * flicker.column_share
+    return 1.0 + _lines(shares, flicker.together_lines, shape, rng)
+
+
+def sample_offsets(state: LineState, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
+    """Noise (row, column or 1, 1), DN, common to rows and columns of one exposure."""
+    return _lines((state.row_variance_DN2, state.column_variance_DN2), state.offsets_together_lines, shape, rng)
+
+
+def _lines(
+    variances: tuple[float, float], together_lines: float, shape: tuple[int, int], rng: np.random.Generator
+) -> FloatArray:
+    """Sum (row, column or 1, 1) of what is common to each row and to each column, of these variances."""
     from scipy.signal import lfilter
 
-    factor = np.ones((1, 1))
-    next_to = flicker.correlation(1)
-    for axis, share in enumerate((1.0 - flicker.column_share, flicker.column_share)):
-        if share > 0.0:
+    total = np.zeros((1, 1))
+    next_to = between_lines(1, together_lines)
+    for axis, variance in enumerate(variances):
+        if variance > 0.0:
             drawn = math.sqrt(1.0 - next_to**2) * rng.standard_normal(shape[axis])
             drawn[0] /= math.sqrt(1.0 - next_to**2)
-            lines = flicker.rms * math.sqrt(share) * lfilter([1.0], [1.0, -next_to], drawn)
-            factor = factor + np.expand_dims(lines, 1 - axis)
-    return np.asarray(factor)
+            lines = math.sqrt(variance) * lfilter([1.0], [1.0, -next_to], drawn)
+            total = total + np.expand_dims(lines, 1 - axis)
+    return np.asarray(total)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from ..line.spectral_signal import mean_signal_energy_keV
 from ..line.twin import Twin
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
-from .defects import gain_pattern, new_bad_pixels, sample_flicker, tile_gain
+from .defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
 
 __all__ = [
     "ExpectedSeries",
@@ -147,7 +147,8 @@ class ExpectedSeries:
         quantum_variance_DN2: from frame to frame, of quanta, after the spread, lag and response.
         white_variance_DN2: of electronics, secondary quanta and the ADC; without row and column noise.
         noise_autocovariance: (4, 4) of the quantum part over lags of 0-3 rows and columns, 1 at lag 0.
-        row_variance_DN2, column_variance_DN2: of what a row or a column of one frame has in common.
+        row_variance_DN2, column_variance_DN2: of what a row or a column of one frame has in common; offsets_together_lines: over so
+            many lines its correlation falls to 1/e.
         flicker: factors of the lines of a frame; None: there are none.
         frame_factor_rms: of the common factor of a frame.
         frame_factor_correlation: (frames,) its correlation over 0, 1, 2... frames.
@@ -169,6 +170,7 @@ class ExpectedSeries:
     noise_autocovariance: FloatArray
     row_variance_DN2: float
     column_variance_DN2: float
+    offsets_together_lines: float
     flicker: LineFlicker | None
     frame_factor_rms: float
     frame_factor_correlation: FloatArray
@@ -767,6 +769,7 @@ def expected_series(
         noise_autocovariance=charge.pattern.autocovariance,
         row_variance_DN2=state.row_variance_DN2 / averaged,
         column_variance_DN2=state.column_variance_DN2 / averaged,
+        offsets_together_lines=state.offsets_together_lines,
         flicker=None
         if state.flicker is None or not request.beam_on
         else replace(state.flicker, rms=state.flicker.rms / math.sqrt(averaged)),
@@ -880,10 +883,7 @@ def sample_series(
             value = value + dark + electronic * rng.standard_normal(shape)
             for height, profile in state.offsets:
                 value += height * float(profile(np.array(now)))
-            if state.row_variance_DN2 > 0:
-                value += math.sqrt(state.row_variance_DN2) * rng.standard_normal((shape[0], 1))
-            if state.column_variance_DN2 > 0:
-                value += math.sqrt(state.column_variance_DN2) * rng.standard_normal((1, shape[1]))
+            value += sample_offsets(state, shape, rng)
             if bad is not None:
                 value = np.where(bad.hot, value + _HOT_SIGMAS * (electronic + 1.0), value)
             if state.step_DN > 0:

@@ -98,6 +98,14 @@ class TilePattern:
         return np.floor(np.arange(length) / max(self.side_px, 1.0)).astype(np.intp)
 
 
+EACH_LINE = 0.1  # lines over which what is common to a line fades where every line has its own: next ones share 5e-5
+
+
+def between_lines(lines: int, together_lines: float) -> float:
+    """Correlation of what is common to two lines so far apart, exp(-|lines| / together_lines)."""
+    return math.exp(-abs(lines) / together_lines)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineFlicker:
     """Factors common to the rows and columns of one exposure, new in each.
@@ -111,7 +119,7 @@ class LineFlicker:
 
     def correlation(self, lines: int) -> float:
         """Of two lines so far apart."""
-        return math.exp(-abs(lines) / self.together_lines)
+        return between_lines(lines, self.together_lines)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +160,8 @@ class LineState:
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
         gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
-        row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure.
+        row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure; offsets_together_lines: over so many
+            lines its correlation falls to 1/e.
         read_variance_taken_DN2: of the calibrated electronic variance, what effects that the calibration saw account for.
         step_DN: of the ADC; 0: none.
         bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
@@ -183,6 +192,7 @@ class LineState:
     offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
     row_variance_DN2: float = 0.0
     column_variance_DN2: float = 0.0
+    offsets_together_lines: float = EACH_LINE
     read_variance_taken_DN2: float = 0.0
     step_DN: float = 0.0
     bad_share: float = 0.0

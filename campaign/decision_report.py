@@ -1,46 +1,48 @@
 """The part of a sweep's page that answers the requirement: verdicts, margins, what would help, the front, the screening."""
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..reports import AFTER, BEFORE, QUIET, Band, Chart, Figure, Line, Points, Rule
+from ..reports.chart import Shape
 from ._ticks import few_ticks
 from .decision import FAILS, IMPOSSIBLE, LIKELY, MEETS, OPEN, WORDS, Change, change_text
-from .figures import GENERATED, PUBLISHED, REAL, figure_with_axes, png_of
 
 _DASH = "–"
 _ORDER = (MEETS, LIKELY, OPEN, FAILS, IMPOSSIBLE)
 _MOST_ROWS = 200
+# settings by what is known of them, and how they are drawn
+_POINTS: dict[str, tuple[str, Shape]] = {
+    "recommended": (BEFORE, "square"),
+    "on the front": (BEFORE, "circle"),
+    "on the front, expected": (BEFORE, "diamond"),
+    "beaten in all three": (AFTER, "circle"),
+    "beaten in all three, expected": (QUIET, "diamond"),
+}
 
 
-def decision_section(answer: Mapping[str, Any]) -> str:
-    """The section as HTML, every text escaped; empty where the answer has no decision, no screening and one size alone."""
-    import jinja2
-
-    template = jinja2.Template(
-        (Path(__file__).parent / "decision_report.html").read_text(encoding="utf-8"), autoescape=True
-    )
+def decision_part(answer: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Figure]]:
+    """What `decision_report.html` needs, all None where the answer has no decision, no screening and one size alone; its figures."""
     decision, screening = answer["decision"], answer["screening"]
     both = next((row for row in answer["rows"] if row["recommended"] and (row["other_size"] or {}).get("line")), None)
-    if decision is None and screening is None and both is None:
-        return ""
     front = [] if decision is None else [_front_row(row) for row in decision["front"]]
-    section: str = template.render(
-        decision=None if decision is None else _decision(decision, answer["unit"]),
-        front=front,
-        front_figure=_inline(plot_front_with_expected(answer)) if front else "",
-        both=None if both is None else {"label": both["label"], "figure": _inline(plot_both_sizes(both, answer))},
-        screening=None if screening is None else _screening(screening),
-    )
-    return section
-
-
-def _inline(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+    figures: dict[str, Figure] = {}
+    if front:
+        figures |= {f"expected_{name}": chart for name, chart in expected_charts(answer).items()}
+    if both is not None:
+        figures |= {f"both_{number}": chart for number, chart in enumerate(charts_of_both_sizes(both, answer))}
+    if screening is not None and screening["observer"] is not None:
+        figures["left_out"] = left_out_chart(screening["observer"]["left_out"])
+    values = {
+        "decided": None if decision is None else _decision(decision, answer["unit"]),
+        "front": front,
+        "both": None if both is None else both["label"],
+        "screening": None if screening is None else _screening_text(screening),
+    }
+    return values, figures
 
 
 def _decision(decision: Mapping[str, Any], unit: str) -> dict[str, Any]:
@@ -125,99 +127,128 @@ def _front_row(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _screening(screening: Mapping[str, Any]) -> dict[str, Any]:
+def _screening_text(screening: Mapping[str, Any]) -> str:
     observer = screening["observer"]
     text = f"{screening['trained']} settings were trained; a model observer decided {screening['screened']} others without training."
     if screening["undecided"]:
         text += f" {screening['undecided']} are undecided."
     if observer is None:
-        return {"text": f"{text} It could not be calibrated: {screening['why_none']}", "figure": ""}
+        return f"{text} It could not be calibrated: {screening['why_none']}"
     who = observer["observer"]
     text += (
         f" It is the {who['detector']} observer of the {who['image']} image, with an efficiency of {who['efficiency']:.3g} and an"
         f" internal noise of {who['internal_noise']:.3g}; settings left out of its calibration are met to"
         f" {100 * screening['left_out_rms']:.0f} % (rms, the networks' own error included)."
     )
-    return {"text": text, "figure": _inline(plot_left_out(observer["left_out"]))}
+    return text
 
 
-def plot_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> bytes:
-    """POD of a setting over contrast and over length in mm, each with its 95 % band. PNG."""
-    figure, axes = figure_with_axes(8.4, 3.2, 1, 2)
-    curves = ((answer["size"], row), (answer["other_size"], row["other_size"]))
-    for axis, (size, curve) in zip(axes[0], curves, strict=True):
+def charts_of_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> list[Chart]:
+    """POD of a setting over contrast and over length in mm, each with its 95 % band."""
+    charts = []
+    for size, curve in ((answer["size"], row), (answer["other_size"], row["other_size"])):
+        marks: list[Any] = [Rule(at=0.9)]
         line = curve["line"]
         if line:
             at, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
-            axis.plot(at, pod, color=REAL)
-            axis.fill_between(at, low, high, color=REAL, alpha=0.15, linewidth=0)
-        for point in curve["points"]:
-            axis.plot([point["size"]], [point["hits"] / point["n"]], "o", color="black", markersize=3)
-        axis.axhline(0.9, color=PUBLISHED, linewidth=0.7, linestyle=":")
-        axis.set(ylim=(-0.03, 1.03), xlabel="contrast" if size == "contrast" else "length of the object, mm")
-    axes[0, 0].set_ylabel("probability of detection")
-    return png_of(figure)
+            marks += [Band(x=at, low=low, high=high), Line(x=at, y=pod)]
+        if curve["points"]:
+            marks.append(
+                Points(
+                    x=[point["size"] for point in curve["points"]],
+                    y=[point["hits"] / point["n"] for point in curve["points"]],
+                    names=[f"{point['hits']} of {point['n']}" for point in curve["points"]],
+                    colour="#111111",
+                    size_px=6.0,
+                )
+            )
+        title = "contrast" if size == "contrast" else "length of the object, mm"
+        charts.append(
+            Chart(
+                name=f"pod_over_{'contrast' if size == 'contrast' else 'length'}",
+                alt=f"POD over {title} with its 95 % band; dots: share of hits in groups of like size.",
+                marks=marks,
+                x_label=title,
+                y_label="probability of detection",
+                y_ends=(-0.03, 1.03),
+            )
+        )
+    return charts
 
 
-def plot_left_out(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """a90 of networks against what an observer calibrated on the other settings expects. PNG."""
-    figure, axes = figure_with_axes(5.2, 4.6)
-    axis = axes[0, 0]
-    ends = []
-    for row in rows:
-        error = math.exp(1.96 * row["log_sd"])
-        low, high = row["measured"] / error, row["measured"] * error
-        axis.plot([row["predicted"]] * 2, [low, high], color=REAL, linewidth=1)
-        axis.plot([row["low"], row["high"]], [row["measured"]] * 2, color=REAL, linewidth=1)
-        axis.plot([row["predicted"]], [row["measured"]], "o", color=REAL, markersize=5)
-        ends += [low, high, row["predicted"], row["low"], row["high"]]
-    span = [0.9 * min(ends), 1.1 * max(ends)]
-    axis.plot(span, span, color=PUBLISHED, linewidth=0.8, linestyle=":")
-    axis.set(xlabel="a90 that the observer expects", ylabel="a90 of networks", xlim=span, ylim=span)
-    return png_of(figure)
+def left_out_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
+    """a90 of networks against what an observer calibrated on the other settings expects."""
+    errors = [math.exp(1.96 * row["log_sd"]) for row in rows]
+    predicted, measured = ([row[name] for row in rows] for name in ("predicted", "measured"))
+    low = [value / error for value, error in zip(measured, errors, strict=True)]
+    high = [value * error for value, error in zip(measured, errors, strict=True)]
+    expected = [row["low"] for row in rows], [row["high"] for row in rows]
+    every = [*low, *high, *predicted, *expected[0]]
+    ends = 0.9 * min(every), 1.1 * max(every)
+    return Chart(
+        name="left_out_settings",
+        alt="a90 of each trained setting against what the observer, calibrated on the others, expects; 95 % intervals of both.",
+        marks=[
+            Line(x=ends, y=ends, colour=QUIET, dashed=True, label="as expected"),
+            Points(
+                x=predicted,
+                y=measured,
+                x_ends=expected,
+                y_ends=(low, high),
+                names=[
+                    str(row["label"]) if "label" in row else f"setting {number + 1}" for number, row in enumerate(rows)
+                ],
+            ),
+        ],
+        x_label="a90 that the observer expects",
+        y_label="a90 of networks",
+        x_ends=ends,
+        y_ends=ends,
+        height_px=400,
+    )
 
 
-def plot_front_with_expected(answer: Mapping[str, Any]) -> bytes:
-    """a90 against throughput and against dose: of networks (full), expected by the observer (empty), the front joined. PNG."""
+def expected_charts(answer: Mapping[str, Any]) -> dict[str, Chart]:
+    """a90 against throughput and against dose: of networks, and as the observer expects it; what is asked for."""
     front = {one["setting"] for one in answer["decision"]["front"]}
     required = answer["decision"]["requirement"]
-    figure, axes = figure_with_axes(11, 4.4, 1, 2)
-    panels = (
-        ("throughput_per_s", "products a minute", required["throughput_per_s"], 60.0),
-        ("dose_uGy", "air kerma of a pair, uGy", required["dose_uGy"], 1.0),
-    )
-    for axis, (name, title, limit, factor) in zip(axes[0], panels, strict=True):
-        points = []
+    panels = {
+        "pace": ("throughput_per_s", "products a minute", required["throughput_per_s"], 60.0),
+        "dose": ("dose_uGy", "air kerma of a pair, µGy", required["dose_uGy"], 1.0),
+    }
+    charts = {}
+    for panel, (name, title, limit, factor) in panels.items():
+        groups: dict[str, list[tuple[float, float, str]]] = {kind: [] for kind in _POINTS}
         for row in answer["rows"]:
             a90 = row["a90"] if row["a90"] is not None else (row["predicted"] or {}).get("value")
             at = row[name]["value"] if isinstance(row[name], Mapping) else row[name]
             if a90 is None or at is None or not row["feasible"]:
                 continue
-            points.append((factor * at, a90, row["a90"] is not None, row["setting"] in front, row["recommended"]))
-        for at, a90, trained, best, taken in points:
-            colour = GENERATED if best else PUBLISHED
-            face = colour if trained else "white"
-            axis.plot(
-                [at], [a90], "s" if taken else "o", color=colour, markerfacecolor=face, markersize=9 if taken else 5
-            )
-        axis.axhline(required["size"], color="black", linewidth=0.8, linestyle=":")
+            best = "on the front" if row["setting"] in front else "beaten in all three"
+            kind = "recommended" if row["recommended"] else best if row["a90"] is not None else f"{best}, expected"
+            groups[kind].append((factor * at, a90, str(row["label"])))
+        marks: list[Any] = [Rule(at=required["size"], colour="#111111", label="asked for")]
         if limit is not None:
-            axis.axvline(factor * limit, color="black", linewidth=0.8, linestyle=":")
-        axis.set(xscale="log", xlabel=title, ylabel="a90" + (f", {answer['unit']}" if answer["unit"] else ""))
-        if points:
-            ticks, ends = few_ticks([*(point[0] for point in points), *([] if limit is None else [factor * limit])])
-            axis.set_xticks(list(ticks), list(ticks.values()))
-            axis.minorticks_off()
-            axis.set_xlim(*ends)
-            axis.set_ylim(0, 1.1 * max(*(point[1] for point in points), required["size"]))
-    for label, colour, face, marker in (
-        ("recommended", GENERATED, GENERATED, "s"),
-        ("on the front", GENERATED, GENERATED, "o"),
-        ("beaten in all three", PUBLISHED, PUBLISHED, "o"),
-        ("expected by the observer", PUBLISHED, "white", "o"),
-        ("asked for", "black", "black", ":"),
-    ):
-        style = {"linestyle": ":"} if marker == ":" else {"marker": marker, "linestyle": "none"}
-        axes[0, 0].plot([], [], color=colour, markerfacecolor=face, label=label, **style)
-    figure.legend(fontsize=8, loc="outside upper left", ncols=5, frameon=False)
-    return png_of(figure)
+            marks.append(Rule(at=factor * limit, along="x", colour="#111111"))
+        for kind, (colour, shape) in _POINTS.items():
+            if groups[kind]:
+                x, y, names = (list(column) for column in zip(*groups[kind], strict=True))
+                size_px = 11.0 if kind == "recommended" else 7.0
+                marks.append(Points(x=x, y=y, names=names, colour=colour, shape=shape, label=kind, size_px=size_px))
+        found = [one for members in groups.values() for one in members]
+        if not found:
+            continue
+        ticks, ends = few_ticks([*(one[0] for one in found), *([] if limit is None else [factor * limit])])
+        charts[panel] = Chart(
+            name=f"expected_a90_against_{panel}",
+            alt=f"a90 against {title.partition(',')[0]}; expected: by the observer, where no networks were trained.",
+            marks=marks,
+            x_label=title,
+            y_label="a90" + (f", {answer['unit']}" if answer["unit"] else ""),
+            x_scale="log",
+            x_ticks=ticks,
+            x_ends=ends,
+            y_ends=(0.0, 1.1 * max(*(one[1] for one in found), required["size"])),
+            height_px=380,
+        )
+    return charts

@@ -9,17 +9,7 @@ from ..generator.twins.twin_io import read_twin
 from ..reports import write_page
 from .demo import read_hits
 from .demo_gap import WithheldFrame, answer_text, withheld_frames, withheld_rows, withheld_text
-from .figures import (
-    plot_a90,
-    plot_examples,
-    plot_gap,
-    plot_noise_maps,
-    plot_photon_transfer,
-    plot_pod,
-    plot_training,
-    plot_validation,
-    plot_withheld,
-)
+from .figures import demo_figures
 
 _DASH = "–"
 _SHARED_NAMES = {"first": "1 s and the longest exposure (first)", "shared": "all exposures (shared start)"}
@@ -33,21 +23,12 @@ def write_report(result: Mapping[str, Any], directory: Path, *, version: str) ->
     exposures = [row["exposure_ms"] for row in result["a90_table"]]
     hits = {path.stem.removeprefix("hits_"): read_hits(path) for path in sorted(directory.glob("hits_*.csv"))}
     withheld = withheld_frames(directory, seed=result["plan"]["seed"])
-    figures = {
-        "gap": plot_gap(result["gap"]["diagnosis"]),
-        "withheld": plot_withheld(withheld),
-        "maps": plot_noise_maps(twin),
-        "photon_transfer": plot_photon_transfer(twin),
-        "validation": plot_validation(result["validation"]["rows"]),
-        "examples": plot_examples(directory, [exposure for exposure in exposures if exposure != 1000.0]),
-        "training": plot_training(result["training"]),
-        "pod": plot_pod(hits, result["pod"], exposures),
-        "a90": plot_a90(result["a90_table"]),
-    }
+    chapters = demo_figures(directory, result, twin=twin, hits=hits, withheld=withheld)
     return write_page(
         directory / "report.html",
         Path(__file__).parent / "report.html",
-        figures=figures,
+        figures={f"{name}_{place}": one for name, several in chapters.items() for place, one in enumerate(several)},
+        chapters={name: [f"{name}_{place}" for place in range(len(several))] for name, several in chapters.items()},
         version=version,
         plan=result["plan"],
         summary=summary_text(result),

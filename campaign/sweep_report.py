@@ -13,7 +13,7 @@ from ..errors import RaytwinError
 from ..reports import AFTER, BEFORE, MEASURED, QUIET, Band, Chart, Figure, Line, Points, Rule, SortedTable, write_page
 from ..reports.chart import Shape
 from ._ticks import few_ticks
-from .decision_report import decision_section
+from .decision_report import decision_part
 from .sweep_choice import paces
 from .sweep_file import Campaign
 from .sweep_trial import EXAMPLE
@@ -67,6 +67,8 @@ def write_report(
     figures |= {f"pod_{number}": chart for number, chart in enumerate(curve_charts(curves, size=size))}
     examples = {str(row["setting"]): _example_png(path.parent, row) for row in ordered[:_MOST_EXAMPLES]}
     figures |= {f"example_{anchors[setting]}": png for setting, png in examples.items() if png is not None}
+    decided, more = decision_part(answer)
+    figures |= more
     columns = {name: any(row[name] is not None for row in ordered) for name in ("motion_px", "cnr_object")}
     columns["other_size"] = any(row["other_size"]["a90"] is not None for row in ordered)
     return write_page(
@@ -77,7 +79,7 @@ def write_report(
         interactive=interactive,
         answer=answer,
         sentence=answer["sentence"],
-        decision=decision_section(answer),
+        **decided,
         size=size,
         trained=_trained_table(
             ordered,

@@ -1,9 +1,13 @@
 """A requirement against the rows of a sweep: three verdicts, margins, what to measure, in words."""
 
+import csv
+import io
 import math
+from pathlib import Path
 
 import pytest
 
+import raytwin.campaign
 from raytwin.api.campaigns import Decision, Sweep
 from raytwin.campaign.decision import (
     Change,
@@ -14,9 +18,10 @@ from raytwin.campaign.decision import (
     measurements_for,
     upper_rate,
 )
-from raytwin.campaign.decision_report import decision_section
+from raytwin.campaign.decision_report import decision_part
 from raytwin.campaign.sweep_choice import choose
 from raytwin.campaign.sweep_file import Requirement
+from raytwin.reports import write_page
 
 ASKED = Requirement(size=2.0, false_alarm_rate=0.01, throughput_per_s=1.0, dose_uGy=3.0)
 
@@ -188,6 +193,29 @@ def test_where_nothing_meets_it_the_closest_is_named_with_what_is_missing():
     assert "None was tried" in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]
 
 
+def page_of(answer, folder):
+    """The decision's part of a sweep's page, alone on one."""
+    part = Path(raytwin.campaign.__path__[0]) / "decision_report.html"
+    template = folder / "page.html"
+    template.write_text('{% extends "base.html" %}{% block body %}' + part.read_text() + "{% endblock %}")
+    values, figures = decision_part(answer)
+    return write_page(
+        folder / "out.html", template, version="0", figures=figures, interactive=False, **values
+    ).read_text()
+
+
+def test_the_charts_hold_every_setting_whether_trained_or_expected(answer):
+    _, figures = decision_part(answer)
+    pace = list(csv.DictReader(io.StringIO(figures["expected_pace"].numbers_csv())))
+    settings = {(row["mark"], float(row["x"]), float(row["y"])) for row in pace if row["name"]}
+    assert settings == {
+        ("recommended", 90.0, 1.5),
+        ("on the front", 90.0, 1.5),
+        ("beaten in all three, expected", 30.0, 3.0),
+    }
+    assert [(row["x"], row["y"]) for row in pace if not row["name"]] == [("", "2"), ("60", "")]
+
+
 def test_python_and_the_page_show_the_decision(answer, tmp_path):
     found = Sweep(path=tmp_path, answer=answer).decision
     assert isinstance(found, Decision)
@@ -197,8 +225,8 @@ def test_python_and_the_page_show_the_decision(answer, tmp_path):
     assert frame["detection_margin"][0] == pytest.approx(0.1)
     assert "1 of 3 settings meet the requirement; a90 1.5: meets" in repr(found)
     assert "<table>" in found._repr_html_() and "29 products" in found._repr_html_()
-    answer["decision"]["settings"][0]["label"] = "<script>"
-    page = decision_section(answer)
-    assert "&lt;script&gt;" in page and "<script>" not in page
-    assert "60 a minute" in page and "would help most" in page and page.count("data:image/png") == 1
+    answer["decision"]["settings"][0]["label"] = "<b>bold</b>"
+    page = page_of(answer, tmp_path)
+    assert "&lt;b&gt;bold" in page and "<b>bold" not in page
+    assert "60 a minute" in page and "would help most" in page and page.count("data:image/png") == 2
     assert Sweep(path=tmp_path, answer=answer | {"decision": None}).decision is None

@@ -1,6 +1,8 @@
 """The demo's last chapter and its page: withheld products before and after, what the answer says, what a missing a90 needs."""
 
+import csv
 import dataclasses
+import io
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from raytwin.campaign.demo_gap import (
     withheld_rows,
     withheld_text,
 )
-from raytwin.campaign.figures import plot_gap, plot_withheld
+from raytwin.campaign.figures import a90_chart, gap_chart, pod_chart, withheld_pictures
 from raytwin.campaign.report import missing_a90
 from raytwin.cli import main
 from raytwin.generator.effects import AppliedEffect
@@ -56,7 +58,18 @@ def test_products_agree_with_a_twin_that_lacks_nothing_and_depart_from_one_with_
         assert abs(plain) < 1.5  # layers are as stated to 0.7 %
         assert scattered > plain + 1.0  # scatter adds light behind the product
         assert 0.5 < frame.departure(frame.before_DN) < frame.departure(frame.after_DN)
-    assert plot_withheld(frames).startswith(b"\x89PNG")
+    pictures = withheld_pictures(frames)
+    assert [picture.title for picture in pictures[:3]] == [
+        f"measured, {pictures[0].title.removeprefix('measured, ')}",
+        "measured over twin, before",
+        "measured over twin, after",
+    ]
+    longest = [frame for frame in frames if frame.exposure_ms == 100.0]
+    assert len(pictures) == 3 * len(longest)
+    for frame, before, after in zip(longest, pictures[1::3], pictures[2::3], strict=True):
+        assert np.array_equal(np.isfinite(before.values), frame.inside)
+        # scatter that is not there: the twin is brighter than what was measured
+        assert np.nanmean(after.values) < np.nanmean(before.values)
 
 
 def one_frame(before, after):
@@ -115,7 +128,38 @@ def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, 
     assert told in text
     assert not_told not in text
     assert "from 6.6 to 1.0" in text
-    assert plot_gap(found).startswith(b"\x89PNG")
+    rows = list(csv.DictReader(io.StringIO(gap_chart(found).numbers_csv())))
+    assert [(row["mark"], row["name"], row["x"]) for row in rows if row["name"] == "everything"] == [
+        ("before", "everything", "6.6"),
+        ("after", "everything", "1"),
+        ("measured against measured", "everything", "0.9"),
+    ]
+
+
+def test_charts_of_detection_hold_every_trial_and_every_a90():
+    rng = np.random.default_rng(3)
+    contrast = rng.uniform(0.01, 0.2, 60)
+    trials = [
+        {"contrast": f"{one:.4f}", "hit": str(int(rng.random() < one / 0.1)), "network": str(number % 2)}
+        for number, one in enumerate(contrast)
+    ]
+    entry = {"a90": 0.09, "low": 0.07, "high": 0.12}
+    rows = [
+        {"exposure_ms": 1000.0, "real": entry, "generated": None},
+        {"exposure_ms": 50.0, "real": None, "generated": entry},
+    ]
+    told = list(csv.DictReader(io.StringIO(a90_chart(rows).numbers_csv())))
+    assert [(row["mark"], row["name"], row["y_low"]) for row in told] == [
+        ("measured", "1000 ms", "0.07"),
+        ("generated", "50 ms", "0.07"),
+    ]
+    answers = {"test_50ms": {"a90": 0.09, "a90_low_two_sided": {"likelihood_ratio": 0.07}, "a90_95_two_sided": {}}}
+    chart = pod_chart({"test_50ms": trials}, answers, 50.0)
+    told = list(csv.DictReader(io.StringIO(chart.numbers_csv())))
+    assert sum(row["name"] in ("0", "1") for row in told) == len(trials)
+    assert [row["x"] for row in told if row["name"] == "a90"] == ["0.09"]
+    # a curve of all trials, and one of each network that its own trials support
+    assert {"generated"} <= {row["mark"] for row in told}
 
 
 @pytest.mark.parametrize(

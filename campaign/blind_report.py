@@ -4,15 +4,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..reports import write_page
+from ..reports import Figure, write_page
 from .blind_figures import (
-    plot_accuracy,
-    plot_confusion,
-    plot_distances,
-    plot_limits,
-    plot_reliability,
-    plot_strengths,
-    plot_unknown,
+    accuracy_charts,
+    confusion_table,
+    distance_table,
+    limit_charts,
+    reliability_charts,
+    strength_chart,
+    unknown_chart,
+    verdict_table,
 )
 from .blind_results import CheckResult
 from .blind_scores import SIGMA_BINS, exactly_right, top1_right
@@ -84,20 +85,22 @@ def write_report(result: CheckResult, rows: Sequence[Mapping[str, Any]], path: P
     scores = result.scores
     outcomes = result.outcomes
     full, every = scores["full_measurement_set"], scores["scores"]
-    figures = {
-        "accuracy": plot_accuracy(full, scores["baselines"]),
-        "reliability": plot_reliability(every, scores["baselines"]),
-        "confusion": plot_confusion(outcomes),
-        "distances": plot_distances(every["distances"]),
-        "strengths": plot_strengths(outcomes),
-        "limits": plot_limits(outcomes),
-        "unknown": plot_unknown(outcomes),
+    chapters: dict[str, Sequence[Figure]] = {
+        "accuracy": accuracy_charts(full, scores["baselines"]),
+        "reliability": reliability_charts(every, scores["baselines"]),
+        "limits": limit_charts(outcomes),
+        "strengths": [strength_chart(outcomes)],
+        "unknown": [unknown_chart(outcomes)],
     }
     wrong = [row for row, outcome in zip(rows, outcomes, strict=True) if not exactly_right(outcome)]
     return write_page(
         path,
         Path(__file__).parent / "blind_report.html",
-        figures=figures,
+        figures={f"{name}_{place}": one for name, several in chapters.items() for place, one in enumerate(several)},
+        chapters={name: [f"{name}_{place}" for place in range(len(several))] for name, several in chapters.items()},
+        confusion=confusion_table(outcomes),
+        distances=distance_table(every["distances"]),
+        verdicts=verdict_table(outcomes),
         version=version,
         summary=summary_text(result),
         development=scores["development_seed"],

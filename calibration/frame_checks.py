@@ -88,6 +88,21 @@ def repeated_frame_indices(pieces: Iterable[NDArray[Any]]) -> tuple[int, ...]:
     return tuple(sorted(scan.copies()))
 
 
+def repeats_the_last(frames: NDArray[Any], last: NDArray[Any] | None) -> NDArray[np.bool_]:
+    """Which frames (m, row, column) or (m, pixel) equal the one before them in every pixel (m,); `last`: the one before the first.
+
+    Between a frame and its copy there is no step of noise. A frame whose pixels are all equal, such as a blank one, is no copy.
+    """
+    before = [last, *frames[:-1]]
+    return np.array(
+        [
+            one is not None and one.flat[0] == frame.flat[0] and np.array_equal(one, frame) and bool(np.ptp(frame) > 0)
+            for one, frame in zip(before, frames, strict=True)
+        ],
+        dtype=bool,
+    )
+
+
 class CopyScan:
     """Finds copies among frames that are handed over one piece after the other."""
 

@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .frame_checks import repeats_the_last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSums:
     """Per-pixel sums over frames x_1 .. x_n, relative to `reference` (the first frame), and the frames' own means.
 
-    Fields: frames (n); pairs (successive differences summed); reference, deviation_sum, square_sum, pair_square_sum
+    Fields: frames (n); pairs (successive differences summed, those to a copy left out where there are others); reference,
+    deviation_sum, square_sum, pair_square_sum
     (row, column), DN and DN^2; frame_mean_DN (n,), in time order; maximum_DN (highest value seen) and maximum_count
     (how many values equal it); integer (all values were whole numbers).
     """
@@ -83,7 +85,7 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
     """
     from ._kernels import COUNT_BLOCK, accumulate, accumulate_counts, count_equal
 
-    frames = pairs = maximum_count = 0
+    frames = pairs = copies = maximum_count = 0
     maximum_DN = -np.inf
     integer = True
     sums: list[NDArray[np.float64]] = []
@@ -111,6 +113,7 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
             )
         reference, deviation, square, pair, last = sums
         count, pixels = flat.shape
+        copies += int(np.count_nonzero(repeats_the_last(flat, last if frames else None)))
         if flat.dtype in (np.uint8, np.uint16):
             blocks = -(-pixels // COUNT_BLOCK)
             totals = np.empty((blocks, count), np.int64)
@@ -137,7 +140,7 @@ def sum_frames(pieces: Iterable[NDArray[Any]], *, name: str = "frames") -> Frame
     reference, deviation, square, pair, _ = (array.reshape(shape) for array in sums)
     return FrameSums(
         frames=frames,
-        pairs=pairs,
+        pairs=pairs - copies if copies < pairs else pairs,
         reference=reference,
         deviation_sum=deviation,
         square_sum=square,

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .frame_checks import repeats_the_last
 from .frame_sums import effective_frames
 
 LARGEST_SQUARE_PX = 64  # a spread of 3 px leaves half of the power at the lowest frequency in use
@@ -406,12 +407,19 @@ def compute_noise_power(
     summed = _PowerSum(signal_DN=signal_DN, good=good, side=side)
     single = 2.0 if about is None else 1.0 - 1.0 / max(about[1], 2)
     last: FloatArray | None = None if about is None else about[0]
+    copies = 0
     for piece in pieces:
         for frame in piece:
             current = np.asarray(frame, dtype=np.float64)
+            if about is None and repeats_the_last(current[None], last)[0]:
+                copies += 1
+                continue
             if last is not None:
                 summed.add(current - last)
             last = current if about is None else last
+    if summed.count == 0 and copies:
+        # nothing ever moves: there is no noise
+        summed.add(np.zeros(good.shape))
     if summed.count == 0 or (about is not None and about[1] < 2):
         raise InputError("frames", received="fewer than two frames", expected="at least two frames of one setting")
     degrees = effective_frames(summed.count + 1) if about is None else summed.count * single

@@ -17,6 +17,13 @@ def in_pieces(frames, cuts):
     return (frames[start:stop] for start, stop in pairwise(edges))
 
 
+def steps_of(frames):
+    """From each frame to the next; those to a copy are none, unless all are."""
+    steps = np.diff(frames.astype(np.float64), axis=0)
+    moved = steps.any(axis=(1, 2)) | (np.ptp(frames[1:], axis=(1, 2)) == 0)
+    return steps[moved] if moved.any() else steps
+
+
 stacks = st.integers(2, 12).flatmap(lambda n: arrays(np.uint16, (n, 3, 4), elements=st.integers(0, 65535)))
 
 
@@ -27,7 +34,7 @@ def test_sums_are_numpy_s_however_the_frames_arrive(frames, cuts):
     assert total.frames == len(frames)
     assert total.mean_DN == pytest.approx(exact.mean(axis=0), rel=1e-12, abs=1e-9)
     assert total.stack_variance_DN2 == pytest.approx(exact.var(axis=0, ddof=1), rel=1e-9, abs=1e-4)
-    assert total.pair_variance_DN2 == pytest.approx(np.mean(np.diff(exact, axis=0) ** 2, axis=0) / 2, rel=1e-12)
+    assert total.pair_variance_DN2 == pytest.approx(np.mean(steps_of(exact) ** 2, axis=0) / 2, rel=1e-12)
     assert total.frame_mean_DN == pytest.approx(exact.mean(axis=(1, 2)))
     assert total.maximum_DN == frames.max()
     assert total.maximum_count == np.sum(frames == frames.max())
@@ -40,8 +47,8 @@ def test_merged_parts_are_the_whole_but_for_the_pair_at_the_seam(first, second):
     merged = merge_frame_sums(sum_frames([first]), sum_frames([second]))
     assert merged.mean_DN == pytest.approx(whole.mean(axis=0), rel=1e-12, abs=1e-9)
     assert merged.stack_variance_DN2 == pytest.approx(whole.var(axis=0, ddof=1), rel=1e-9, abs=1e-3)
-    assert merged.pairs == len(whole) - 2
-    steps = np.concatenate([np.diff(part.astype(np.float64), axis=0) for part in (first, second)])
+    steps = np.concatenate([steps_of(part) for part in (first, second)])
+    assert merged.pairs == len(steps)
     assert merged.pair_variance_DN2 == pytest.approx(np.mean(steps**2, axis=0) / 2, rel=1e-12)
     assert merged.maximum_count == np.sum(whole == whole.max())
 
@@ -169,3 +176,16 @@ def test_sums_of_many_frames_are_exact_whatever_the_spread_of_their_values(dtype
         assert np.array_equal(total.square_sum, (away**2).sum(axis=0))
         assert np.array_equal(total.pair_square_sum, (np.diff(whole, axis=0) ** 2).sum(axis=0))
         assert (total.maximum_DN, total.maximum_count) == (whole.max(), np.sum(whole == whole.max()))
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_copies_of_frames_leave_the_variance_of_pairs_alone(dtype):
+    rng = np.random.default_rng(8)
+    frames = np.rint(1000 + 9 * rng.standard_normal((40, 12, 15))).astype(dtype)
+    stored = np.repeat(frames, 1 + (np.arange(40) % 3 == 1), axis=0)
+    for cuts in ([], [2], [3, 20]):
+        total = sum_frames(in_pieces(stored, cuts))
+        assert total.frames == len(stored) and total.pairs == 39
+        np.testing.assert_allclose(total.pair_variance_DN2, sum_frames([frames]).pair_variance_DN2)
+    still = sum_frames([np.repeat(frames[:1], 5, axis=0)])
+    assert still.pairs == 4 and not still.pair_variance_DN2.any()

@@ -198,3 +198,13 @@ def test_too_few_frames_or_good_pixels_are_refused():
         compute_noise_power([frames_of(1)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
     with pytest.raises(InputError, match="good pixels: got 0; expected squares of 64 x 64 px"):
         compute_noise_power([frames_of(2)], signal_DN=LEVEL, good=np.zeros(SHAPE, bool))
+
+
+def test_copies_of_frames_leave_the_noise_power_alone():
+    frames = frames_of(12)
+    good = np.ones(SHAPE, bool)
+    stored = np.repeat(frames, 1 + (np.arange(12) % 3 == 1), axis=0)
+    found, once = (compute_noise_power([each], signal_DN=LEVEL, good=good) for each in (stored, frames))
+    np.testing.assert_allclose(found.power_DN2, once.power_DN2)
+    still = compute_noise_power([np.repeat(frames[:1], 4, axis=0)], signal_DN=LEVEL, good=good)
+    assert not np.nan_to_num(still.power_DN2).any()

@@ -17,7 +17,8 @@ from raytwin.diagnosis.probes.map_probes import MapProjection, Template
 from raytwin.diagnosis.probes.moving_picture import MovingPicture
 from raytwin.diagnosis.probes.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.probes.scalar_context import Areas, ScalarContext
-from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, summarise_series
+from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, look_at_series, summarise_series
+from raytwin.diagnosis.session.usable import SeenSeries
 from raytwin.errors import InputError
 
 SHAPE = (48, 64)
@@ -496,3 +497,39 @@ def test_quanta_of_an_area_whose_pixels_are_brighter_are_noisier_by_the_square_o
     assert left / right == pytest.approx(1.21)
     # together they are as noisy as calibration found them
     assert 0.5 * (left + right) == pytest.approx(1.0)
+
+
+def test_copies_of_frames_change_nothing_that_is_said_of_the_noise():
+    """Of a series with copies all is said that is said of the frames that are there once; the copies are counted."""
+    frames = flat_frames(
+        np.random.default_rng(6), rows=1.0, factor=1.0 + 0.01 * np.random.default_rng(7).standard_normal(FRAMES)
+    )
+    stored = np.repeat(frames, 1 + (np.arange(FRAMES) % 4 == 1), axis=0)
+    found, once = summary_of(stored), summary_of(frames)
+    assert found.frames == once.frames == FRAMES
+    for name in (
+        "mean_DN",
+        "label_variance_DN2",
+        "label_autocovariance_DN2",
+        "row_variance_DN2",
+        "block_variance_DN2",
+        "temporal_covariance_DN2",
+        "frame_mean_DN",
+    ):
+        np.testing.assert_allclose(getattr(found, name), getattr(once, name), rtol=1e-5, atol=1e-6)
+    good = np.ones(SHAPE, dtype=bool)
+    assert look_at_series([stored[:10], stored[10:]], good=good).copies == FRAMES // 4
+
+
+def test_copies_are_counted_once_for_the_series_that_calibrate_and_once_for_all_others():
+    def look(copies, noise=1.0):
+        return SimpleNamespace(copies=copies, stack_variance_DN2=np.full((2, 2), noise))
+
+    looks = {"dark": look(2), "flat": look(1), "later": look(3), "blank": look(4, noise=0.0)}
+    kept = tuple(
+        SimpleNamespace(name=name, calibrates=name in ("dark", "flat"), series=SimpleNamespace(n_frames=11))
+        for name in looks
+    )
+    seen = SimpleNamespace(kept=kept, looks=looks)
+    # frames that are all alike can be copies or not: nothing tells
+    assert SeenSeries.counted_copies.fget(seen) == {"flat": (3, 20), "later": (3, 10)}

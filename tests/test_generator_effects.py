@@ -62,6 +62,7 @@ CATALOGUE = {
     "crosstalk": ("%", 3, 40),
     "line_flicker": ("%", 0.03, 1),
     "grey_absorber": ("%", 0.5, 60),
+    "dropped_frames": ("%", 0.5, 30),
 }
 CACHE = ModelCache()
 
@@ -139,6 +140,7 @@ def numbers(found):
                 found.column_variance_DN2,
                 found.bad_pixel_share,
                 0.0 if found.gain_pattern is None else found.gain_pattern.rms,
+                found.repeated_share,
             ]
         ),
         np.zeros(3)
@@ -218,6 +220,15 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     residual = frames - expected.mean_DN
     for image, course in expected.trend_DN or ():
         residual = residual - course[:, None, None] * image
+    if name == "dropped_frames":
+        copies = np.all(frames[1:] == frames[:-1], axis=(1, 2))
+        share = expected.repeated_share
+        assert share == pytest.approx(EFFECTS[name].strength.high / 100)
+        assert abs(copies.mean() - share) < 4 * math.sqrt(share * (1 - share) / copies.size)
+        # what is left is a series like any other
+        frames = frames[np.concatenate([[True], ~copies])]
+        residual = frames - expected.mean_DN
+        count = len(frames)
     quantum = expected.quantum_variance_DN2
     lines = expected.row_variance_DN2 + expected.column_variance_DN2
     common = expected.frame_factor_rms**2 * expected.signal_DN**2

@@ -490,6 +490,21 @@ def test_quantisation_gives_multiples_of_its_step():
     assert np.array_equal(values, np.rint(np.rint(values / 2.5) * 2.5))
 
 
+def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
+    line = line_with("dropped_frames=20", seed=3)
+    shown = []
+    for number in range(2):
+        line.begin_series(number)
+        shown.append(np.array([frame for frame, _ in line.dark(10.0, frames=600)]))
+    copies = [np.all(frames[1:] == frames[:-1], axis=(1, 2)) for frames in shown]
+    share = np.mean(copies)
+    # stalls of 1.5 frames: twice the variance of copies drawn one by one
+    assert abs(share - 0.20) < 4 * math.sqrt(2 * 0.2 * 0.8 / 1200)
+    lengths = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], copies[0], [0]]))))[::2]
+    assert lengths.mean() == pytest.approx(1.5, abs=4 * math.sqrt(0.75 / lengths.size))
+    assert not np.array_equal(shown[1][0], shown[0][-1])
+
+
 # --- what no catalogue holds ------------------------------------------------------------------------------------------
 
 

@@ -248,6 +248,7 @@ def session_model(
             previous_DN=before,
             code_range=summaries[item.name].code_range,
             counts_all=item.name == counting,
+            repeatable=seen.counted_copies.get(item.name, (0, 0))[1],
         )
         alone = expected_scalars(expected, context)
         tells = item.name in placed.telling
@@ -279,8 +280,9 @@ def _context(
     previous_DN: float | None,
     code_range: int,
     counts_all: bool,
+    repeatable: int,
 ) -> ScalarContext:
-    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it."""
+    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; repeatable: see there."""
     in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
     lit_DN = np.asarray(signal_DN if lit else 0.0)
@@ -303,6 +305,7 @@ def _context(
         quantum_DN2=mean_over(expected.quantum_variance_DN2, clean),
         dark_DN=mean_over(expected.dark_DN, clean),
         counts_all_outliers=counts_all,
+        repeatable=repeatable,
         gain=maps.gain if lit and "gain" not in item.series.corrected else None,
         averaged=item.request.exposures_per_frame,
         whole_lines=int(clean.sum()) > _WHOLE_LINES * in_use,

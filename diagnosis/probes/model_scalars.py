@@ -14,7 +14,7 @@ from .line_scalars import LineNoise, bent_share
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
-from .probes import FIXED_COLUMNS, FIXED_ROWS, OUTLIERS, OUTLIERS_ANYWHERE, PATTERN_PIXEL_SHARE
+from .probes import FIXED_COLUMNS, FIXED_ROWS, OUTLIERS, OUTLIERS_ANYWHERE, PATTERN_PIXEL_SHARE, REPEATED_FRAMES
 from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
 
 
@@ -45,6 +45,8 @@ def expected_scalars(
         values["codes"] = max(expected.quantisation_step_DN, 1.0)
     if not context.calibrates and context.kind in ("flat", "dark"):
         values |= _pattern_scalars(expected, context)
+    if context.repeatable:
+        values[REPEATED_FRAMES] = math.sqrt(expected.repeated_share * context.repeatable + 0.375)
     if context.counts_all_outliers:
         values[OUTLIERS_ANYWHERE] = math.sqrt(expected.bad_pixel_share * areas.order.size + 0.375)
     return values

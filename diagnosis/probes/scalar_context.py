@@ -77,7 +77,8 @@ class ScalarContext:
     dark_DN: the base model's mean dark;
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
     of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; whole_lines: good pixels fill
-    rows and columns, so that noise of these is seen; areas: the
+    rows and columns, so that noise of these is seen; repeatable: frames of all series that this one stands for, which may be copies
+    of others; areas: the
     good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
@@ -97,6 +98,7 @@ class ScalarContext:
     gain: NDArray[np.floating] | None = None
     averaged: int = 1
     whole_lines: bool = True
+    repeatable: int = 0
     areas: "Areas" = field(init=False)
     label_gain: NDArray[np.float64] = field(init=False)
 

@@ -155,14 +155,16 @@ class _Measured:
     """What the frames of a session show, and what the base twin expects of them.
 
     Fields: expected; pictures (row, column): corrected mean frames, DN, by name of series; summaries of the frames' noise, by name;
-    memory: of outlying pixels in darks, see `memory_of`, by name; clean: pixels in use that do not stand out (row, column);
-    outliers: how many stand out in any series; skipped: what could not be used and why.
+    memory: of outlying pixels in darks, see `memory_of`, by name; copies: of frames, by name of the series that counts them; clean:
+    pixels in use that do not stand out (row, column); outliers: how many stand out in any series; skipped: what could not be used
+    and why.
     """
 
     expected: SessionModel
     pictures: Mapping[str, NDArray[np.float64]]
     summaries: Mapping[str, SeriesSummary]
     memory: Mapping[str, tuple[float, int] | None]
+    copies: Mapping[str, int]
     clean: NDArray[np.bool_]
     outliers: int
     skipped: tuple[str, ...]
@@ -205,6 +207,7 @@ def _measured(
         memory={
             item.name: memory_of(seen.looks[item.name], outlying) for item in seen.kept if item.series.kind == "dark"
         },
+        copies={name: count for name, (count, _) in seen.counted_copies.items()},
         clean=clean,
         outliers=int(np.count_nonzero(outlying)),
         skipped=seen.skipped,
@@ -305,7 +308,9 @@ class _Compared:
         """One series: its templates and projections, and what every change does to it."""
         measured, session = self.measured, self.measured.expected
         moved = session.moved(one, self.asked)
-        frame = mean_frame(one, measured.pictures[one.name], session.maps, side=self.side)
+        frame = mean_frame(
+            one, measured.pictures[one.name], session.maps, frames=measured.summaries[one.name].frames, side=self.side
+        )
         probes = series_probes(
             session,
             one,
@@ -315,6 +320,7 @@ class _Compared:
             variants=self.variants,
             all_outliers=measured.outliers,
             memory=measured.memory.get(one.name),
+            copies=measured.copies.get(one.name, 0),
         )
         block = series_block(session, probes, frame, self.asked, moved, self._thicker(one))
         return _Part(view=_view(one, frame, measured.summaries[one.name]), block=block, probes=probes)

@@ -115,13 +115,14 @@ def mean_frame(
     corrected_DN: NDArray[np.float64],
     maps: CalibratedMaps,
     *,
+    frames: int,
     side: int,
 ) -> MeanFrame:
     """A series' corrected mean frame (row, column) against the model.
 
-    side: of the squares of the panel's pixels that stand for pixels.
+    frames: whose mean it is, copies left out; side: of the squares of the panel's pixels that stand for pixels.
     """
-    clean, frames, expected = one.context.good, one.session.series.n_frames, one.expected
+    clean, expected = one.context.good, one.expected
     shape = clean.shape
     signal = signal_map(expected, shape)
     mask = clean if one.placement is None else inside(clean, one.placement)
@@ -175,6 +176,7 @@ def series_probes(
     variants: Sequence[Variant],
     all_outliers: int,
     memory: tuple[float, int] | None,
+    copies: int = 0,
 ) -> SeriesProbes:
     """The probes of one series.
 
@@ -187,6 +189,7 @@ def series_probes(
         variants: effects to try; the mean frame is projected on what each does at its first strength.
         all_outliers: pixels that stand out in any series.
         memory: of outlying pixels in this series, see `memory_of`.
+        copies: of frames, that this series counts.
     """
     first = [(variant, moved[rows[0]]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
     projection = MapProjection(
@@ -215,6 +218,7 @@ def series_probes(
         outliers=outliers,
         all_outliers=all_outliers,
         memory=memory,
+        copies=copies,
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.frame_checks import CopyScan, repeats_the_last
 from ...errors import InputError
 
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
@@ -26,7 +27,8 @@ CODES_FRAMES = 16  # the first, in which codes are counted
 class SeriesSummary:
     """Statistics of the n frames of one series; DN throughout.
 
-    Fields: frames; mean_DN (row, column); pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
+    Fields: frames, copies of the one before left out; mean_DN (row, column);
+    pair_variance_DN2, stack_variance_DN2 (row, column), common factor removed;
     label_variance_DN2 (label,), label_autocovariance_DN2 (label, lag) over LAGS: averages over the pixels of each noise
     label, of which there are label_pixels (label,), and over its label_pairs (label, lag) of neighbours;
     row_variance_DN2, column_variance_DN2, block_variance_DN2: variance in time of the means of rows, columns and blocks
@@ -74,9 +76,10 @@ class SeriesSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirstLook:
-    """What says which pixels and series can be used; fields as those of `SeriesSummary`."""
+    """What says which pixels and series can be used; fields as those of `SeriesSummary`; copies: frames that equal an earlier one."""
 
     frames: int
+    copies: int
     mean_DN: NDArray[np.float64]
     pair_variance_DN2: NDArray[np.float64]
     stack_variance_DN2: NDArray[np.float64]
@@ -89,7 +92,10 @@ _Piece = tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32], NDArray[n
 def _pieces(
     pieces: Iterable[NDArray[Any]], good: NDArray[np.bool_], pattern: NDArray[np.floating[Any]] | None, name: str
 ) -> Iterator[_Piece]:
-    """Frames as they are, in single precision, less the first one and their common factor, and steps between these."""
+    """Frames as they are, in single precision, less the first one and their common factor, and steps between these.
+
+    Copies of the frame before are left out: they say nothing more.
+    """
     use = good.astype(np.float32)
     n_good = int(good.sum())
     if n_good < 16:
@@ -97,6 +103,7 @@ def _pieces(
     shape_of_one = np.ones(good.shape, np.float32) if pattern is None else np.asarray(pattern, dtype=np.float32)
     reference: NDArray[np.float32] | None = None
     last: NDArray[np.float32] | None = None
+    before: NDArray[Any] | None = None
     for piece in pieces:
         for start in range(0, len(piece), PIECE_FRAMES):
             raw = piece[start : start + PIECE_FRAMES]
@@ -104,6 +111,12 @@ def _pieces(
                 raise InputError(name, received=f"frames of {raw.shape[1:]}", expected=f"frames of {good.shape}")
             if raw.dtype.kind == "f" and not np.all(np.isfinite(raw)):
                 raise InputError(name, received="NaN or infinite detector numbers", expected="finite values")
+            copied = repeats_the_last(raw, before)
+            before = raw[-1].copy()
+            if copied.any():
+                raw = raw[~copied]
+                if not len(raw):
+                    continue
             x = raw.astype(np.float32)
             if reference is None:
                 reference = x[0].copy()
@@ -162,14 +175,21 @@ def look_at_series(
     saturation_DN: float | None = None,
 ) -> FirstLook:
     """Mean, variances and saturation of a series; arguments and errors as those of `summarise_series`."""
-    found = _Variances(good.shape)
+    found, scan = _Variances(good.shape), CopyScan()
     saturated = 0
-    for raw, x, cleaned, steps in _pieces(pieces, good, pattern, name):
+
+    def scanned() -> Iterator[NDArray[Any]]:
+        for piece in pieces:
+            scan.add(piece)
+            yield piece
+
+    for raw, x, cleaned, steps in _pieces(scanned(), good, pattern, name):
         found.add(x, cleaned, steps)
         if saturation_DN is not None and float(raw.max()) >= saturation_DN:
             saturated += int(np.count_nonzero(raw[:, good] >= saturation_DN))
     return FirstLook(
         frames=found.frames,
+        copies=len(scan.copies()),
         mean_DN=found.mean,
         pair_variance_DN2=found.of_pairs,
         stack_variance_DN2=found.of_stack,

@@ -15,6 +15,7 @@ from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
 from .crosstalk import CROSSTALK
 from .dark_drift import DARK_DRIFT
+from .dropped_frames import DROPPED_FRAMES
 from .effect import (
     EVERY_SERIES,
     LIT_SERIES,
@@ -76,6 +77,7 @@ OURS: dict[str, Effect] = {
         CROSSTALK,
         LINE_FLICKER,
         GREY_ABSORBER,
+        DROPPED_FRAMES,
     )
 }
 EFFECTS = Catalogue(OURS)

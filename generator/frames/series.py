@@ -157,6 +157,7 @@ class ExpectedSeries:
         bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
         gain_pattern: of the pixels' gains, that no map knows; None: none.
         tile_pattern: the same of tiles; None: there is none.
+        repeated_share: chance of a frame to be a copy of the one before; its mean and noise are those of any other.
         saturated_share: share of pixels whose mean lies at the end of the ADC's range.
         frames: in the series.
     """
@@ -180,6 +181,7 @@ class ExpectedSeries:
     hot_pixel_share: float
     gain_pattern: FixedPattern | None
     tile_pattern: TilePattern | None
+    repeated_share: float
     saturated_share: float
     frames: int
 
@@ -781,6 +783,7 @@ def expected_series(
         hot_pixel_share=state.bad_share * state.bad_hot_share,
         gain_pattern=state.gain_pattern if request.beam_on else None,
         tile_pattern=state.tile_pattern if request.beam_on else None,
+        repeated_share=state.repeated_share,
         saturated_share=saturated,
         frames=request.frames,
     )
@@ -850,6 +853,7 @@ def sample_series(
     quantum = variance / np.maximum(before, 1e-300)
     quantum = np.maximum(quantum, 1e-9 * float(np.max(quantum)) + 1e-300)
     number = 0
+    stored: NDArray[np.float32] | None = None
     for _ in range(request.frames):
         total = np.zeros(shape)
         for _ in range(averaged):
@@ -891,7 +895,9 @@ def sample_series(
             total += np.clip(value, lowest, highest)
             number += 1
         carried.trapped_DN = trapped
-        yield (total / averaged).astype(np.float32)
+        if stored is None or state.repeated_share == 0.0 or rng.random() >= state.repeated_share:
+            stored = (total / averaged).astype(np.float32)
+        yield stored.copy()
     carried.time_s = request.start_s + number * interval
 
 

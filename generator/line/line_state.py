@@ -166,6 +166,7 @@ class LineState:
         step_DN: of the ADC; 0: none.
         bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
             rest being dead; bad_seed draws them.
+        repeated_share: chance of a stored frame to be a copy of the one before it in its series.
     """
 
     parameters: FloatArray | None
@@ -198,6 +199,7 @@ class LineState:
     bad_share: float = 0.0
     bad_hot_share: float = 0.5
     bad_seed: int = 0
+    repeated_share: float = 0.0
 
 
 def _made_anew(owner: object, name: object, make: Callable[[], Any]) -> Any:

@@ -42,7 +42,14 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "kv_error": ("with ripple",),
     "filtration_error": ("copper",),
     "composition_error": ("in all objects",),
+    "crosstalk": ("corners as well", "more along rows"),
+    "line_flicker": ("sine of any phase", "columns", "bands of rows"),
+    "grey_absorber": ("copper from a slanted border on", "strip", "corner"),
+    "dropped_frames": ("every few frames", "some in a row"),
 }
+# what the plain simulator has no law of: a middling strength (unit of the catalogue)
+ADDED = {"crosstalk": 10.0, "line_flicker": 0.2, "grey_absorber": 4.0, "dropped_frames": 5.0}
+ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber"}
 
 
 def correlated(rng: np.random.Generator, shape: tuple[int, int], px: float) -> np.ndarray:
@@ -67,6 +74,7 @@ class FamilyLine(plain.Line):
         super().__init__(name, effects, rng)
         self.law = np.random.default_rng(rng.integers(2**62))
         self.families = {one: str(self.law.choice(FAMILIES[one])) for one in self.effects if one in FAMILIES}
+        self.always |= ADDED_ALWAYS & set(self.effects)
         self.u = {key: self.law.uniform() for key in "abcd"}
         if "gain_map_error" in self.effects:
             self.changed_gain = 1.0 + self.effects["gain_map_error"] / 100.0 * self._pattern()
@@ -85,6 +93,22 @@ class FamilyLine(plain.Line):
         if family == "smooth and fine":
             return 0.8 * correlated(self.law, shape, 12.0) + 0.6 * self.law.standard_normal(shape)
         return correlated(self.law, shape, 0.5 + 5.5 * self.u["a"])
+
+    def _passed(self, energies: np.ndarray, share: float) -> np.ndarray:
+        """What an absorber in a part of the beam leaves of the light, (row, column, energy) or (row, column, 1)."""
+        y, x = (np.arange(side) / (side - 1) - 0.5 for side in self.of.shape)
+        turn = 2.0 * math.pi * self.u["a"]
+        along = y[:, None] * math.cos(turn) + x[None, :] * math.sin(turn)
+        if self._is("grey_absorber", "strip"):
+            covered = np.clip((0.2 - np.abs(along - 0.2 * self.u["b"])) / 0.04 + 0.5, 0.0, 1.0)
+        elif self._is("grey_absorber", "corner"):
+            covered = np.clip((y[:, None] - 0.1) / 0.04, 0.0, 1.0) * np.clip((x[None, :] - 0.1) / 0.04, 0.0, 1.0)
+        else:
+            # so much copper as 45 keV lose the share
+            covered = np.clip((along - 0.2 * self.u["b"]) / 0.06 + 0.5, 0.0, 1.0)
+            copper = plain.attenuation_per_mm("Cu", np.array([45.0, *energies]))
+            return np.exp(math.log1p(-share) * covered[..., None] * copper[1:] / copper[0])
+        return (1.0 - share * covered)[..., None]
 
     def _dead(self) -> np.ndarray:
         shape = self.of.shape
@@ -138,6 +162,8 @@ class FamilyLine(plain.Line):
             along = np.arange(self.of.shape[1]) / (self.of.shape[1] - 1)
             course = along if self._is("heel", "one-sided") else along ** (1.5 + self.u["a"])
             arriving = arriving * np.exp(-course[None, :, None] * thick_mm * tungsten)
+        if "grey_absorber" in on:
+            arriving = arriving * self._passed(energies, on["grey_absorber"] / 100.0)
         return energies, arriving
 
     def transmitted(self, scene: str, energies: np.ndarray, on: dict, exposure_ms: float) -> np.ndarray:
@@ -173,12 +199,31 @@ class FamilyLine(plain.Line):
                 return gaussian_filter(along, (0.42 * width_px, 0.15 * width_px))
 
             signal, variance = spot(signal), spot(variance)
+        if "crosstalk" in on:
+            signal, variance = (self._hopped(one, on["crosstalk"] / 100.0) for one in (signal, variance))
         if "motion_blur" in on:
             time = np.linspace(0.0, 1.0, 25)
             course = np.sin(2.0 * math.pi * time) / 2.0 if self._is("motion_blur", "to and fro") else time**2 - 0.5
             places = course * on["motion_blur"] * exposure_ms / 50.0
             signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         return signal, variance
+
+    def _hopped(self, image: np.ndarray, share: float) -> np.ndarray:
+        """A picture of which each pixel's neighbours count a share."""
+        weights = np.zeros((3, 3))
+        if self._is("crosstalk", "corners as well"):
+            weights[1, ::2] = weights[::2, 1] = 0.19
+            weights[::2, ::2] = 0.06
+        else:
+            weights[1, ::2], weights[::2, 1] = 0.4, 0.1
+        wide = np.pad(image, 1, mode="edge")
+        rows, columns = image.shape
+        moved = sum(
+            weights[down, right] * wide[down : down + rows, right : right + columns]
+            for down in range(3)
+            for right in range(3)
+        )
+        return (1.0 - share) * image + share * np.asarray(moved)
 
     def light(self, kV: float, mAs: float, copper_mm: float, scene: str, on: dict, exposure_ms: float) -> tuple:
         far_share = 0.3 + 0.5 * self.u["d"]
@@ -202,6 +247,18 @@ class FamilyLine(plain.Line):
         return signal, variance, remote
 
     def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
+        shown = self._exposed(count, kind, exposure_ms, after, lit)
+        share = self.on(after).get("dropped_frames", 0.0) / 100.0
+        if share and self._is("dropped_frames", "some in a row"):
+            for number in np.flatnonzero(self.law.random(count - 1) < share / 3.0) + 1:
+                shown[number : number + 3] = shown[number - 1]
+        elif share:
+            every = max(round(1.0 / share), 2)
+            for number in range(int(self.law.integers(1, every + 1)), count, every):
+                shown[number] = shown[number - 1]
+        return shown
+
+    def _exposed(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
         on = self.on(after)
         if not set(on) & {"image_lag", "quantisation", "dark_drift", "row_noise"} and "image_lag" not in self.effects:
             return super().frames(count, kind, exposure_ms, after, lit)
@@ -280,7 +337,21 @@ class FamilyLine(plain.Line):
             else:
                 self.walk += 0.012
             level = level * (1.0 + size * (self.walk if self._is("output_drift", "random walk") else self.walk - 1.5))
+        if "line_flicker" in on:
+            level = level * (1.0 + on["line_flicker"] / 100.0 * self._flickering())
         return np.asarray(level)
+
+    def _flickering(self) -> np.ndarray:
+        """Factors of the lines of one exposure, mean square 1: (row, 1) or (1, column)."""
+        rows, columns = self.of.shape
+        if self._is("line_flicker", "columns"):
+            return self.law.standard_normal((1, columns))
+        if self._is("line_flicker", "bands of rows"):
+            lines = gaussian_filter1d(self.law.standard_normal(rows), 1.5, mode="wrap")
+            return (lines / lines.std())[:, None]
+        cycles_a_line = 0.02 + 0.2 * self.u["a"]
+        phase = self.law.uniform(0.0, 2.0 * math.pi)
+        return math.sqrt(2.0) * np.sin(2.0 * math.pi * cycles_a_line * np.arange(rows) + phase)[:, None]
 
     def _bent(self, level: np.ndarray, departure: float) -> np.ndarray:
         """`departure` from a line at half of the highest level."""
@@ -291,6 +362,11 @@ class FamilyLine(plain.Line):
             knee = 0.2 + 0.3 * self.u["a"]
             return level * (1.0 - departure * np.maximum(at - knee, 0.0) / (1.0 - knee))
         return level * (1.0 - departure * np.sqrt(np.maximum(at, 0.0)))
+
+
+def effects_of(line: str) -> list[str]:
+    """Effects of which a line can have a law of a drawn family."""
+    return [one for one in plain.cases_of(plain.LINES[line]) if one in FAMILIES and one not in ADDED] + list(ADDED)
 
 
 STRONGER = {
@@ -306,7 +382,7 @@ MOST = {"k_fluorescence": 60.0}  # a share of all photons above the K edge
 
 def clear_strength(effect: str, rng: np.random.Generator) -> float:
     """A strength (unit of the catalogue) that the plain simulator's lines show clearly, spread over a factor of three."""
-    usual = STRONGER.get(effect, plain.CASES[effect][0] * 1.5)
+    usual = ADDED[effect] if effect in ADDED else STRONGER.get(effect, plain.CASES[effect][0] * 1.5)
     return min(float(f"{usual * math.exp(rng.uniform(-0.35, 0.75)):.3g}"), MOST.get(effect, math.inf))
 
 
@@ -352,7 +428,7 @@ def main() -> None:
             print(f"{effect:18s} {'; '.join(families)}")
         return
     rows = []
-    possible = set(plain.cases_of(plain.LINES[options.line]))
+    possible = set(effects_of(options.line))
     for effect in (one for one in options.only if one in possible):
         row = judged(options.line, effect, options.seed, options.frames)
         rows.append(row)

@@ -172,7 +172,7 @@ def main() -> None:
         return
     singles = [case for case in plain.cases_of(plain.LINES[options.line]) if "+" not in case and "_later" not in case]
     if options.families:
-        singles = [case for case in singles if case in law_families.FAMILIES]
+        singles = law_families.effects_of(options.line)
     rows = []
     for effect in options.only or singles:
         rng = np.random.default_rng([options.seed, zlib.crc32((options.line + effect).encode())])

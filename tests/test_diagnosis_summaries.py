@@ -8,6 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
+from raytwin.diagnosis.model.changes import variants_of
+from raytwin.diagnosis.model.curves import node_weights
 from raytwin.diagnosis.model.defects import memory_of
 from raytwin.diagnosis.model.placing import _smeared
 from raytwin.diagnosis.probes.fixed_pattern import Pattern
@@ -20,6 +22,7 @@ from raytwin.diagnosis.probes.scalar_context import Areas, ScalarContext
 from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, look_at_series, summarise_series
 from raytwin.diagnosis.session.usable import SeenSeries
 from raytwin.errors import InputError
+from raytwin.generator.effects import EFFECTS
 
 SHAPE = (48, 64)
 FRAMES = 40
@@ -533,3 +536,16 @@ def test_copies_are_counted_once_for_the_series_that_calibrate_and_once_for_all_
     seen = SimpleNamespace(kept=kept, looks=looks)
     # frames that are all alike can be copies or not: nothing tells
     assert SeenSeries.counted_copies.fget(seen) == {"flat": (3, 20), "later": (3, 10)}
+
+
+def test_between_the_strengths_that_are_asked_copies_are_foretold_within_their_chance():
+    strength = EFFECTS["dropped_frames"].strength
+    nodes = np.array(variants_of(EFFECTS["dropped_frames"])[0].strengths)
+    asked = np.geomspace(strength.low, strength.high, 50)
+
+    def root(percent):
+        return np.sqrt(percent / 100.0 * 800 + 0.375) - np.sqrt(0.375)
+
+    found = node_weights(nodes, asked) @ root(nodes)
+    error = np.abs(found - root(asked))
+    assert error.max() < 0.5 and np.median(error) < 0.1

@@ -39,7 +39,8 @@ DROPPED_FRAMES = Effect(
     shows=Shows(series=EVERY_SERIES, axis="time", flats=False),
     either_onset=True,
     absorbed="nothing",
-    reading=Reading(probes=("repeated frames",)),
-    grid=Grid(shares=(0.2, 0.6, 1.0)),
+    reading=Reading(probes=("repeated frames",), sd=0.0),  # copies are counted: chance alone is left
+    # numbers of copies go as a root, which takes more strengths to follow than a line
+    grid=Grid(shares=(0.0, 0.2, 0.4, 0.6, 0.8, 1.0)),
     images=InImages(left_out="a copy among images is seen in no single one"),
 )

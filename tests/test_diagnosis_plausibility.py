@@ -12,7 +12,7 @@ from raytwin.cli import main
 from raytwin.diagnosis.checks.label_suspects import LEAST_EVIDENCE
 from raytwin.diagnosis.checks.map_suspects import _inherent_mm_Al, _scaled
 from raytwin.diagnosis.checks.plausibility import check_plausibility
-from raytwin.diagnosis.checks.readings import _without_common
+from raytwin.diagnosis.checks.readings import _without_common, reading_of
 from raytwin.diagnosis.session.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
@@ -317,3 +317,18 @@ def test_what_all_scenes_at_one_gap_want_is_no_fault_of_their_maps():
     assert len(factors_of(**near, wedge_c=(500.0, 0.75))) == 6
     assert len(factors_of(**near)) == 4
     assert len(factors_of(wedge_a=(700.0, 1.4), wedge_b=(700.0, 1.0), **far)) == 2
+
+
+def test_copies_of_frames_leave_the_noise_that_labels_are_judged_by():
+    rng = np.random.default_rng(6)
+    drawn = 1000.0 + 5.0 * rng.standard_normal((8, 64, 64))
+    acquisition = SimpleNamespace(instrument=SimpleNamespace(source_detector_mm=1000.0))
+    series = SimpleNamespace(
+        averaged=1, kV=60.0, filters=(), power_W=20.0, current_mA=None, exposure_ms=20.0, source_detector_mm=None
+    )
+    plain = reading_of(series, drawn[:4], acquisition, since=False)
+    copied = reading_of(series, drawn[[0, 1, 1, 2, 2, 2, 3, 3]], acquisition, since=False)
+    assert (plain.frames, copied.frames) == (4, 4)
+    np.testing.assert_array_equal(copied.variance_DN2, plain.variance_DN2)
+    np.testing.assert_array_equal(copied.mean_DN, plain.mean_DN)
+    assert float(plain.variance_DN2.mean()) == pytest.approx(25.0, rel=0.1)

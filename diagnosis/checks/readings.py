@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.setting import Filter
+from ...calibration.frame_checks import repeats_the_last
 from ...errors import InputError
 
 FloatArray = NDArray[np.float64]
@@ -60,13 +61,15 @@ class Label:
 class Reading:
     """A series as it is: mean frame (row, column) of the pixels looked at, its noise, what they amount to.
 
-    released: share of its level that an image lag may have brought from the exposures before.
+    frames: that it rests on, copies left out; released: share of its level that an image lag may have brought from the exposures
+    before.
     """
 
     series: Series
     label: Label
     mean_DN: FloatArray
     variance_DN2: FloatArray | None
+    frames: int
     since: bool
     level_DN: float = math.nan
     gain_DN: float = math.nan
@@ -89,6 +92,8 @@ def reading_of(item: Series, frames: FloatArray, acquisition: AcquisitionFile, *
         since: whether it was taken after those that calibrate.
     """
     variance = None
+    # a copy of the frame before says nothing of noise
+    frames = frames[~repeats_the_last(frames, None)]
     if len(frames) > 1:
         steps = np.diff(frames, axis=0)
         steps = _without_common(steps, np.asarray(frames.mean(axis=0), dtype=np.float64))
@@ -114,6 +119,7 @@ def reading_of(item: Series, frames: FloatArray, acquisition: AcquisitionFile, *
         label=label,
         mean_DN=np.asarray(frames.mean(axis=0), dtype=np.float64),
         variance_DN2=variance,
+        frames=len(frames),
         since=since,
     )
 
@@ -165,7 +171,7 @@ def measure(item: Reading, dark: FloatArray | None, read_DN2: float, good: NDArr
         quantum = mean_of(item.variance_DN2, good) - read_DN2
         if mean > 0 and quantum > 0:
             item.gain_DN = quantum / mean
-            pairs = min(item.series.n_frames, FRAMES_READ) - 1
+            pairs = item.frames - 1
             pairs = pairs if pairs < 4 else pairs // 2
             item.gain_sd = math.sqrt(4.0 / (max(pairs * 2.0 / 3.0, 1.0) * max(int(good.sum()), 1)))
     return True

@@ -121,6 +121,7 @@ benchmark: $(READY)
 	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/generate_pair.py
 	OMP_WAIT_POLICY=passive $(BIN)/python benchmarks/project_polychromatic.py
 	$(BIN)/python benchmarks/cost_table.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ensemble.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/training_step.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/pod_bootstrap.py
 

@@ -58,6 +58,7 @@ def train_on_file(
     seed: int,
     start_from: "str | os.PathLike[str] | None" = None,
     device: str = "cpu",
+    workers: int | None = None,
     tell: Callable[[str], None] = lambda line: None,
     name: str = "networks",
 ) -> None:
@@ -67,25 +68,29 @@ def train_on_file(
         path: dataset with images of split train (and val).
         folder: of the networks.
         recipe, networks, seed, start_from, device: as `train_networks` has them.
+        workers: processes of one thread each that share the networks (`ensemble`); None: this process, with its threads.
         tell: shows one line of progress.
         name: what the lines call these networks.
     """
     from ..segmentation import train_networks
+    from .ensemble import train_together
 
     def progress(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
         tell(f"{name}: network {network + 1}, epoch {done} of {wanted}")
 
     with read_dataset(path) as dataset:
-        train_networks(
-            dataset,
-            folder,
-            recipe=recipe,
-            networks=networks,
-            seed=seed,
-            device=device,
-            start_from=start_from,
-            progress=progress,
-        )
+        words: dict[str, Any] = {
+            "recipe": recipe,
+            "networks": networks,
+            "seed": seed,
+            "device": device,
+            "start_from": start_from,
+            "progress": progress,
+        }
+        if workers is None:
+            train_networks(dataset, folder, **words)
+        else:
+            train_together(dataset, folder, workers=workers, **words)
 
 
 def thresholds_from_images(

@@ -91,6 +91,7 @@ def train_networks(
     start_from: "str | os.PathLike[str] | None" = None,
     fresh: Callable[[int, int], NDArray[Any]] | None = None,
     fresh_noise: Mapping[str, Any] | None = None,
+    only: Sequence[int] | None = None,
     progress: Progress | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> list[NetworkResult]:
@@ -107,11 +108,12 @@ def train_networks(
         fresh: called with an image's number and the epoch, gives its log images (2, row, column) with noise of that epoch;
             validation images are those of epoch 0 throughout. None takes the file's images.
         fresh_noise: what decides `fresh`, kept with the folder so that it is not gone on with by other images.
+        only: numbers of those among them that this call trains, for several processes that share a folder; None: all.
         progress: called after every epoch.
         warn: called with what the user should know (a made-up split, an unreadable state).
 
     Returns:
-        Records of networks 0 .. networks - 1.
+        Records of networks 0 .. networks - 1, or of those in `only`.
 
     Raises:
         InputError: a folder of another configuration, unusable data or weights.
@@ -138,7 +140,7 @@ def train_networks(
     runs = create_or_resume_runs(runs_path, configuration)
     done = set(finished_networks(runs))
     results = []
-    for number in range(networks):
+    for number in range(networks) if only is None else only:
         if number in done:
             result = read_result(runs, number)
             if progress is not None:

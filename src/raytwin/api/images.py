@@ -530,6 +530,7 @@ def train(
     high: "Setting | str | None" = None,
     device: str = "auto",
     threads: int | None = None,
+    workers: int = 1,
     seed: "int | np.random.Generator" = 0,
     progress: Progress | bool | None = None,
 ) -> TrainedNetworks:
@@ -550,7 +551,8 @@ def train(
             and learning rate are then smaller.
         fresh_noise: a twin that draws other noise for every epoch, at the settings `low` and `high`; `dataset` holds references.
         device: `auto`, `cpu`, `cuda` or `mps`.
-        threads: processor threads; None: all.
+        threads: processor threads; None: all, of several workers one each.
+        workers: processes that share the networks; a core each is the fastest. The weights depend on threads, not on workers.
         seed: a whole number or a generator.
         progress: True for a bar, or a function of (stage, done, total).
 
@@ -566,6 +568,7 @@ def train(
         >>> len(runs.networks)
         1
     """
+    from ..campaign.ensemble import train_together
     from ..segmentation import choose_device, train_networks
 
     chosen = _recipe(
@@ -587,31 +590,36 @@ def train(
             received="only a part of fresh_noise, low and high",
             expected="all three: a twin and the two settings to train for",
         )
+    if workers != 1 and fresh_noise is not None:
+        raise InputError(
+            "workers", received=f"{workers} with fresh_noise", expected="1: fresh noise is drawn in one process"
+        )
     number = whole_seed(seed)
     warnings: list[str] = []
     with _as_dataset(dataset) as images, Telling(progress, unit="epoch") as telling:
         fresh, decided_by = None, None
         if fresh_noise is not None and low is not None and high is not None:
             fresh, decided_by = _fresh(images, fresh_noise, low, high, seed=number, warnings=warnings)
-        _use_threads(threads)
+        if workers == 1:
+            _use_threads(threads)
         where = choose_device(device)
 
         def told(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
             telling.begin(f"network {network + 1}/{networks}", wanted, done=done)
 
-        found = train_networks(
-            images,
-            output,
-            recipe=chosen,
-            networks=networks,
-            seed=number,
-            device=where,
-            start_from=start_from,
-            fresh=fresh,
-            fresh_noise=decided_by,
-            progress=told,
-            warn=warnings.append,
-        )
+        words: dict[str, Any] = {
+            "recipe": chosen,
+            "networks": networks,
+            "seed": number,
+            "device": where,
+            "start_from": start_from,
+            "progress": told,
+            "warn": warnings.append,
+        }
+        if workers == 1:
+            found = train_networks(images, output, **words, fresh=fresh, fresh_noise=decided_by)
+        else:
+            found = train_together(images, output, **words, workers=workers, threads=1 if threads is None else threads)
     return TrainedNetworks(
         path=Path(output), recipe=chosen, device=where, networks=tuple(found), warnings=tuple(warnings)
     )

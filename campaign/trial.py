@@ -5,7 +5,7 @@ What a step writes appears whole or not at all; where its file is there already,
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,12 +94,29 @@ def train_on_file(
 
 
 def thresholds_from_images(
-    runs_path: Path, learnt_from: Path, out: Path, share: float, *, device: str
+    runs_path: Path,
+    learnt_from: Path,
+    out: Path,
+    share: float,
+    *,
+    device: str,
+    numbers: Sequence[int] | None = None,
 ) -> dict[int, float]:
     """Probability above which each network's pixels are marked, by network.
 
     Networks that learnt little differ in how readily they mark. Each gets the threshold at which `share` of the images that
     it learnt from show a mark away from objects: something its owner knows, whatever images it is tried on later.
+
+    Args:
+        runs_path: of the networks.
+        learnt_from: dataset file.
+        out: JSON file of the thresholds; where it is there already, it is read.
+        share: of the images, 0 to 1.
+        device: torch device.
+        numbers: of other images of the file to take in place of those of split train and val.
+
+    Returns:
+        Network number -> threshold, 0.01 or more and below 1.
     """
     from scipy.ndimage import binary_dilation
 
@@ -110,7 +127,8 @@ def thresholds_from_images(
     runs = open_runs(runs_path)
     found: dict[int, float] = {}
     with read_dataset(learnt_from) as dataset:
-        numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
+        if numbers is None:
+            numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
         for network_number in finished_networks(runs):
             _, weights = read_weights(runs.path / f"network_{network_number:03d}" / "weights.pt")
             network = build_network(runs.recipe, seed=0, pretrained=False)
@@ -139,8 +157,9 @@ def detect_on_file(
     thresholds: Mapping[int, float],
     *,
     device: str,
+    numbers: Sequence[int] | None = None,
 ) -> None:
-    """Hit table of all networks on the images of split test; images of one scene share its name."""
+    """Hit table of all networks on the images of split test, or of these numbers; images of one scene share its name."""
     from ..segmentation import Detection, detect_with_networks, open_runs, write_detections
 
     if out.exists():
@@ -158,7 +177,8 @@ def detect_on_file(
                 yield replace(found, image=scene, contrast=value if known else None)
 
     with read_dataset(dataset_path) as dataset:
-        write_detections(out, rows(dataset, dataset.indices(split="test")))
+        chosen = dataset.indices(split="test") if numbers is None else np.asarray(numbers, dtype=np.intp)
+        write_detections(out, rows(dataset, chosen))
 
 
 def curve_of_table(

@@ -1,6 +1,7 @@
 """The paper's table: planted differences, what is dealt out, what is stated or refused, the page, and that it can be stopped."""
 
 import copy
+import dataclasses
 import json
 import math
 
@@ -10,7 +11,7 @@ import pytest
 from raytwin.acquisition import DatasetRow, write_dataset
 from raytwin.campaign import table as table_module
 from raytwin.campaign import trial as trial_module
-from raytwin.campaign.table import dealt_boneless, half_width, networks_text, plan_of, run_table, verdict_text
+from raytwin.campaign.table import alarms_at, half_width, networks_text, plan_of, run_table, verdict_text
 from raytwin.campaign.table_page import table_page
 from raytwin.cli import main
 from raytwin.errors import InputError
@@ -82,7 +83,27 @@ def run(words):
 def detect(runs, dataset, out, contrast, thresholds, *, device, numbers):
     if not out.exists():
         kind = out.stem.removeprefix("hits_").rpartition("_")[0]
-        write_detections(out, detections(PLANTED[kind], networks=PLAN.networks))
+        clean = dataclasses.replace(
+            next(detections(0.1, networks=1)),
+            contrast=None,
+            foreign_object="",
+            recall=None,
+            false_alarm=False,
+            response=0.2,
+            hit=False,
+        )
+        looks = [
+            dataclasses.replace(clean, network=network, image=f"clean{number}")
+            for network in range(PLAN.networks)
+            for number in range(10)
+        ]
+        write_detections(out, [*detections(PLANTED[kind], networks=PLAN.networks), *looks])
+
+
+def set_thresholds(runs, dataset, out, share, *, device, numbers):
+    found = dict.fromkeys(range(PLAN.networks), 0.5)
+    out.write_text(json.dumps(found))
+    return found
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -90,7 +111,7 @@ def _no_networks():
     """Every trial has the a90 that is planted under its name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(table_module, "train_on_file", lambda *words, **options: None)
-        patch.setattr(table_module, "thresholds_from_images", lambda *words, **options: {0: 0.5})
+        patch.setattr(table_module, "thresholds_from_images", set_thresholds)
         patch.setattr(table_module, "detect_on_file", detect)
         yield patch
 
@@ -116,6 +137,7 @@ def test_equal_curves_are_equivalent_and_a_planted_difference_is_found(made):
     assert second["measured"]["a90"] == pytest.approx(0.12, abs=0.02)
     assert second["compare"]["verdict"].startswith("equivalent at 0.02")
     assert second["compare"]["paired"] == "image and network"
+    assert second["alarms_on_measured"]["n"] == 30
     published = second["published"]["compare"]
     assert published["verdict"].startswith("different (90 %")
     assert published["difference_a90"]["low"] < 0.07 < published["difference_a90"]["high"]
@@ -196,15 +218,29 @@ def test_wide_intervals_are_marked(made):
     assert any("50 ms measured (+-15 %)" in line for line in notes.items)
 
 
-def test_products_without_bone_are_dealt_out_alike_whatever_the_order_of_the_file(tmp_path):
-    write_products(tmp_path / "a.h5")
-    setting, trying = dealt_boneless(tmp_path / "a.h5")
-    assert len(setting) == 5
-    assert sorted(setting + trying) == list(range(50))
-    from raytwin.acquisition import read_dataset
-
-    with read_dataset(tmp_path / "a.h5") as dataset:
-        assert sorted(dataset.rows[number].image for number in setting) == ["040", "042", "044", "046", "048"]
+def test_false_alarms_are_counted_at_other_thresholds(tmp_path):
+    looks = [
+        dataclasses.replace(
+            next(detections(0.1, networks=1)),
+            network=network,
+            image=f"clean{number}",
+            contrast=None,
+            recall=None,
+            false_alarm=False,
+            response=0.1 * number,
+        )
+        for network in (0, 1)
+        for number in range(10)
+    ]
+    with_bones = list(detections(0.1, networks=2))
+    write_detections(tmp_path / "hits.csv", [*looks, *with_bones])
+    (tmp_path / "thresholds.json").write_text('{"0": 0.65, "1": 0.85}')
+    found = alarms_at(tmp_path / "hits.csv", tmp_path / "thresholds.json")
+    assert found["n"] == 20
+    assert found["rate"] == pytest.approx((3 + 1) / 20)  # above 0.65 lie three of ten, above 0.85 one
+    assert found["low"] < found["rate"] < found["high"]
+    write_detections(tmp_path / "bones.csv", with_bones)
+    assert alarms_at(tmp_path / "bones.csv", tmp_path / "thresholds.json") is None
 
 
 def test_half_the_width_of_an_interval_is_a_share_of_the_a90():

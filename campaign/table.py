@@ -15,7 +15,6 @@ Study, Table 1 (contrast Delta R at POD 90 %, 100 networks an exposure).
 
 import csv
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -375,8 +374,3 @@ def signed(value: float) -> str:
     """A contrast with its sign; no sign where it rounds to nothing."""
     text = f"{value:+.3f}"
     return text[1:] if float(text) == 0 else text
-
-
-def read_table(directory: Path) -> dict[str, Any]:
-    """What `table.json` of a folder holds."""
-    return dict(json.loads((directory / "table.json").read_text(encoding="utf-8")))

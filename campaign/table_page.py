@@ -287,7 +287,8 @@ def _made(result: Mapping[str, Any]) -> tuple[str, ...]:
         ),
         f"Line: the virtual lab's, {rows} x {columns} pixels of {line['pixel_mm']:g} mm"
         + ("" if line["source_detector_mm"] is None else f", detector at {line['source_detector_mm']:g} mm")
-        + ". Its contrasts are not those of the paper's line, which has other pixels, distances and products.",
+        + ", without scatter, lag, glare or drift. Its contrasts are not those of the paper's line, which has other pixels,"
+        " distances and products.",
         f"The twin predicts the mean of {result['line']['flats']} flats at settings it never saw to {error['mean']:.2g} %, their"
         f" noise to {error['sd']:.2g} % (median).",
         f"Learning: {line['products']} products at 1 s; {line['generated']} image pairs generated from them at every other"

@@ -281,6 +281,7 @@ class _Work:
                 self.plan.alarm_share,
                 device="cpu",
                 numbers=boneless,
+                lowest=0.0,
             )
             detect_on_file(path / trial.networks, images, hits, {}, thresholds, device="cpu", numbers=everything)
         curve = curve_of_table(hits, "contrast")

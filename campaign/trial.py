@@ -101,6 +101,7 @@ def thresholds_from_images(
     *,
     device: str,
     numbers: Sequence[int] | None = None,
+    lowest: float = 0.01,
 ) -> dict[int, float]:
     """Probability above which each network's pixels are marked, by network.
 
@@ -114,13 +115,15 @@ def thresholds_from_images(
         share: of the images, 0 to 1.
         device: torch device.
         numbers: of other images of the file to take in place of those of split train and val.
+        lowest: threshold; with 0 the share is met by networks that hardly mark anything, too.
 
     Returns:
-        Network number -> threshold, 0.01 or more and below 1.
+        Network number -> threshold, `lowest` or more and below 1.
     """
     from scipy.ndimage import binary_dilation
 
-    from ..segmentation import build_network, finished_networks, open_runs, predict_probabilities, read_weights
+    from ..segmentation import build_network, examples_from_dataset, finished_networks, open_runs, read_weights
+    from ..segmentation.network import probabilities_from_scaled
 
     if out.exists():
         return {int(number): float(value) for number, value in json.loads(out.read_text(encoding="utf-8")).items()}
@@ -129,6 +132,7 @@ def thresholds_from_images(
     with read_dataset(learnt_from) as dataset:
         if numbers is None:
             numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
+        examples = examples_from_dataset(dataset, numbers, recipe=runs.recipe)  # scaled once for all networks
         for network_number in finished_networks(runs):
             _, weights = read_weights(runs.path / f"network_{network_number:03d}" / "weights.pt")
             network = build_network(runs.recipe, seed=0, pretrained=False)
@@ -136,14 +140,15 @@ def thresholds_from_images(
             network = network.to(device)
             highest = []
             for first in range(0, len(numbers), _AT_ONCE):
-                part = numbers[first : first + _AT_ONCE]
-                maps = predict_probabilities(network, dataset.images(part), recipe=runs.recipe, device=device)
-                for values, mask in zip(maps, dataset.foreign_object_masks(part), strict=True):
+                pairs = [examples[place] for place in range(first, min(first + _AT_ONCE, len(numbers)))]
+                scaled = np.stack([image for image, _ in pairs])
+                maps = probabilities_from_scaled(network, scaled, recipe=runs.recipe, device=device)
+                for values, mask in zip(maps, (masks[-1] != 0 for _, masks in pairs), strict=True):
                     away = (
                         ~binary_dilation(mask, iterations=_NEAR_PX) if mask.any() else np.ones(mask.shape, dtype=bool)
                     )
                     highest.append(float(values[away].max()) if away.any() else 0.0)
-            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 1.0 - 1e-6))
+            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), lowest, 1.0 - 1e-6))
     with whole_file(out) as temporary:
         temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return found
@@ -167,14 +172,13 @@ def detect_on_file(
 
     def rows(dataset: Dataset, numbers: NDArray[np.intp]) -> Iterator[Detection]:
         runs = open_runs(runs_path)
-        for network, threshold in thresholds.items():
-            for found in detect_with_networks(
-                runs, dataset, numbers, networks=[network], threshold=threshold, device=device
-            ):
-                scene = scene_of(found.image)
-                value = contrast.get(scene, found.contrast)
-                known = value is not None and math.isfinite(value) and found.recall is not None
-                yield replace(found, image=scene, contrast=value if known else None)
+        for found in detect_with_networks(
+            runs, dataset, numbers, networks=list(thresholds), threshold=thresholds, device=device
+        ):
+            scene = scene_of(found.image)
+            value = contrast.get(scene, found.contrast)
+            known = value is not None and math.isfinite(value) and found.recall is not None
+            yield replace(found, image=scene, contrast=value if known else None)
 
     with read_dataset(dataset_path) as dataset:
         chosen = dataset.indices(split="test") if numbers is None else np.asarray(numbers, dtype=np.intp)

@@ -198,7 +198,7 @@ def detect_with_networks(
     numbers: Sequence[int] | NDArray[np.intp],
     *,
     networks: Sequence[int] | None = None,
-    threshold: float = MARK_THRESHOLD,
+    threshold: float | Mapping[int, float] = MARK_THRESHOLD,
     device: str = "cpu",
     network: Any = None,
     progress: Callable[[int], None] | None = None,
@@ -211,7 +211,7 @@ def detect_with_networks(
         dataset: open dataset file; images of any size.
         numbers: of the images to try.
         networks: numbers of networks, None = all finished ones.
-        threshold: probability above which a pixel is marked, 0..1.
+        threshold: probability above which a pixel is marked, 0..1; or one for each network, by number.
         device: torch device.
         network: of a folder of networks of the user's own, the module or function that they were trained with.
         progress: called with the number of images done, after every batch.
@@ -223,10 +223,12 @@ def detect_with_networks(
     Raises:
         InputError: no finished network, an unknown one, no images, a threshold outside 0..1.
     """
-    if not 0 <= threshold < 1:
-        raise InputError("threshold", received=threshold, expected="a probability, 0 or more and below 1")
     finished = finished_networks(runs)
     chosen = finished if networks is None else list(networks)
+    thresholds = threshold if isinstance(threshold, Mapping) else dict.fromkeys(chosen, threshold)
+    for value in thresholds.values():
+        if not 0 <= value < 1:
+            raise InputError("threshold", received=value, expected="a probability, 0 or more and below 1")
     if not chosen or not set(chosen) <= set(finished):
         raise InputError(
             str(runs.path),
@@ -256,7 +258,7 @@ def detect_with_networks(
             )
             for place, (_, masks), found in zip(places, pairs, probabilities, strict=True):
                 row = dataset.rows[usable[place]]
-                yield detect_on_row(row, found, masks[-1], network=number, threshold=threshold)
+                yield detect_on_row(row, found, masks[-1], network=number, threshold=thresholds[number])
             if progress is not None:
                 progress(len(pairs))
 

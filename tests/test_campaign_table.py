@@ -100,7 +100,7 @@ def detect(runs, dataset, out, contrast, thresholds, *, device, numbers):
         write_detections(out, [*detections(PLANTED[kind], networks=PLAN.networks), *looks])
 
 
-def set_thresholds(runs, dataset, out, share, *, device, numbers):
+def set_thresholds(runs, dataset, out, share, *, device, numbers, lowest):
     found = dict.fromkeys(range(PLAN.networks), 0.5)
     out.write_text(json.dumps(found))
     return found

@@ -11,9 +11,13 @@ Files:
     sweep_report       the page of a sweep
     decision           whether a setting meets a requirement; decision_report: its part of the page
     trial              networks trained on one file and tried on another
+    ensemble           networks of one recipe in several processes
+    table              the paper's table; table_page: its page
     fresh_noise        training with new noise at every look
     task               POD before and after a diagnosis
     starter            images of the starter network
+    chain              commands in order, answers kept
+    lab_line           the paper's experiment on the virtual lab: line and images
     demo               the demo; demo_gap: its planted effect; figures, report: its page
     blind_check        sealed cases, top to bottom
     blind_cases        labels and their seal

@@ -6,28 +6,18 @@ already is not done again, so that a killed run goes on where it stopped.
 
 import contextlib
 import csv
-import io
-import json
 import math
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..acquisition.setting import Filter, Setting
-from ..errors import InputError, RaytwinError
-from ..files import whole_file
+from ..errors import InputError
+from .chain import Chain, Run, Tell, claim_folder
 from .demo_gap import GapPlan, run_gap
-
-Run = Callable[[Sequence[str]], int]
-Tell = Callable[[str], None]
-
-_FILTERS = (Filter(material="Cu", thickness_mm=0.05),)
-LOW = Setting(kV=40, power_W=40, exposure_ms=100, averaged=10, filters=_FILTERS)
-HIGH = Setting(kV=90, power_W=45, exposure_ms=100, averaged=10, filters=_FILTERS)
+from .lab_line import LabLine, measure_line, write_generated, write_measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +63,22 @@ class DemoPlan:
             if getattr(self, name) < 1:
                 raise InputError(name, received=getattr(self, name), expected="1 or more")
 
+    @property
+    def line(self) -> LabLine:
+        """What is measured and generated."""
+        return LabLine(
+            size=self.size,
+            pixel_mm=self.pixel_mm,
+            source_detector_mm=self.source_detector_mm,
+            bones_mm=self.bones_mm,
+            calibration_frames=self.calibration_frames,
+            products=self.products,
+            test_products=self.test_products,
+            exposures_ms=self.exposures_ms,
+            generated=self.generated,
+            seed=self.seed,
+        )
+
 
 PAPER_PLAN = DemoPlan(
     size=(760, 956),
@@ -94,45 +100,6 @@ PAPER_PLAN = DemoPlan(
 )
 
 
-@dataclass(slots=True)
-class _Chain:
-    """Runs commands in order; keeps each answer in DIR/answers and the words that produced it."""
-
-    directory: Path
-    run: Run
-    tell: Tell
-    commands: list[dict[str, Any]] = field(default_factory=list)
-
-    def path(self, name: str) -> str:
-        return str(self.directory / name)
-
-    def step(self, name: str, words: Sequence[str], *, outputs: Sequence[str] = ()) -> dict[str, Any]:
-        """Answer of a command, from the last run where that is complete."""
-        text = "raytwin " + " ".join(words).replace(f"{self.directory}/", "")
-        kept = self.directory / "answers" / f"{name}.json"
-        if kept.exists() and all(Path(self.path(output)).exists() for output in outputs):
-            record: dict[str, Any] = json.loads(kept.read_text())
-            if record.get("command") == text:
-                self.commands.append(record)
-                return dict(record["answer"])
-        self.tell(text)
-        started = time.monotonic()
-        answer = io.StringIO()
-        with contextlib.redirect_stdout(answer):
-            code = self.run([*words, "--json"])
-        if code != 0:
-            raise RaytwinError(f"the step `{text}` failed (exit code {code}); its message stands above")
-        record = {
-            "command": text,
-            "seconds": round(time.monotonic() - started, 1),
-            "answer": json.loads(answer.getvalue()),
-        }
-        with whole_file(kept) as temporary:
-            temporary.write_text(json.dumps(record))
-        self.commands.append(record)
-        return dict(record["answer"])
-
-
 def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[str, Any]:
     """Do the whole chain in `directory` and return everything the report shows.
 
@@ -146,11 +113,14 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
         InputError: the directory holds a demo of another plan.
         RaytwinError: a step failed.
     """
-    _claim(directory, plan)
-    chain = _Chain(directory=directory, run=run, tell=tell)
+    claim_folder(directory, asdict(plan), what="a demo")
+    chain = Chain(directory=directory, run=run, tell=tell)
     exposures = [1000.0, *plan.exposures_ms]
-    line = _measured_line(chain, plan)
-    _datasets(chain, plan, exposures)
+    line = measure_line(chain, plan.line)
+    write_measured(chain, plan.line, exposures)
+    for exposure in plan.exposures_ms:
+        for name in ("train", "test", "published"):
+            write_generated(chain, plan.line, exposure, name)
     found = _networks(chain, plan, exposures)
     gap = run_gap(directory, plan.gap, seed=plan.seed, step=chain.step)
     return {
@@ -164,96 +134,7 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
     }
 
 
-def _claim(directory: Path, plan: DemoPlan) -> None:
-    """Make the folder one of this plan.
-
-    Raises:
-        InputError: it holds a demo of another plan, or other files.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    fingerprint = json.dumps(asdict(plan), sort_keys=True)
-    kept = directory / "plan.json"
-    if kept.exists() and kept.read_text() != fingerprint:
-        raise InputError(
-            "-o",
-            received=f"{directory}, a demo of another plan",
-            expected="a new folder, or the same options as before",
-        )
-    if not kept.exists():
-        if any(directory.iterdir()):
-            raise InputError("-o", received=f"{directory}, a folder with files in it", expected="a new or empty folder")
-        with whole_file(kept) as temporary:
-            temporary.write_text(fingerprint)
-
-
-def _measured_line(chain: _Chain, plan: DemoPlan) -> dict[str, Any]:
-    """The line that is measured, its twin, and how well that predicts flats."""
-    at = chain.path
-    size = ["--size", f"{plan.size[0]}x{plan.size[1]}", "--pixel-mm", f"{plan.pixel_mm:g}", "--seed", str(plan.seed)]
-    # the main job end to end, on a line without surprises
-    size += ["--family", "none", "--no-unkindness"]
-    if plan.source_detector_mm is not None:
-        size += ["--source-detector-mm", f"{plan.source_detector_mm:g}"]
-    bones = [] if plan.bones_mm is None else ["--bones-mm", ",".join(f"{length:g}" for length in plan.bones_mm)]
-    truth = chain.step(
-        "lab_calibration",
-        ["lab", "-o", at("calibration.h5"), "--protocol", "calibration", *size,
-         "--frames", str(plan.calibration_frames)],
-        outputs=["calibration.h5"],
-    )  # fmt: skip
-    calibration = chain.step("calibrate", ["calibrate", at("calibration.h5"), "-o", at("twin.h5")], outputs=["twin.h5"])
-    validation = chain.step("validate", ["validate", at("twin.h5"), at("calibration.h5")])
-    for name, count, more in (("set1", plan.products, []), ("set2", plan.test_products, bones)):
-        chain.step(
-            f"lab_{name}",
-            ["lab", "-o", at(f"{name}.h5"), "--protocol", name, *size, "--products", str(count), *more],
-            outputs=[f"{name}.h5"],
-        )
-    return {"truth": truth, "calibration": calibration, "validation": validation}
-
-
-def _datasets(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> None:
-    """Measured images as datasets; generated ones, for training from set 1, for testing from the 1 s images of set 2."""
-    at = chain.path
-    twin = ["--twin", at("twin.h5")]
-    chain.step(
-        "references",
-        ["import", "reference", at("set1.h5"), "-o", at("references.h5"), *twin, "--validation", "0.2",
-         "--seed", str(plan.seed)],
-        outputs=["references.h5"],
-    )  # fmt: skip
-    for exposure in exposures:
-        low, high = setting_pair(exposure)
-        chain.step(
-            f"real_{exposure:g}ms",
-            ["import", "reference", at("set2.h5"), "-o", at(f"real_{exposure:g}ms.h5"), *twin,
-             "--low", str(low), "--high", str(high)],
-            outputs=[f"real_{exposure:g}ms.h5"],
-        )  # fmt: skip
-    for exposure in plan.exposures_ms:
-        low, high = setting_pair(exposure)
-        setting = ["--low", str(low), "--high", str(high)]
-        number = f"{exposure:g}ms"
-        seed = 1000 * plan.seed + 10 * int(exposure)
-        for kind, source, count, offset in (
-            ("train", "references.h5", plan.generated, 0),
-            ("test", "real_1000ms.h5", plan.test_products, 1),
-        ):
-            chain.step(
-                f"generate_{kind}_{number}",
-                ["generate", at("twin.h5"), at(source), *setting, "-n", str(count),
-                 "--seed", str(seed + offset), "--no-counts", "-o", at(f"{kind}_{number}.h5")],
-                outputs=[f"{kind}_{number}.h5"],
-            )  # fmt: skip
-        chain.step(
-            f"published_{number}",
-            ["generate", at("twin.h5"), at("real_1000ms.h5"), *setting, "-n", str(plan.test_products),
-             "--recipe", "as_published", "--seed", str(seed + 2), "--no-counts", "-o", at(f"published_{number}.h5")],
-            outputs=[f"published_{number}.h5"],
-        )  # fmt: skip
-
-
-def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:
+def _networks(chain: Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:
     """Networks trained, tried and compared.
 
     Each starts from the network that comes with raytwin, or from one shared by all that is trained before. From the one that
@@ -306,7 +187,7 @@ def _networks(chain: _Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict
     return {"training": training, "detection": detection, "pod": pod, "compare": compared}
 
 
-def _shared_start(chain: _Chain, plan: DemoPlan, common: Sequence[str]) -> dict[str, Any]:
+def _shared_start(chain: Chain, plan: DemoPlan, common: Sequence[str]) -> dict[str, Any]:
     """One network that all others start from, `runs_shared`.
 
     First from the least noisy images (noisier ones teach a new network nothing for hundreds of steps), then from all exposures.
@@ -329,17 +210,7 @@ def _shared_start(chain: _Chain, plan: DemoPlan, common: Sequence[str]) -> dict[
     return {"first": first, "shared": shared}
 
 
-def setting_pair(exposure_ms: float) -> tuple[Setting, Setting]:
-    """Low and high setting of the paper's line at an exposure; 1000 ms is ten averaged frames of 100 ms."""
-    if exposure_ms == 1000.0:
-        return LOW, HIGH
-    return (
-        replace(LOW, exposure_ms=exposure_ms, averaged=1),
-        replace(HIGH, exposure_ms=exposure_ms, averaged=1),
-    )
-
-
-def _mix(chain: _Chain, sources: Sequence[str], out: str) -> None:
+def _mix(chain: Chain, sources: Sequence[str], out: str) -> None:
     """One dataset out of several, made by the library: the command line has no word for it."""
     from ..acquisition.dataset_io import concatenate_datasets, read_dataset
 
@@ -351,22 +222,16 @@ def _mix(chain: _Chain, sources: Sequence[str], out: str) -> None:
         concatenate_datasets(opened, chain.path(out))
 
 
-def _pod(chain: _Chain, name: str) -> dict[str, Any]:
+def _pod(chain: Chain, name: str) -> dict[str, Any]:
     """POD answer of a hit table, or why there is none (all hit, all missed)."""
-    try:
-        return chain.step(f"pod_{name}", ["pod", chain.path(f"hits_{name}.csv"), "--size", "contrast"])
-    except RaytwinError as error:
-        chain.tell(f"no POD curve for {name}: {error}")
-        return {"a90": None, "warnings": [str(error)]}
+    return {"a90": None} | chain.step_or_reason(
+        f"pod_{name}", ["pod", chain.path(f"hits_{name}.csv"), "--size", "contrast"]
+    )
 
 
-def _compared(chain: _Chain, number: str) -> dict[str, Any]:
+def _compared(chain: Chain, number: str) -> dict[str, Any]:
     words = ["compare", chain.path(f"hits_real_{number}.csv"), chain.path(f"hits_test_{number}.csv")]
-    try:
-        return chain.step(f"compare_{number}", words)
-    except RaytwinError as error:
-        chain.tell(f"no comparison at {number}: {error}")
-        return {"warnings": [str(error)]}
+    return chain.step_or_reason(f"compare_{number}", words)
 
 
 def a90_table(pod: dict[str, Any], compared: dict[str, Any], exposures: Sequence[float]) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ What a step writes appears whole or not at all; where its file is there already,
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,6 +58,7 @@ def train_on_file(
     seed: int,
     start_from: "str | os.PathLike[str] | None" = None,
     device: str = "cpu",
+    workers: int | None = None,
     tell: Callable[[str], None] = lambda line: None,
     name: str = "networks",
 ) -> None:
@@ -67,45 +68,71 @@ def train_on_file(
         path: dataset with images of split train (and val).
         folder: of the networks.
         recipe, networks, seed, start_from, device: as `train_networks` has them.
+        workers: processes of one thread each that share the networks (`ensemble`); None: this process, with its threads.
         tell: shows one line of progress.
         name: what the lines call these networks.
     """
     from ..segmentation import train_networks
+    from .ensemble import train_together
 
     def progress(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
         tell(f"{name}: network {network + 1}, epoch {done} of {wanted}")
 
     with read_dataset(path) as dataset:
-        train_networks(
-            dataset,
-            folder,
-            recipe=recipe,
-            networks=networks,
-            seed=seed,
-            device=device,
-            start_from=start_from,
-            progress=progress,
-        )
+        words: dict[str, Any] = {
+            "recipe": recipe,
+            "networks": networks,
+            "seed": seed,
+            "device": device,
+            "start_from": start_from,
+            "progress": progress,
+        }
+        if workers is None:
+            train_networks(dataset, folder, **words)
+        else:
+            train_together(dataset, folder, workers=workers, **words)
 
 
 def thresholds_from_images(
-    runs_path: Path, learnt_from: Path, out: Path, share: float, *, device: str
+    runs_path: Path,
+    learnt_from: Path,
+    out: Path,
+    share: float,
+    *,
+    device: str,
+    numbers: Sequence[int] | None = None,
+    lowest: float = 0.01,
 ) -> dict[int, float]:
     """Probability above which each network's pixels are marked, by network.
 
     Networks that learnt little differ in how readily they mark. Each gets the threshold at which `share` of the images that
     it learnt from show a mark away from objects: something its owner knows, whatever images it is tried on later.
+
+    Args:
+        runs_path: of the networks.
+        learnt_from: dataset file.
+        out: JSON file of the thresholds; where it is there already, it is read.
+        share: of the images, 0 to 1.
+        device: torch device.
+        numbers: of other images of the file to take in place of those of split train and val.
+        lowest: threshold; with 0 the share is met by networks that hardly mark anything, too.
+
+    Returns:
+        Network number -> threshold, `lowest` or more and below 1.
     """
     from scipy.ndimage import binary_dilation
 
-    from ..segmentation import build_network, finished_networks, open_runs, predict_probabilities, read_weights
+    from ..segmentation import build_network, examples_from_dataset, finished_networks, open_runs, read_weights
+    from ..segmentation.network import probabilities_from_scaled
 
     if out.exists():
         return {int(number): float(value) for number, value in json.loads(out.read_text(encoding="utf-8")).items()}
     runs = open_runs(runs_path)
     found: dict[int, float] = {}
     with read_dataset(learnt_from) as dataset:
-        numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
+        if numbers is None:
+            numbers = [number for number, row in enumerate(dataset.rows) if row.split in ("train", "val")]
+        examples = examples_from_dataset(dataset, numbers, recipe=runs.recipe)  # scaled once for all networks
         for network_number in finished_networks(runs):
             _, weights = read_weights(runs.path / f"network_{network_number:03d}" / "weights.pt")
             network = build_network(runs.recipe, seed=0, pretrained=False)
@@ -113,14 +140,15 @@ def thresholds_from_images(
             network = network.to(device)
             highest = []
             for first in range(0, len(numbers), _AT_ONCE):
-                part = numbers[first : first + _AT_ONCE]
-                maps = predict_probabilities(network, dataset.images(part), recipe=runs.recipe, device=device)
-                for values, mask in zip(maps, dataset.foreign_object_masks(part), strict=True):
+                pairs = [examples[place] for place in range(first, min(first + _AT_ONCE, len(numbers)))]
+                scaled = np.stack([image for image, _ in pairs])
+                maps = probabilities_from_scaled(network, scaled, recipe=runs.recipe, device=device)
+                for values, mask in zip(maps, (masks[-1] != 0 for _, masks in pairs), strict=True):
                     away = (
                         ~binary_dilation(mask, iterations=_NEAR_PX) if mask.any() else np.ones(mask.shape, dtype=bool)
                     )
                     highest.append(float(values[away].max()) if away.any() else 0.0)
-            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), 0.01, 1.0 - 1e-6))
+            found[network_number] = float(np.clip(np.quantile(highest, 1.0 - share), lowest, 1.0 - 1e-6))
     with whole_file(out) as temporary:
         temporary.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return found
@@ -134,8 +162,9 @@ def detect_on_file(
     thresholds: Mapping[int, float],
     *,
     device: str,
+    numbers: Sequence[int] | None = None,
 ) -> None:
-    """Hit table of all networks on the images of split test; images of one scene share its name."""
+    """Hit table of all networks on the images of split test, or of these numbers; images of one scene share its name."""
     from ..segmentation import Detection, detect_with_networks, open_runs, write_detections
 
     if out.exists():
@@ -143,17 +172,17 @@ def detect_on_file(
 
     def rows(dataset: Dataset, numbers: NDArray[np.intp]) -> Iterator[Detection]:
         runs = open_runs(runs_path)
-        for network, threshold in thresholds.items():
-            for found in detect_with_networks(
-                runs, dataset, numbers, networks=[network], threshold=threshold, device=device
-            ):
-                scene = scene_of(found.image)
-                value = contrast.get(scene, found.contrast)
-                known = value is not None and math.isfinite(value) and found.recall is not None
-                yield replace(found, image=scene, contrast=value if known else None)
+        for found in detect_with_networks(
+            runs, dataset, numbers, networks=list(thresholds), threshold=thresholds, device=device
+        ):
+            scene = scene_of(found.image)
+            value = contrast.get(scene, found.contrast)
+            known = value is not None and math.isfinite(value) and found.recall is not None
+            yield replace(found, image=scene, contrast=value if known else None)
 
     with read_dataset(dataset_path) as dataset:
-        write_detections(out, rows(dataset, dataset.indices(split="test")))
+        chosen = dataset.indices(split="test") if numbers is None else np.asarray(numbers, dtype=np.intp)
+        write_detections(out, rows(dataset, chosen))
 
 
 def curve_of_table(

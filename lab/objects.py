@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 PRODUCT_MATERIAL = "chicken_breast"
 BONE_MATERIAL = "rib_bone"
+RIB_ACROSS_MM = (1.0, 3.0)
 TURN_DEGREES = 8.0  # how far a product may lie askew
 
 
@@ -259,9 +260,11 @@ def sample_fillet(rng: np.random.Generator, *, name: str, half_y_mm: float, half
     )
 
 
-def sample_bone(rng: np.random.Generator, *, name: str, size_mm: float) -> Bone:
-    """A piece of rib of the given length: 1 to 3 mm across, never thicker than two thirds of its length."""
-    width_mm = min(rng.uniform(1.0, 3.0), size_mm / 1.5)
+def sample_bone(
+    rng: np.random.Generator, *, name: str, size_mm: float, across_mm: tuple[float, float] = RIB_ACROSS_MM
+) -> Bone:
+    """A piece of bone of the given length, a rib's 1 to 3 mm across by default, never thicker than two thirds of its length."""
+    width_mm = min(rng.uniform(*across_mm), size_mm / 1.5)
     return Bone(
         name=name,
         size_mm=size_mm,

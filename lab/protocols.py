@@ -19,6 +19,7 @@ from .bench import Bench, RenderedScene, render
 from .families import sample_system
 from .objects import (
     BONE_MATERIAL,
+    RIB_ACROSS_MM,
     TURN_DEGREES,
     Bone,
     Fillet,
@@ -48,6 +49,7 @@ SET_1_BONES = 44
 SET_2_PRODUCTS = 84
 SET_2_BONELESS = 2
 SET_2_BONES_MM = (2.0, 3.0)
+SET_2_EXPOSURES_MS = (100.0, 50.0, 20.0)  # beside 1 s
 CORRECTION_FRAMES = 200  # averaged into each dark and flat of the product sets
 
 
@@ -202,6 +204,7 @@ def plan_set_1(
     frames: int,
     product_mm: float | None = None,
     bones_mm: tuple[float, ...] | None = None,
+    across_mm: tuple[float, float] = RIB_ACROSS_MM,
 ) -> Plan:
     """The paper's first set: fillets with bones of 1.5 to 11 mm and boneless ones (163 to 91), each at 1 s.
 
@@ -215,12 +218,15 @@ def plan_set_1(
     # Sizes spread evenly over the logarithm of the range, so that a short set holds small and large bones alike.
     edges_mm = np.geomspace(1.5, 11.0, n_bones + 1)
     bones = [
-        sample_bone(rng, name=f"bone{number + 1:02d}", size_mm=round(float(rng.uniform(low, high)), 1))
+        sample_bone(
+            rng, name=f"bone{number + 1:02d}", size_mm=round(float(rng.uniform(low, high)), 1), across_mm=across_mm
+        )
         for number, (low, high) in enumerate(pairwise(edges_mm))
     ]
     if bones_mm is not None:
         bones = [
-            sample_bone(rng, name=f"bone{number + 1:02d}", size_mm=size_mm) for number, size_mm in enumerate(bones_mm)
+            sample_bone(rng, name=f"bone{number + 1:02d}", size_mm=size_mm, across_mm=across_mm)
+            for number, size_mm in enumerate(bones_mm)
         ]
     bone_order = [bones[number % len(bones)] for number in range(n_with_bone)]
     contents: list[Bone | None] = [*bone_order, *([None] * (products - n_with_bone))]
@@ -236,17 +242,22 @@ def plan_set_2(
     frames: int,
     product_mm: float | None = None,
     bones_mm: tuple[float, ...] | None = None,
+    across_mm: tuple[float, float] = RIB_ACROSS_MM,
+    exposures_ms: tuple[float, ...] | None = None,
+    boneless: int | None = None,
 ) -> Plan:
     """The paper's second set: two fillets, bones of 2 and 3 mm in many places, at 1 s, 100, 50 and 20 ms each.
 
-    Two of 84 products are boneless (at least one). Fillets and bones are others than those of the first set.
+    Two of 84 products are boneless (at least one), or as many as `boneless` says. `exposures_ms` are those beside 1 s. Fillets
+    and bones are others than those of the first set.
     """
     fillets = _fillets(rng, system, count=2, product_mm=product_mm, prefix="test_fillet")
     bones = [
-        sample_bone(rng, name=f"test_bone{number + 1}", size_mm=size_mm)
+        sample_bone(rng, name=f"test_bone{number + 1}", size_mm=size_mm, across_mm=across_mm)
         for number, size_mm in enumerate(bones_mm or SET_2_BONES_MM)
     ]
     n_boneless = max(1, round(products * SET_2_BONELESS / SET_2_PRODUCTS)) if products > 1 else 0
+    n_boneless = n_boneless if boneless is None else boneless
     contents: list[Bone | None] = [None] * n_boneless
     contents += [bones[number % len(bones)] for number in range(products - n_boneless)]
     return _product_plan(
@@ -254,7 +265,7 @@ def plan_set_2(
         system,
         fillets=fillets,
         contents=contents,
-        exposures=((100.0, 10), (100.0, 1), (50.0, 1), (20.0, 1)),
+        exposures=((100.0, 10), *((exposure_ms, 1) for exposure_ms in exposures_ms or SET_2_EXPOSURES_MS)),
         frames=frames,
     )
 
@@ -324,12 +335,17 @@ def make_plan(
     products: int | None = None,
     product_mm: float | None = None,
     bones_mm: tuple[float, ...] | None = None,
+    bones_across_mm: tuple[float, ...] | None = None,
+    exposures_ms: tuple[float, ...] | None = None,
+    boneless: int | None = None,
 ) -> Plan:
     """The plan of a protocol by name; see `PROTOCOLS`.
 
     Raises:
         InputError: an unknown protocol, numbers below 1 (2 products), or a product larger than the field.
     """
+    if protocol != "set2":
+        _only_in("set2", exposures_ms=exposures_ms, boneless=boneless)
     if protocol not in PROTOCOLS:
         known = ", ".join((*PROTOCOLS, *SESSIONS))
         raise InputError("protocol", received=repr(protocol), expected=f"one of {known}")
@@ -337,6 +353,7 @@ def make_plan(
     if frames < 1:
         raise InputError("frames", received=frames, expected="1 or more")
     if protocol not in DEFAULT_PRODUCTS:
+        _only_in("a set of products", bones_across_mm=bones_across_mm)
         if frames < 2:
             raise InputError("frames", received=frames, expected="2 or more in a calibration")
         if protocol == "calibration":
@@ -349,8 +366,25 @@ def make_plan(
         raise InputError("product_mm", received=f"{product_mm:g} mm", expected="10 to 1000 mm")
     if bones_mm is not None and not (bones_mm and all(0.2 <= size_mm <= 100.0 for size_mm in bones_mm)):
         raise InputError("bones_mm", received=bones_mm, expected="lengths of 0.2 to 100 mm")
-    plan = plan_set_1 if protocol == "set1" else plan_set_2
-    return plan(rng, system, products=products, frames=frames, product_mm=product_mm, bones_mm=bones_mm)
+    words: dict[str, Any] = {
+        "products": products,
+        "frames": frames,
+        "product_mm": product_mm,
+        "bones_mm": bones_mm,
+    }
+    if bones_across_mm is not None:
+        if len(bones_across_mm) != 2 or not 0.1 <= bones_across_mm[0] <= bones_across_mm[1] <= 20.0:
+            raise InputError("bones_across_mm", received=bones_across_mm, expected="least and most, 0.1 to 20 mm")
+        words["across_mm"] = (bones_across_mm[0], bones_across_mm[1])
+    if protocol == "set1":
+        return plan_set_1(rng, system, **words)
+    if exposures_ms is not None:
+        allowed = len(set(exposures_ms)) == len(exposures_ms) and all(0.01 <= one <= 10000.0 for one in exposures_ms)
+        if not (exposures_ms and allowed):
+            raise InputError("exposures_ms", received=exposures_ms, expected="different times of 0.01 to 10000 ms")
+    if boneless is not None and not 0 <= boneless < products:
+        raise InputError("boneless", received=boneless, expected=f"0 or more, and fewer than the {products} products")
+    return plan_set_2(rng, system, **words, exposures_ms=exposures_ms, boneless=boneless)
 
 
 def truth_path(acquisition: str | os.PathLike[str]) -> Path:
@@ -372,6 +406,9 @@ def run_protocol(
     products: int | None = None,
     product_mm: float | None = None,
     bones_mm: tuple[float, ...] | None = None,
+    bones_across_mm: tuple[float, ...] | None = None,
+    exposures_ms: tuple[float, ...] | None = None,
+    boneless: int | None = None,
     session: int = 0,
     system: LabSystem | None = None,
     families: Sequence[str] | None = None,
@@ -397,6 +434,9 @@ def run_protocol(
         products: how many (sets only).
         product_mm: length of a product; by default nine tenths of the field.
         bones_mm: lengths of the bones, instead of the set's own.
+        bones_across_mm: least and most width of the bones, instead of a rib's 1 to 3 mm (sets only).
+        exposures_ms: of set2 beside 1 s, instead of 100, 50 and 20 ms.
+        boneless: how many products of set2 have no bone.
         session: another number is another day: other noise and other products on the same system.
         system: a system to measure with, instead of the seed's.
         families: of departures that the seed's system is drawn from, of `families.FAMILIES`; None: all of them.
@@ -422,6 +462,9 @@ def run_protocol(
             pixel_mm=pixel_mm,
             source_detector_mm=source_detector_mm,
             product_mm=product_mm,
+            bones_across_mm=bones_across_mm,
+            exposures_ms=exposures_ms,
+            boneless=boneless,
         )
         return _run_session(
             path,
@@ -472,6 +515,9 @@ def run_protocol(
         products=products,
         product_mm=product_mm,
         bones_mm=bones_mm,
+        bones_across_mm=bones_across_mm,
+        exposures_ms=exposures_ms,
+        boneless=boneless,
     )
     bench = Bench(system, rng=noise_rng, series_count=len(plan.takes))
     begin(plan.frames)

@@ -3,7 +3,8 @@
 difference = a90_second - a90_first, ratio = a90_second / a90_first, both with 95 % intervals built from the two
 curves' own likelihood intervals (MOVER), with their correlation where the two share images or networks. Few networks enter
 by Student's quantile, in intervals and tests. Verdict at a stated margin on the ratio by two one-sided tests: equivalent
-when the 90 % interval of the ratio lies within [1 / (1 + m), 1 + m].
+when the 90 % interval of the ratio lies within [1 / (1 + m), 1 + m]; and, where a margin in the sizes' unit is stated, when the
+90 % interval of the difference lies within [-m, m].
 Source: Zou & Donner, Stat. Med. 27 (2008) 1693, doi:10.1002/sim.3095; Schuirmann, J. Pharmacokin. Biopharm. 15 (1987)
 657.
 """
@@ -49,12 +50,27 @@ class CurveTest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SizeEquivalence:
+    """Two one-sided tests of the difference of two a90 at a margin in the sizes' unit.
+
+    Fields: margin; low, high (90 % interval of the difference; None where the data give none); verdict (`equivalent`,
+    `different within the margin`, `different` or `inconclusive`).
+    """
+
+    margin: float
+    low: float | None
+    high: float | None
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
     """Two POD curves beside each other; sizes in the tables' unit.
 
     difference_a90 (second - first) and ratio_a90 (second / first); equivalence_low, equivalence_high: 90 % interval of
     the ratio; p_equivalence: the larger of the two one-sided p-values; correlation: of the two a90, from shared images
-    and networks; paired: what is shared (`image`, `network`, `image and network`, `nothing`).
+    and networks; paired: what is shared (`image`, `network`, `image and network`, `nothing`); size_equivalence: at a margin in
+    the sizes' unit, None where none was stated.
     """
 
     first: PodFit
@@ -70,6 +86,7 @@ class Comparison:
     paired: str
     curve_test: CurveTest | None
     warnings: tuple[str, ...]
+    size_equivalence: SizeEquivalence | None = None
 
 
 def compare_pod(
@@ -81,6 +98,7 @@ def compare_pod(
     method: str = "auto",
     repeats: str = "pooled",
     margin: float = 0.1,
+    size_margin: float | None = None,
     shared_images: bool = False,
     shared_networks: bool = False,
 ) -> Comparison:
@@ -93,6 +111,7 @@ def compare_pod(
         method: see `fit_pod`.
         repeats: see `fit_pod`, for both.
         margin: m of the equivalence test, as a share of a90 (0.1: within some 10 %).
+        size_margin: also a test of the difference at this margin, in the tables' unit.
         shared_images, shared_networks: whether the same images and networks stand in both (the comparison is paired).
 
     Raises:
@@ -100,6 +119,8 @@ def compare_pod(
     """
     if not (math.isfinite(margin) and margin > 0):
         raise InputError("margin", received=margin, expected="a positive share of a90, for example 0.1")
+    if size_margin is not None and not (math.isfinite(size_margin) and size_margin > 0):
+        raise InputError("size margin", received=size_margin, expected="a positive size, in the unit of the tables")
     fits = tuple(
         fit_trials(_compressed(table), link=link, log_size=log_size, method=method, repeats=repeats)
         for table in (first, second)
@@ -120,6 +141,9 @@ def compare_pod(
     if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
         correlation = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
     empty = Interval(value=None, low=None, high=None)
+    # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
+    freedoms = [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
+    shares = [float(student_quantile(ONE_SIDED, m) / student_quantile(TWO_SIDED, m)) for m in freedoms]
     difference = ratio = empty
     low90 = high90 = p = None
     verdict = "inconclusive"
@@ -144,9 +168,6 @@ def compare_pod(
                 low=None if logs.low is None else math.exp(logs.low),
                 high=None if logs.high is None else math.exp(logs.high),
             )
-            # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
-            freedoms = [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
-            shares = [float(student_quantile(ONE_SIDED, m) / student_quantile(TWO_SIDED, m)) for m in freedoms]
             short = _mover(
                 math.log(b), math.log(a), *_log_ends(fits[1], shares[1]), *_log_ends(fits[0], shares[0]), correlation
             )
@@ -177,7 +198,23 @@ def compare_pod(
         paired=paired,
         curve_test=test,
         warnings=tuple(notes),
+        size_equivalence=None
+        if size_margin is None
+        else _size_equivalence(fits, difference, shares, margin=size_margin, correlation=correlation),
     )
+
+
+def _size_equivalence(
+    fits: tuple[PodFit, ...], difference: Interval, shares: list[float], *, margin: float, correlation: float
+) -> SizeEquivalence:
+    """Verdict on the difference of the two a90; `shares` shorten the arms of their 95 % intervals to 90 %."""
+    a, b = fits[0].a90, fits[1].a90
+    if a is None or b is None:
+        return SizeEquivalence(margin=margin, low=None, high=None, verdict="inconclusive")
+    short = _mover(b, a, *_ends(fits[1], shares[1]), *_ends(fits[0], shares[0]), correlation)
+    inside = short.low is not None and short.high is not None and short.low > -margin and short.high < margin
+    apart = (difference.low is not None and difference.low > 0) or (difference.high is not None and difference.high < 0)
+    return SizeEquivalence(margin=margin, low=short.low, high=short.high, verdict=_verdict(inside=inside, apart=apart))
 
 
 def _verdict(*, inside: bool, apart: bool) -> str:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .examples import Examples, examples_from_arrays, examples_from_dataset
     from .losses import LOSSES, cross_entropy_and_dice, dice_as_published
     from .network import build_network, choose_device, predict_probabilities
+    from .own_module import build_module, recipe_for_module
     from .recipe import RECIPES, Recipe, recipe_for_fine_tuning
     from .runs import detect_with_networks, split_for_training, train_networks
     from .runs_io import (
@@ -55,6 +56,7 @@ _LAZY = {
     "examples": ("Examples", "examples_from_arrays", "examples_from_dataset"),
     "losses": ("LOSSES", "cross_entropy_and_dice", "dice_as_published"),
     "network": ("build_network", "choose_device", "predict_probabilities"),
+    "own_module": ("build_module", "recipe_for_module"),
     "recipe": ("RECIPES", "Recipe", "recipe_for_fine_tuning"),
     "runs": ("detect_with_networks", "split_for_training", "train_networks"),
     "runs_io": (
@@ -89,6 +91,7 @@ __all__ = [
     "Runs",
     "Segmenter",
     "TrainingState",
+    "build_module",
     "build_network",
     "choose_device",
     "count_epochs",
@@ -113,6 +116,7 @@ __all__ = [
     "read_weights",
     "recall_in_mask",
     "recipe_for_fine_tuning",
+    "recipe_for_module",
     "recipe_of_start",
     "scale_min_max",
     "scale_residual",

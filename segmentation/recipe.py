@@ -15,6 +15,7 @@ FOREIGN_OBJECT = "foreign_object"
 PRODUCT = "product"
 ARCHITECTURE = "DeepLabV3Plus"
 ENCODER = "efficientnet-b0"
+OWN_MODULE = "own module"  # in the place of an architecture: a torch module that the user passes
 _DILATED = ("DeepLabV3", "DeepLabV3Plus")  # the encoder stops at a sixteenth (DeepLabV3: an eighth) of the resolution
 
 _CHOICES = {

@@ -11,8 +11,9 @@ from ..files import sha256_of_file
 from ._torch import load_torch
 from .detection import MARK_THRESHOLD, Detection, detect_on_row
 from .examples import examples_from_dataset
-from .network import build_network, probabilities_from_scaled
-from .recipe import Recipe
+from .network import probabilities_from_scaled
+from .own_module import module_signature, network_of
+from .recipe import OWN_MODULE, Recipe
 from .runs_io import (
     OF_NETWORK,
     NetworkResult,
@@ -28,7 +29,7 @@ from .runs_io import (
     write_finished,
     write_state,
 )
-from .training import EpochResult, TrainingState, iterate_training
+from .training import EpochResult, TrainingState, iterate_training, load_weights
 
 if TYPE_CHECKING:
     import os
@@ -91,6 +92,8 @@ def train_networks(
     start_from: "str | os.PathLike[str] | None" = None,
     fresh: Callable[[int, int], NDArray[Any]] | None = None,
     fresh_noise: Mapping[str, Any] | None = None,
+    only: Sequence[int] | None = None,
+    network: Any = None,
     progress: Progress | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> list[NetworkResult]:
@@ -107,11 +110,14 @@ def train_networks(
         fresh: called with an image's number and the epoch, gives its log images (2, row, column) with noise of that epoch;
             validation images are those of epoch 0 throughout. None takes the file's images.
         fresh_noise: what decides `fresh`, kept with the folder so that it is not gone on with by other images.
+        only: numbers of those among them that this call trains, for several processes that share a folder; None: all.
+        network: a torch module of the user's own, or a function that makes one (`own_module`), for a recipe of
+            `recipe_for_module`; None: the recipe's. Its weights are written as `weights.safetensors`, too.
         progress: called after every epoch.
         warn: called with what the user should know (a made-up split, an unreadable state).
 
     Returns:
-        Records of networks 0 .. networks - 1.
+        Records of networks 0 .. networks - 1, or of those in `only`.
 
     Raises:
         InputError: a folder of another configuration, unusable data or weights.
@@ -122,6 +128,7 @@ def train_networks(
         raise InputError("seed", received=seed, expected="a whole number, 0 or more")
     say = warn or (lambda line: None)
     torch = load_torch()
+    _check_own(recipe, network)
     train, validation, note = split_for_training(dataset, seed=seed)
     if note:
         say(note)
@@ -129,7 +136,12 @@ def train_networks(
     starts = {number: _starting_weights(path, recipe) for number, path in started_from.items()}
     hashes = {number: sha256_of_file(path) for number, path in started_from.items()}
     configuration = make_configuration(
-        recipe, seed=seed, dataset_sha256=sha256_of_file(dataset.path), started_from=hashes, fresh_noise=fresh_noise
+        recipe,
+        seed=seed,
+        dataset_sha256=sha256_of_file(dataset.path),
+        started_from=hashes,
+        fresh_noise=fresh_noise,
+        network=None if network is None else module_signature(network, recipe=recipe, seed=seed),
     )
     train_examples = examples_from_dataset(dataset, train, recipe=recipe, fresh=fresh)
     validation_examples = examples_from_dataset(dataset, validation, recipe=recipe, fresh=fresh)
@@ -138,7 +150,7 @@ def train_networks(
     runs = create_or_resume_runs(runs_path, configuration)
     done = set(finished_networks(runs))
     results = []
-    for number in range(networks):
+    for number in range(networks) if only is None else only:
         if number in done:
             result = read_result(runs, number)
             if progress is not None:
@@ -158,6 +170,7 @@ def train_networks(
             device=device,
             start_from=starts.get(number, starts.get(-1)),
             resume=resume,
+            network=network,
         ):
             write_state(runs, number, state)
             if progress is not None:
@@ -185,8 +198,9 @@ def detect_with_networks(
     numbers: Sequence[int] | NDArray[np.intp],
     *,
     networks: Sequence[int] | None = None,
-    threshold: float = MARK_THRESHOLD,
+    threshold: float | Mapping[int, float] = MARK_THRESHOLD,
     device: str = "cpu",
+    network: Any = None,
     progress: Callable[[int], None] | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> Iterator[Detection]:
@@ -197,8 +211,9 @@ def detect_with_networks(
         dataset: open dataset file; images of any size.
         numbers: of the images to try.
         networks: numbers of networks, None = all finished ones.
-        threshold: probability above which a pixel is marked, 0..1.
+        threshold: probability above which a pixel is marked, 0..1; or one for each network, by number.
         device: torch device.
+        network: of a folder of networks of the user's own, the module or function that they were trained with.
         progress: called with the number of images done, after every batch.
         warn: called with what the user should know.
 
@@ -208,10 +223,12 @@ def detect_with_networks(
     Raises:
         InputError: no finished network, an unknown one, no images, a threshold outside 0..1.
     """
-    if not 0 <= threshold < 1:
-        raise InputError("threshold", received=threshold, expected="a probability, 0 or more and below 1")
     finished = finished_networks(runs)
     chosen = finished if networks is None else list(networks)
+    thresholds = threshold if isinstance(threshold, Mapping) else dict.fromkeys(chosen, threshold)
+    for value in thresholds.values():
+        if not 0 <= value < 1:
+            raise InputError("threshold", received=value, expected="a probability, 0 or more and below 1")
     if not chosen or not set(chosen) <= set(finished):
         raise InputError(
             str(runs.path),
@@ -221,28 +238,40 @@ def detect_with_networks(
         )
     usable = images_with_pixels(dataset, numbers, warn=warn)
     recipe = runs.recipe
+    _check_own(recipe, network)
     examples = examples_from_dataset(dataset, usable, recipe=recipe)
     for number in chosen:
-        network = build_network(recipe, seed=0, pretrained=False)
+        module = network_of(recipe, network, seed=0, pretrained=False)
         path = network_folder(runs, number) / "weights.pt"
         held_recipe, weights = read_weights(path)
         if held_recipe != recipe:
             raise FileFormatError(
                 str(path), received="weights of another recipe", expected="weights of this folder's run.json"
             )
-        network.load_state_dict(weights)
-        network = network.to(device)
+        load_weights(module, weights)
+        module = module.to(device)
         for first in range(0, len(usable), _DETECTION_BATCH):
             places = range(first, min(first + _DETECTION_BATCH, len(usable)))
             pairs = [examples[place] for place in places]
             probabilities = probabilities_from_scaled(
-                network, np.stack([image for image, _ in pairs]), recipe=recipe, device=device, batch=_DETECTION_BATCH
+                module, np.stack([image for image, _ in pairs]), recipe=recipe, device=device, batch=_DETECTION_BATCH
             )
             for place, (_, masks), found in zip(places, pairs, probabilities, strict=True):
                 row = dataset.rows[usable[place]]
-                yield detect_on_row(row, found, masks[-1], network=number, threshold=threshold)
+                yield detect_on_row(row, found, masks[-1], network=number, threshold=thresholds[number])
             if progress is not None:
                 progress(len(pairs))
+
+
+def _check_own(recipe: Recipe, network: Any) -> None:
+    """A recipe of a module of the user's own needs that module, and no other recipe takes one."""
+    if (recipe.architecture == OWN_MODULE) != (network is not None):
+        raise InputError(
+            "network",
+            received="none" if network is None else f"a module, and a recipe of {recipe.architecture}",
+            expected="the torch module, or the function that makes it, with a recipe of recipe_for_module",
+            remedy="in Python give network=; the command line has no word for it" if network is None else "",
+        )
 
 
 def images_with_pixels(

@@ -3,6 +3,7 @@
     run.json                     what all networks share: recipe, seed, dataset hash, starting weights
     network_000/state.pt         while it trains: enough to go on from the last finished epoch
     network_000/weights.pt       when it is finished: weights of the lowest validation loss, with the recipe
+    network_000/weights.safetensors  the same of a module of the user's own
     network_000/network.json     when it is finished: best epoch, losses, where the weights came from
 
 Weights and states are read as plain tensors and numbers (`torch.load(weights_only=True)`): such a file runs no code.
@@ -23,9 +24,9 @@ from typing import Any
 from ..errors import FileFormatError, InputError
 from ..files import sha256_of_file, whole_file
 from ._torch import load_torch
-from .recipe import Recipe, recipe_from_mapping
+from .recipe import OWN_MODULE, Recipe, recipe_from_mapping
 from .training import EpochResult, TrainingState
-from .weights_io import STARTER, STARTER_PATH, read_safetensors
+from .weights_io import STARTER, STARTER_PATH, read_safetensors, write_safetensors
 
 FORMAT = "raytwin-runs"
 WEIGHTS_FORMAT = "raytwin-weights"
@@ -77,6 +78,7 @@ def make_configuration(
     dataset_sha256: str,
     started_from: Mapping[int, str] | None = None,
     fresh_noise: Mapping[str, Any] | None = None,
+    network: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What decides the weights of the networks of a folder.
 
@@ -86,6 +88,7 @@ def make_configuration(
         dataset_sha256: what on.
         started_from: hash of the weights that networks start from; key -1 stands for one shared by all.
         fresh_noise: where the noise of the images comes from, where it is drawn anew for every epoch.
+        network: what tells a module of the user's own from others.
     """
     return {
         "format": FORMAT,
@@ -95,6 +98,7 @@ def make_configuration(
         "dataset_sha256": dataset_sha256,
         "started_from": {str(number): digest for number, digest in (started_from or {}).items()},
         **({} if fresh_noise is None else {"fresh_noise": dict(fresh_noise)}),
+        **({} if network is None else {"network": dict(network)}),
     }
 
 
@@ -234,6 +238,8 @@ def write_finished(runs: Runs, network: int, state: TrainingState, *, notes: Map
             "weights": dict(state.best_weights),
         },
     )
+    if runs.recipe.architecture == OWN_MODULE:
+        write_safetensors(folder / "weights.safetensors", runs.recipe, state.best_weights, half=False)
     result = NetworkResult(
         network=network,
         best_epoch=state.best_epoch,
@@ -343,7 +349,7 @@ def recipe_of_start(path: str | os.PathLike[str], *, otherwise: Recipe) -> tuple
 
 def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     different = []
-    for key in ("dataset_sha256", "seed", "started_from", "fresh_noise"):
+    for key in ("dataset_sha256", "seed", "started_from", "fresh_noise", "network"):
         if held.get(key) != wanted.get(key):
             different.append(f"{key} ({_short(held.get(key))} there, {_short(wanted.get(key))} now)")
     # a folder of an earlier version lacks fields that did not exist then: they had their defaults

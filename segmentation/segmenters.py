@@ -2,7 +2,7 @@
 
 One protocol: a segmenter is called with log images (image, 2, row, column), -log(I/I0), low kV first, float32, and gives the
 probability of a foreign object in each pixel (image, row, column), 0 to 1. Masks from another program come from a function that
-returns them.
+returns them. A torch module that is trained here first: `own_module`.
 """
 
 import os

@@ -18,7 +18,8 @@ from .augmentation import AUGMENTATIONS, crop_around_object
 from .detection import DETECTION_RECALL, MARK_THRESHOLD, recall_in_mask
 from .examples import Examples
 from .losses import LOSSES
-from .network import build_network, tensor_from_array
+from .network import tensor_from_array
+from .own_module import network_of
 from .recipe import Recipe
 from .scaling import crop_to_shape, pad_to_multiple
 
@@ -100,6 +101,7 @@ def iterate_training(
     device: str = "cpu",
     start_from: Mapping[str, Any] | None = None,
     resume: TrainingState | None = None,
+    network: Any = None,
 ) -> Iterator[TrainingState]:
     """Train one network, giving its state after every epoch; the best weights are those of the lowest validation loss.
 
@@ -112,6 +114,7 @@ def iterate_training(
         device: torch device.
         start_from: weights of a trained network to start with instead of random ones.
         resume: state to go on from.
+        network: a module of the user's own, or what makes one (`own_module`); None: the recipe's.
 
     Returns:
         Iterator of states, the last one `finished`; nothing where `resume` is finished already.
@@ -127,11 +130,11 @@ def iterate_training(
     interval = max(1, _STEPS_BETWEEN_VALIDATIONS // steps_per_epoch)
 
     fresh = start_from is None and resume is None
-    network = build_network(recipe, seed=_seed(seed, network_number, 0), pretrained=fresh)
-    _load_weights(network, resume.weights if resume is not None else start_from)
-    network = network.to(device)
+    module = network_of(recipe, network, seed=_seed(seed, network_number, 0), pretrained=fresh)
+    load_weights(module, resume.weights if resume is not None else start_from)
+    module = module.to(device)
     make = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[recipe.optimizer]
-    optimizer = make(network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    optimizer = make(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     history: list[EpochResult] = []
     best_weights: Mapping[str, Any] = {}
     best_epoch, best_loss = 0, math.inf
@@ -145,7 +148,7 @@ def iterate_training(
         with torch.random.fork_rng(devices=gpus):
             torch.manual_seed(_seed(seed, network_number, epoch))
             loss = _train_epoch(
-                network,
+                module,
                 optimizer,
                 train.at_epoch(epoch),
                 recipe=recipe,
@@ -160,10 +163,10 @@ def iterate_training(
                 " lower the learning rate or look at the images"
             )
         if epoch % interval == 0 or epoch == epochs:
-            result = _validate(network, validation, recipe=recipe, device=device, epoch=epoch, loss=loss)
+            result = _validate(module, validation, recipe=recipe, device=device, epoch=epoch, loss=loss)
             if result.validation_loss is not None and result.validation_loss < best_loss:
                 best_loss, best_epoch = result.validation_loss, epoch
-                best_weights = {name: value.detach().clone() for name, value in network.state_dict().items()}
+                best_weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
         else:
             result = EpochResult(epoch=epoch, loss=loss)
         history.append(result)
@@ -171,7 +174,7 @@ def iterate_training(
             epochs_done=epoch,
             epochs_wanted=epochs,
             history=tuple(history),
-            weights=network.state_dict(),
+            weights=module.state_dict(),
             optimizer=optimizer.state_dict(),
             best_weights=best_weights,
             best_epoch=best_epoch,
@@ -283,14 +286,19 @@ def _seed(*entropy: int) -> int:
     return int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0] >> 1)
 
 
-def _load_weights(network: Any, weights: Mapping[str, Any] | None) -> None:
+def load_weights(network: Any, weights: Mapping[str, Any] | None) -> None:
+    """Give a network its weights; None leaves it as it is.
+
+    Raises:
+        InputError: weights of another network.
+    """
     if weights is None:
         return
     try:
         network.load_state_dict(weights)
     except (RuntimeError, TypeError) as error:
         raise InputError(
-            "starting weights",
+            "weights",
             received=str(error)[:120],
-            expected="weights of a network of the same recipe classes and architecture",
+            expected="weights of a network of the same classes and architecture",
         ) from None

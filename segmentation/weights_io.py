@@ -1,7 +1,7 @@
 """Weights as safetensors: tensors and text alone, so that reading a file runs no code. The starter network is one of them.
 
 The file's metadata holds the recipe, so that the network can be built again. Floating-point numbers are stored in half
-precision (3 significant digits) and read as single precision.
+precision (3 significant digits), unless it is asked for otherwise, and read as single precision.
 """
 
 import dataclasses
@@ -21,19 +21,22 @@ STARTER_PATH = Path(__file__).parents[1] / "data" / "starter" / "starter.safeten
 _KEY = "raytwin_recipe"
 
 
-def write_safetensors(path: str | os.PathLike[str], recipe: Recipe, weights: Mapping[str, Any]) -> None:
+def write_safetensors(
+    path: str | os.PathLike[str], recipe: Recipe, weights: Mapping[str, Any], *, half: bool = True
+) -> None:
     """Write weights with their recipe; the file appears whole or not at all.
 
     Args:
         path: ends in `.safetensors`.
         recipe: how the network is built and its images are scaled.
         weights: name -> tensor, a network's `state_dict()`.
+        half: floating-point numbers in half precision; False: as they are.
     """
     load_torch()
     from safetensors.torch import save
 
     packed = {
-        name: (value.half() if value.is_floating_point() else value).detach().cpu().contiguous()
+        name: (value.half() if half and value.is_floating_point() else value).detach().cpu().contiguous()
         for name, value in weights.items()
     }
     # one key alone: safetensors writes several in an order that changes from run to run

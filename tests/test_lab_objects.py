@@ -144,6 +144,42 @@ def test_bones_and_fillets_of_the_second_set_are_all_combined():
     assert len(pairs) == 4
 
 
+def test_the_second_set_has_the_exposures_clean_products_and_bones_that_were_asked_for():
+    plan = make_plan(
+        "set2",
+        system=SYSTEM,
+        products=24,
+        rng=np.random.default_rng(3),
+        exposures_ms=(200.0, 75.0),
+        boneless=6,
+        bones_mm=tuple(np.linspace(6.0, 12.0, 18)),
+        bones_across_mm=(3.5, 4.0),
+    )
+    bones = [product.bone for product in plan.scenes.values()]
+    assert sum(bone is None for bone in bones) == 6
+    assert all(3.5 <= bone.width_mm <= 4.0 for bone in bones if bone is not None)
+    objects = [take.setting for take in plan.takes if take.kind == "object"]
+    assert {(one.exposure_ms, one.averaged) for one in objects} == {(100.0, 10), (200.0, 1), (75.0, 1)}
+    # every exposure has the dark and flats that correct it
+    assert {take.setting.exposure_ms for take in plan.takes if take.kind == "flat"} == {200.0, 100.0, 75.0}
+
+
+@pytest.mark.parametrize(
+    ("protocol", "words", "message"),
+    [
+        ("set2", {"exposures_ms": (50.0, 50.0)}, "exposures_ms"),
+        ("set2", {"exposures_ms": (0.0,)}, "exposures_ms"),
+        ("set2", {"boneless": 24}, "boneless"),
+        ("set2", {"bones_across_mm": (3.0, 1.0)}, "bones_across_mm"),
+        ("set1", {"boneless": 2}, "it belongs to set2"),
+        ("calibration", {"bones_across_mm": (1.0, 3.0)}, "it belongs to a set of products"),
+    ],
+)
+def test_a_set_refuses_what_it_cannot_be(protocol, words, message):
+    with pytest.raises(InputError, match=message):
+        make_plan(protocol, system=SYSTEM, rng=np.random.default_rng(1), products=24, **words)
+
+
 def test_what_does_not_fit_is_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(

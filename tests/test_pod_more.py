@@ -332,6 +332,24 @@ def test_a_wide_margin_makes_equivalent_what_a_narrow_one_leaves_open():
         compare_pod(one, two, margin=0)
 
 
+def test_equivalence_at_a_margin_in_the_sizes_unit_is_that_of_the_90_percent_interval_of_the_difference():
+    one, two = two_tables(2, shift=1.3, images=120, networks=30)
+    words = {"link": "logit", "repeats": "cluster", "shared_images": True, "shared_networks": True}
+    found = compare_pod(one, two, size_margin=0.001, **words)
+    inner, outer = found.size_equivalence, found.difference_a90
+    assert outer.low < inner.low < outer.value < inner.high < outer.high
+    assert inner.verdict == "different"
+    assert compare_pod(one, two, size_margin=1.01 * inner.high, **words).size_equivalence.verdict == (
+        "different within the margin"
+    )
+    assert compare_pod(one, two, size_margin=0.99 * inner.high, **words).size_equivalence.verdict == "different"
+    assert compare_pod(one, one, size_margin=0.01, **words).size_equivalence.verdict == "equivalent"
+    assert compare_pod(one, two, **words).size_equivalence is None
+    for margin in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="size margin"):
+            compare_pod(one, two, size_margin=margin, **words)
+
+
 def test_difference_interval_covers_nothing_where_there_is_none():
     # independent tables of one curve: 95 % of 100 within 4 standard errors (2.2)
     inside = 0

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from raytwin.acquisition import DatasetRow, read_dataset, write_dataset
+from raytwin.campaign._children import ChildError
+from raytwin.campaign.ensemble import train_together
 from raytwin.cli import main
-from raytwin.errors import FileFormatError, InputError, MissingDependencyError
+from raytwin.errors import FileFormatError, InputError, MissingDependencyError, RaytwinError
 from raytwin.segmentation import (
     RECIPES,
     Recipe,
@@ -30,6 +32,7 @@ from raytwin.segmentation import (
     recipe_for_fine_tuning,
     recipe_of_start,
     split_for_training,
+    starter_recipe,
     train_networks,
 )
 from raytwin.segmentation.runs_io import network_folder, read_state, write_state
@@ -693,6 +696,36 @@ def test_a_folder_that_is_none_of_ours_is_refused(content, message, tmp_path):
     with pytest.raises(FileFormatError) as error:
         open_runs(tmp_path)
     assert message in str(error.value)
+
+
+def test_networks_trained_by_two_processes_are_those_of_one_to_the_byte(dataset_file, tmp_path):
+    recipe = dataclasses.replace(starter_recipe(), steps=None, epochs=1, batch=2)
+    words = {"recipe": recipe, "networks": 3, "seed": 5, "start_from": "starter"}
+    told = []
+    with read_dataset(dataset_file) as dataset:
+        alone = train_together(dataset, tmp_path / "alone", workers=1, **words)
+        # a run that was stopped after its first network
+        train_networks(dataset, tmp_path / "two", only=(0,), **words)
+        two = train_together(
+            dataset, tmp_path / "two", workers=2, progress=lambda number, *rest: told.append(number), **words
+        )
+    assert [item.weights_sha256 for item in two] == [item.weights_sha256 for item in alone]
+    assert len({item.weights_sha256 for item in two}) == 3
+    assert sorted(told) == [1, 2]
+
+
+def test_a_process_that_cannot_train_ends_the_job_with_its_reason(dataset_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("raytwin.campaign.ensemble.Children.run", _no_child)
+    recipe = dataclasses.replace(starter_recipe(), steps=None, epochs=1, batch=2)
+    with (
+        read_dataset(dataset_file) as dataset,
+        pytest.raises(RaytwinError, match=r"failed: the loss is not finite; what is trained is kept"),
+    ):
+        train_together(dataset, tmp_path / "runs", recipe=recipe, networks=2, workers=2)
+
+
+def _no_child(self, module, words=(), **options):
+    raise ChildError("the loss is not finite")
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from .errors import InputError, RaytwinError
 # name -> (module in raytwin.commands, one line for `raytwin --help`)
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the main job end to end on the virtual lab"),
+    "table": ("table", "the paper's table: a90 at each exposure, generated against measured"),
     "spectrum": ("spectrum", "tube spectrum behind filters"),
     "mu": ("mu", "effective attenuation of a material"),
     "check": ("check", "what measurements allow, what is suspicious, what to measure next"),

@@ -170,6 +170,7 @@ class PodComparison(Result):
                 },
                 "verdict": found.verdict,
                 "margin": found.margin,
+                "size_equivalence": None if found.size_equivalence is None else asdict(found.size_equivalence),
                 "curve_test": None if test is None else asdict(test),
                 "paired": found.paired,
                 "correlation": found.correlation,
@@ -214,6 +215,10 @@ class PodComparison(Result):
         ]
         rows.append(("difference, second - first", *interval_text(answer["difference_a90"])))
         rows.append(("ratio, second / first", *interval_text(answer["ratio_a90"])))
+        if answer["size_equivalence"] is not None:
+            held = answer["size_equivalence"]
+            ends = " to ".join("none" if held[end] is None else number_text(held[end]) for end in ("low", "high"))
+            rows.append((f"difference at a margin of {held['margin']:g}", held["verdict"], f"{ends} (90 %)"))
         title = f"{self.verdict} at a margin of {100 * self.comparison.margin:g} % on a90 ({self.size_name})"
         notes = [f"warning: {text}" for text in self.warnings]
         return Table(title=title, header=("", "value", "95 % interval"), rows=tuple(rows), notes=tuple(notes))
@@ -685,6 +690,7 @@ def compare(
     second: "TableLike",
     *,
     margin: float = 0.1,
+    size_margin: float | None = None,
     size: str | None = None,
     hit: str | None = None,
     trials: str | None = None,
@@ -701,6 +707,7 @@ def compare(
     Args:
         first, second: curves of `fit_pod`, or tables as `fit_pod` takes them.
         margin: on a90, as a share of it.
+        size_margin: also on the difference of the two a90, in the tables' unit.
         size, hit, trials, site, where: columns of both tables, as for `fit_pod`.
         link, log_size, method, repeats: as for `fit_pod`; None: as the curves were fitted, else the defaults.
         unpaired: images and networks of the same name are not the same ones.
@@ -745,6 +752,7 @@ def compare(
         method=method or "auto",
         repeats=repeats,
         margin=margin,
+        size_margin=size_margin,
         shared_images=shared["image"] and not unpaired,
         shared_networks=shared["network"] and not unpaired,
     )

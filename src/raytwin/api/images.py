@@ -524,12 +524,14 @@ def train(
     encoder_weights: str | None = None,
     architecture: str | None = None,
     encoder: str | None = None,
+    network: Any = None,
     start_from: PathLike | None = None,
     fresh_noise: "Twin | PathLike | None" = None,
     low: "Setting | str | None" = None,
     high: "Setting | str | None" = None,
     device: str = "auto",
     threads: int | None = None,
+    workers: int = 1,
     seed: "int | np.random.Generator" = 0,
     progress: Progress | bool | None = None,
 ) -> TrainedNetworks:
@@ -546,11 +548,16 @@ def train(
         batch, learning_rate, crop_px: of a step.
         encoder_weights: `imagenet` (downloaded once).
         architecture, encoder: names of segmentation-models-pytorch, such as `FPN` and `resnet18`.
+        network: in their place a torch module of your own, or a function without arguments that makes one: scaled log images
+            (image, 2, row, column) -> logits (image, class, row, column), the foreign object last. Networks from a function
+            start from different random weights, copies of a module all from its own. Weights are written as
+            `weights.safetensors`, and `detect` takes the same `network`.
         start_from: `starter` (comes with raytwin), a folder of networks, a weights.pt or a .safetensors file; steps
             and learning rate are then smaller.
         fresh_noise: a twin that draws other noise for every epoch, at the settings `low` and `high`; `dataset` holds references.
         device: `auto`, `cpu`, `cuda` or `mps`.
-        threads: processor threads; None: all.
+        threads: processor threads; None: all, of several workers one each.
+        workers: processes that share the networks; a core each is the fastest. The weights depend on threads, not on workers.
         seed: a whole number or a generator.
         progress: True for a bar, or a function of (stage, done, total).
 
@@ -565,7 +572,17 @@ def train(
         >>> runs = rt.train("references.h5", "networks", networks=1, steps=2, batch=2, crop_px=32, seed=1)
         >>> len(runs.networks)
         1
+
+        A module of your own:
+
+        >>> import torch
+        >>> def make():
+        ...     return torch.nn.Sequential(torch.nn.Conv2d(2, 8, 5, padding=2), torch.nn.ReLU(), torch.nn.Conv2d(8, 1, 1))
+        >>> own = rt.train("references.h5", "own_networks", network=make, networks=1, steps=2, batch=2, crop_px=32, seed=1)
+        >>> len(rt.detect(own, "references.h5", split="all", network=make).networks)
+        1
     """
+    from ..campaign.ensemble import train_together
     from ..segmentation import choose_device, train_networks
 
     chosen = _recipe(
@@ -587,34 +604,55 @@ def train(
             received="only a part of fresh_noise, low and high",
             expected="all three: a twin and the two settings to train for",
         )
+    if workers != 1 and fresh_noise is not None:
+        raise InputError(
+            "workers", received=f"{workers} with fresh_noise", expected="1: fresh noise is drawn in one process"
+        )
+    if network is not None:
+        chosen = _own_recipe(chosen, architecture=architecture, encoder=encoder, workers=workers)
     number = whole_seed(seed)
     warnings: list[str] = []
     with _as_dataset(dataset) as images, Telling(progress, unit="epoch") as telling:
         fresh, decided_by = None, None
         if fresh_noise is not None and low is not None and high is not None:
             fresh, decided_by = _fresh(images, fresh_noise, low, high, seed=number, warnings=warnings)
-        _use_threads(threads)
+        if workers == 1:
+            _use_threads(threads)
         where = choose_device(device)
 
         def told(network: int, done: int, wanted: int, result: "EpochResult | None") -> None:
             telling.begin(f"network {network + 1}/{networks}", wanted, done=done)
 
-        found = train_networks(
-            images,
-            output,
-            recipe=chosen,
-            networks=networks,
-            seed=number,
-            device=where,
-            start_from=start_from,
-            fresh=fresh,
-            fresh_noise=decided_by,
-            progress=told,
-            warn=warnings.append,
-        )
+        words: dict[str, Any] = {
+            "recipe": chosen,
+            "networks": networks,
+            "seed": number,
+            "device": where,
+            "start_from": start_from,
+            "progress": told,
+            "warn": warnings.append,
+        }
+        if workers == 1:
+            found = train_networks(images, output, **words, fresh=fresh, fresh_noise=decided_by, network=network)
+        else:
+            found = train_together(images, output, **words, workers=workers, threads=1 if threads is None else threads)
     return TrainedNetworks(
         path=Path(output), recipe=chosen, device=where, networks=tuple(found), warnings=tuple(warnings)
     )
+
+
+def _own_recipe(recipe: "Recipe", *, architecture: str | None, encoder: str | None, workers: int) -> "Recipe":
+    """The recipe of a module of the user's own."""
+    from ..segmentation import recipe_for_module
+
+    for name, value in (("architecture", architecture), ("encoder", encoder)):
+        if value is not None:
+            raise InputError(name, received=f"{value} with a network of your own", expected="one of the two")
+    if workers != 1:
+        raise InputError(
+            "workers", received=f"{workers} with a network of your own", expected="1: it lives in this process"
+        )
+    return recipe_for_module(recipe)
 
 
 def _recipe(
@@ -687,6 +725,7 @@ def detect(
     scaling: str | None = None,
     probabilities: bool = False,
     classes: str | None = None,
+    network: Any = None,
     device: str = "auto",
     threads: int | None = None,
     progress: Progress | bool | None = None,
@@ -708,6 +747,7 @@ def detect(
         probabilities: whether a torch module or an ONNX file gives these; False: logits.
         classes: of a torch module or an ONNX file with several, the last of them the foreign object: `exclusive` (a softmax) or
             `independent` (a sigmoid of the last); None: exclusive, with a line in `warnings`.
+        network: the module, or the function that makes it, that the folder's networks were trained with.
         device, threads: as for `train`.
         progress: True for a bar, or a function of (stage, done, total).
 
@@ -734,6 +774,10 @@ def detect(
         raise InputError("split", received=repr(split), expected="one of " + ", ".join(SPLITS))
     warnings: list[str] = []
     meant: dict[str, Any] = {"scaling": scaling, "probabilities": probabilities, "classes": classes}
+    if network is not None and not isinstance(runs, TrainedNetworks | str | os.PathLike):
+        raise InputError(
+            "network", received="given beside networks made elsewhere", expected="a folder of networks with it"
+        )
     foreign = _segmenters(runs, meant, device=device, threads=threads, warn=warnings.append)
     with _as_dataset(dataset) as images, Telling(progress, unit="image") as telling:
         words: dict[str, Any] = {"threshold": threshold, "progress": telling.advance, "warn": warnings.append}
@@ -758,7 +802,7 @@ def detect(
             if unfinished:
                 warnings.append(f"{unfinished} networks of {folder.path} are not finished and are left out")
             telling.begin("detecting", len(numbers) * len(networks))
-            rows = tuple(detect_with_networks(folder, images, numbers, device=where, **words))
+            rows = tuple(detect_with_networks(folder, images, numbers, device=where, network=network, **words))
     unknown = sum(row.recall is not None and row.contrast is None and row.size_mm is None for row in rows)
     if unknown:
         warnings.append(

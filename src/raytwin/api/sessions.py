@@ -95,8 +95,8 @@ def lab_session(
         size: (rows, columns), or N for N x N pixels; None: 128 x 160, long sessions 128 x 128.
         effects: to plant in a long session, id -> strength, or texts `ID=STRENGTH[@always|@calibration]`.
         progress: True for a bar, or a function of (stage, done, total).
-        **words: more of `raytwin.lab.protocols.run_protocol`: frames, products, product_mm, bones_mm, pixel_mm,
-            source_detector_mm, session, geometry, leave_out, only.
+        **words: more of `raytwin.lab.protocols.run_protocol`: frames, products, product_mm, bones_mm, bones_across_mm,
+            exposures_ms, boneless, pixel_mm, source_detector_mm, session, geometry, leave_out, only.
 
     Returns:
         Where the session lies, and its truth.

@@ -24,6 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("first", metavar="REAL.csv")
     parser.add_argument("second", metavar="GENERATED.csv")
     parser.add_argument("--margin", type=float, default=0.1, help="margin on a90 as a share of it (default 0.1)")
+    parser.add_argument(
+        "--size-margin",
+        type=float,
+        metavar="SIZE",
+        help="also a margin on the difference of the two a90, in the tables' unit",
+    )
     parser.add_argument("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
     parser.add_argument("--hit", metavar="COLUMN", help="0 or 1; default: hit")
     parser.add_argument("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
@@ -43,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.first,
         arguments.second,
         margin=arguments.margin,
+        size_margin=arguments.size_margin,
         size=arguments.size,
         hit=arguments.hit,
         trials=arguments.trials,
@@ -86,5 +93,11 @@ def _text(result: dict[str, Any]) -> str:
         f"at a margin of {100 * equal['margin']:g} % on a90: {equal['verdict']}"
         f" (90 % interval of the ratio {shown(equal['low'])} to {shown(equal['high'])}, p {shown(equal['p'])})"
     )
+    held = result["size_equivalence"]
+    if held is not None:
+        lines.append(
+            f"at a margin of {held['margin']:g} on the difference: {held['verdict']}"
+            f" (90 % interval {shown(held['low'])} to {shown(held['high'])})"
+        )
     lines.append(f"paired by {result['paired']}; correlation of the two a90 {result['correlation']:.2f}")
     return "\n".join(lines)

@@ -54,6 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--product-mm", type=float, metavar="MM", help="length of a product (default: fills the field)")
     parser.add_argument("--bones-mm", metavar="MM,MM", help="lengths of the bones (default: those of the set)")
     parser.add_argument(
+        "--bones-across-mm", metavar="LEAST,MOST", help="width of the bones in a set of products (default: 1 to 3 mm)"
+    )
+    parser.add_argument("--exposures-ms", metavar="MS,MS", help="set2: exposures beside 1 s (default: 100,50,20)")
+    parser.add_argument("--boneless", type=int, metavar="N", help="set2: products without bone (default: 2 of 84)")
+    parser.add_argument(
         "--source-detector-mm",
         type=float,
         metavar="MM",
@@ -111,13 +116,13 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-def _lengths(text: str | None) -> tuple[float, ...] | None:
+def _list(option: str, text: str | None, expected: str) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
         return tuple(float(word) for word in text.split(","))
     except ValueError:
-        raise InputError("--bones-mm", received=repr(text), expected="lengths in mm joined by commas") from None
+        raise InputError(option, received=repr(text), expected=f"{expected} joined by commas") from None
 
 
 def _families(names: list[str] | None) -> tuple[str, ...] | None:
@@ -132,7 +137,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     given: dict[str, Any] = {
         "size": None if arguments.size is None else _size(arguments.size),
-        "bones_mm": _lengths(arguments.bones_mm),
+        "bones_mm": _list("--bones-mm", arguments.bones_mm, "lengths in mm"),
+        "bones_across_mm": _list("--bones-across-mm", arguments.bones_across_mm, "least and most, mm,"),
+        "exposures_ms": _list("--exposures-ms", arguments.exposures_ms, "times in ms"),
+        "boneless": arguments.boneless,
     }
     with Bar(only_on_terminal=True, unit="frame") as bar:
         found = lab_session(

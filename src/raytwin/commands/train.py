@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = """example:
   raytwin train images.h5 -o networks --networks 5 --seed 1
+  raytwin train images.h5 -o ten --networks 10 --workers 2 --start-from starter
   raytwin train images_20ms.h5 -o networks_20ms --start-from networks
   raytwin train images.h5 -o quick --start-from starter          # has learnt already: 60 steps of a small network
   raytwin train references.h5 -o fresh_20ms --fresh-noise twin.h5 \
@@ -62,7 +63,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--low", metavar="SETTING", help="with --fresh-noise: target setting at the low kV")
     parser.add_argument("--high", metavar="SETTING", help="the same at the high kV")
     parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
-    parser.add_argument("--threads", type=int, help="processor threads (all)")
+    parser.add_argument("--threads", type=int, help="processor threads (all; of several workers one each)")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        help="processes that share the networks, a core each (1); any number, same weights",
+    )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 
@@ -97,6 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
             high=arguments.high,
             device=arguments.device,
             threads=arguments.threads,
+            workers=arguments.workers,
             seed=arguments.seed,
             progress=told,
         )

@@ -1,0 +1,365 @@
+"""The page of the paper's table."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..reports import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    Chart,
+    KeyFigure,
+    Line,
+    Points,
+    ResultPage,
+    Rule,
+    Section,
+    SortedTable,
+    Step,
+)
+from ..reports.chart import Shape
+from .table import WIDE, signed
+
+_DASH = "–"
+_KINDS: tuple[tuple[str, str, str, Shape], ...] = (
+    ("measured", "measured test images", MEASURED, "square"),
+    ("generated", "generated test images", AFTER, "circle"),
+)
+
+
+def table_page(result: Mapping[str, Any]) -> ResultPage:
+    """The table with its figures; `result` is what `run_table` returns."""
+    rows, plan = result["rows"], result["plan"]
+    pairs = [row for row in rows if row["compare"] is not None]
+    margin = plan["margin"]
+    pending = [*result["pending"], *result["published_pending"]]
+    notes = _notes(result)
+    return ResultPage(
+        heading="Contrast at POD 90 %, generated against measured",
+        answer=_answer(pairs, margin, pending=pending),
+        key_figures=tuple(_key_figure(row) for row in pairs),
+        proof=(a90_chart(rows), difference_chart(pairs, margin=margin)) if pairs else (),
+        steps=() if not pending else (Step(text="Go on where this run stopped.", command="raytwin table -o FOLDER"),),
+        sections=(
+            Section(
+                title="The table",
+                text=(
+                    "Contrast at POD 90 % with its 95 % interval. Networks and products are crossed random effects; where all"
+                    " networks find the same products, the interval is clustered by both (see the notes).",
+                    f"Each network marks at the threshold that {100 * plan['alarm_share']:g} % of the {plan['line']['boneless']}"
+                    " products without bone reach, measured ones for measured images, generated ones for generated images.",
+                ),
+                table=_table(rows),
+            ),
+            Section(title="False alarms", text=_alarm_text(plan), table=_alarms(pairs)),
+            Section(
+                title="POD curves",
+                figures=tuple(pod_chart(row) for row in rows),
+            ),
+            *([_published(pairs)] if any(row["published"] for row in pairs) else []),
+            Section(title="How it was made", text=_made(result)),
+            *([Section(title=f"Notes on the curves ({len(notes)})", items=tuple(notes), folded=True)] if notes else []),
+        ),
+        doubtful=bool(result["pending"]) or not pairs,
+        made_from=f"seed {plan['line']['seed']}",
+    )
+
+
+def _answer(pairs: Sequence[Mapping[str, Any]], margin: float, *, pending: Sequence[float]) -> tuple[str, ...]:
+    lines = []
+    if pending:
+        told = ", ".join(f"{exposure:g} ms" for exposure in pending)
+        lines.append(f"This table is not finished. Still to come: {told}.")
+    same = [row for row in pairs if row["compare"]["verdict"].startswith("equivalent")]
+    apart = [row for row in pairs if row["compare"]["verdict"].startswith("different")]
+    open_ = [row for row in pairs if row not in same and row not in apart]
+    for found, text in (
+        (same, f"Generated and measured test images give the same a90 within {margin:g} at"),
+        (apart, f"They differ by more than {margin:g} allows at"),
+        (open_, f"These test sets cannot say whether both agree within {margin:g} at"),
+    ):
+        if found:
+            lines.append(f"{text} {', '.join(_exposure(row) for row in found)}.")
+    return tuple(lines)
+
+
+def _key_figure(row: Mapping[str, Any]) -> KeyFigure:
+    value = " | ".join(_number(row[kind]["a90"]) for kind in ("generated", "measured"))
+    return KeyFigure(value=value, text=f"a90 at {_exposure(row)}: generated | measured")
+
+
+def a90_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
+    """a90 with its interval against exposure."""
+    marks: list[Any] = []
+    published: tuple[str, str, str, Shape] = ("published", "generated as published", BEFORE, "triangle")
+    for place, (kind, label, colour, shape) in enumerate((*_KINDS, published)):
+        curves = [(row["exposure_ms"], _curve_of(row, kind)) for row in rows]
+        known = [(exposure, curve) for exposure, curve in curves if curve and curve["a90"] is not None]
+        if not known:
+            continue
+        # side by side: intervals of one exposure must not hide each other
+        x = [exposure * (1.0 + 0.06 * (place - 1)) for exposure, _ in known]
+        a90 = [curve["a90"] for _, curve in known]
+        ends = tuple([_end(curve, name) for _, curve in known] for name in ("low", "high"))
+        names = [f"{exposure:g} ms" for exposure, _ in known]
+        marks.append(
+            Points(x=x, y=a90, y_ends=(ends[0], ends[1]), names=names, colour=colour, shape=shape, label=label)
+        )
+    exposures = [row["exposure_ms"] for row in rows]
+    return Chart(
+        name="a90_of_exposure",
+        alt="Contrast at POD 90 % with its 95 % interval against exposure, measured and generated test images.",
+        marks=marks,
+        x_label="exposure, ms",
+        y_label="contrast at POD 90 %",
+        x_scale="log",
+        x_ticks={exposure: f"{exposure:g}" for exposure in exposures},
+        x_ends=(min(exposures) / 1.3, max(exposures) * 1.3),
+    )
+
+
+def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Chart:
+    """Generated less measured a90 with its 95 % interval, and the margin."""
+    known = [row for row in pairs if (row["compare"]["difference_a90"] or {}).get("value") is not None]
+    found = [row["compare"]["difference_a90"] for row in known]
+    ends = tuple([one["value"] if one[name] is None else one[name] for one in found] for name in ("low", "high"))
+    exposures = [row["exposure_ms"] for row in pairs]
+    reach = 1.1 * max([2.0 * margin, *(abs(value) for values in ends for value in values)])
+    points = Points(
+        x=[row["exposure_ms"] for row in known],
+        y=[one["value"] for one in found],
+        y_ends=(ends[0], ends[1]),
+        names=[f"{_exposure(row)}: {row['compare']['verdict']}" for row in known],
+        label="difference of a90",
+    )
+    return Chart(
+        name="difference_of_a90",
+        alt="Generated less measured contrast at POD 90 % with its 95 % interval, and the margin of equivalence on both sides.",
+        marks=[
+            *([points] if known else []),
+            Rule(at=0.0),
+            Rule(at=margin, colour=BEFORE, label="margin"),
+            Rule(at=-margin, colour=BEFORE),
+        ],
+        x_label="exposure, ms",
+        y_label="generated less measured a90",
+        y_ends=(-reach, reach),
+        x_scale="log",
+        x_ticks={exposure: f"{exposure:g}" for exposure in exposures},
+        x_ends=(min(exposures) / 1.3, max(exposures) * 1.3),
+    )
+
+
+def pod_chart(row: Mapping[str, Any]) -> Chart:
+    """Both curves of an exposure with the share of hits in groups of like contrast."""
+    marks: list[Any] = [Rule(at=0.9)]
+    for kind, label, colour, shape in _KINDS:
+        curve = row[kind]
+        if curve is None:
+            continue
+        if curve["line"] is not None:
+            line = curve["line"]
+            marks.append(Line(x=line["size"], y=line["pod"], colour=colour, label=label, dashed=kind == "measured"))
+        points = curve["points"]
+        if points:
+            marks.append(
+                Points(
+                    x=[one["size"] for one in points],
+                    y=[one["hits"] / one["n"] for one in points],
+                    names=[f"{one['hits']} of {one['n']}" for one in points],
+                    colour=colour,
+                    shape=shape,
+                    label="" if curve["line"] is not None else label,
+                )
+            )
+    return Chart(
+        name=f"pod_{row['exposure_ms']:g}ms",
+        title=_exposure(row),
+        alt=f"POD against contrast at {_exposure(row)}; dots: share of hits in groups of like contrast.",
+        marks=marks,
+        x_label="contrast",
+        y_label="probability of detection",
+        y_ends=(-0.03, 1.03),
+    )
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
+    shown = []
+    for row in rows:
+        compared = row["compare"]
+        difference = {} if compared is None else compared["difference_a90"] or {}
+        shown.append(
+            (
+                _exposure(row),
+                _interval(row["generated"]),
+                _interval(row["measured"]),
+                _signed(difference),
+                _DASH if compared is None else str(compared["verdict"]),
+                _hits(row["generated"]),
+                _hits(row["measured"]),
+            )
+        )
+    return SortedTable(
+        header=(
+            "exposure",
+            "generated",
+            "measured",
+            "difference",
+            "equivalence",
+            "found, generated",
+            "found, measured",
+        ),
+        rows=tuple(shown),
+        words=frozenset({0, 4}),
+    )
+
+
+def _alarms(pairs: Sequence[Mapping[str, Any]]) -> SortedTable:
+    def told(alarms: Mapping[str, Any] | None) -> str:
+        if alarms is None:
+            return _DASH
+        ends = " to ".join(f"{100 * alarms[end]:.1f}" for end in ("low", "high"))
+        return f"{100 * alarms['rate']:.1f} % ({ends})"
+
+    return SortedTable(
+        header=("exposure", "set on generated", "set on measured", "measured, at the thresholds of generated"),
+        rows=tuple(
+            (
+                _exposure(row),
+                *(f"{100 * row[kind]['false_alarms']['rate']:.1f} %" for kind in ("generated", "measured")),
+                told(row["alarms_on_measured"]),
+            )
+            for row in pairs
+        ),
+    )
+
+
+def _alarm_text(plan: Mapping[str, Any]) -> tuple[str, ...]:
+    share = f"{100 * plan['alarm_share']:g} %"
+    return (
+        f"Thresholds are set so that {share} of the looks at products without bone end in an alarm, in each kind of images by"
+        " itself. So both a90 of a row are at one rate.",
+        "The last column is what a line would see whose thresholds come from generated images: false alarms on measured"
+        " products, with the 95 % interval of the products and networks tried.",
+    )
+
+
+def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
+    rows = [
+        (
+            _exposure(row),
+            _interval(row["published"]["generated"]),
+            _interval(row["published"]["measured"]),
+            _signed(row["published"]["compare"]["difference_a90"] or {}),
+            str(row["published"]["compare"]["verdict"]),
+        )
+        for row in pairs
+        if row["published"]
+    ]
+    return Section(
+        title="The published recipe of the images",
+        text=(
+            "The same networks learn from images that were generated as published (as_published), and are tried on such images"
+            " and on the measured ones.",
+        ),
+        table=SortedTable(
+            header=("exposure", "generated as published", "measured", "difference", "equivalence"),
+            rows=tuple(rows),
+            words=frozenset({0, 4}),
+        ),
+    )
+
+
+def _made(result: Mapping[str, Any]) -> tuple[str, ...]:
+    plan, line = result["plan"], result["plan"]["line"]
+    error = result["line"]["median_abs_error_percent"]
+    rows, columns = line["size"]
+    shared = plan["start"] == "starter"
+    return (
+        f"{result['networks']}.",
+        *(
+            [
+                "All networks start from the same weights. They differ less than networks from scratch, and their spread does not"
+                " hold the chance in those weights."
+            ]
+            if shared
+            else []
+        ),
+        f"Line: the virtual lab's, {rows} x {columns} pixels of {line['pixel_mm']:g} mm"
+        + ("" if line["source_detector_mm"] is None else f", detector at {line['source_detector_mm']:g} mm")
+        + ", without scatter, lag, glare or drift. Its contrasts are not those of the paper's line, which has other pixels,"
+        " distances and products.",
+        f"The twin predicts the mean of {result['line']['flats']} flats at settings it never saw to {error['mean']:.2g} %, their"
+        f" noise to {error['sd']:.2g} % (median).",
+        f"Learning: {line['products']} products at 1 s; {line['generated']} image pairs generated from them at every other"
+        " exposure. At 1 s networks learn from the measured images.",
+        f"Test: {line['test_products'] - line['boneless']} products with a bone and {line['boneless']} without, of two fillets, each"
+        " measured at every exposure and generated from its 1 s image.",
+    )
+
+
+def _notes(result: Mapping[str, Any]) -> list[str]:
+    """Warnings of the curves and comparisons, each once with the curves it belongs to; and intervals that are wide."""
+    where: dict[str, list[str]] = {}
+    for row in result["rows"]:
+        parts = [("generated", row["generated"]), ("measured", row["measured"]), ("comparison", row["compare"])]
+        if row["published"]:
+            parts += [(f"published, {name}", row["published"][name]) for name in ("generated", "measured", "compare")]
+        for label, part in parts:
+            for line in (part or {}).get("warnings", []):
+                where.setdefault(str(line), []).append(f"{_exposure(row)} {label}")
+            if label == "comparison" or label.endswith("compare"):
+                continue
+            width = (part or {}).get("half_width")
+            if width is not None and width > WIDE:
+                text = f"the 95 % interval is wider than +-{100 * WIDE:g} % of the a90"
+                where.setdefault(text, []).append(f"{_exposure(row)} {label} (+-{100 * width:.0f} %)")
+        if row["compare"] is not None and _fitted_anew(row):
+            text = "both curves were fitted alike for the difference (clustered), so that it is not that of the two columns"
+            where.setdefault(text, []).append(_exposure(row))
+    return [f"{', '.join(curves)}: {line}" for line, curves in where.items()]
+
+
+def _fitted_anew(row: Mapping[str, Any]) -> bool:
+    """Whether the comparison's difference is another one than that of the row's two a90."""
+    value = (row["compare"]["difference_a90"] or {}).get("value")
+    ends = [row[kind]["a90"] for kind in ("generated", "measured")]
+    return value is not None and None not in ends and abs(value - (ends[0] - ends[1])) > 5e-4
+
+
+def _curve_of(row: Mapping[str, Any], kind: str) -> Mapping[str, Any] | None:
+    found = row["published"]["generated"] if kind == "published" and row["published"] else row.get(kind)
+    return None if found is None or "a90" not in found else found
+
+
+def _end(curve: Mapping[str, Any], name: str) -> float:
+    """An end of the interval; the a90 itself where there is none."""
+    found = curve["a90_95_interval"][name]
+    return float(curve["a90"] if found is None else found)
+
+
+def _exposure(row: Mapping[str, Any]) -> str:
+    return "1 s" if row["exposure_ms"] == 1000.0 else f"{row['exposure_ms']:g} ms"
+
+
+def _number(value: float | None) -> str:
+    return _DASH if value is None else f"{value:.3f}"
+
+
+def _interval(curve: Mapping[str, Any] | None) -> str:
+    if curve is None or curve["a90"] is None:
+        return _DASH
+    ends = curve["a90_95_interval"]
+    wide = " (wide)" if curve["half_width"] is None or curve["half_width"] > WIDE else ""
+    return f"{_number(curve['a90'])} ({_number(ends['low'])} to {_number(ends['high'])}){wide}"
+
+
+def _signed(difference: Mapping[str, Any]) -> str:
+    if difference.get("value") is None:
+        return _DASH
+    ends = (_DASH if difference[end] is None else signed(difference[end]) for end in ("low", "high"))
+    return f"{signed(difference['value'])} ({' to '.join(ends)})"
+
+
+def _hits(curve: Mapping[str, Any] | None) -> str:
+    return _DASH if curve is None else f"{curve['n_hits']} of {curve['n']}"

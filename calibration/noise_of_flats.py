@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, Series
+from ..acquisition.instrument import Instrument
 from ..errors import FitError, InputError
+from ..materials import material_from_name
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
 from .frame_sums import effective_frames
@@ -17,6 +19,11 @@ from .noise_power import NoisePower, compute_difference_power, compute_noise_pow
 from .repeated_frames import Beam, RepeatedFrames, beam_of, most_read_variance, widened
 from .spread_fit import SpreadFit, fit_spread
 
+# Elements of converters that free charge instead of light (Kasap et al., Sensors 11 (2011) 5112): nothing spreads as in a screen.
+_PHOTOCONDUCTORS = tuple(
+    frozenset(elements.split())
+    for elements in ("Se", "Si", "Ge", "Ga As", "Cd Te", "Cd Zn Te", "Hg I", "Pb I", "Pb O", "C")
+)
 POWER_FRAMES = 400
 PIECE_BYTES = 8 * 2**20
 _POWER_SAMPLES = 3e7  # pixels x frames a series; the gain is then known to about 0.1 %
@@ -127,7 +134,8 @@ def fit_flat_noise(
         return _power(item, total, total.mean_DN - darks.of(item), good=mask, estimator=estimator)
 
     found = [(of_series(item, total, good), group_of[beam_of(item)]) for item, total in stacks]
-    found += [(_pair_power(pair, darks, good), group_of[pair.beam]) for pair in pairs]
+    shapes = _shapes_of_beams(pairs, darks, good)
+    found += [(_pair_power(pair, darks, good, shapes[pair.beam]), group_of[pair.beam]) for pair in pairs]
     found += [(other.power(of_series), group_of[other.beam]) for other in others]
     dark_signal = np.zeros(good.shape)
     found += [(_power(item, total, dark_signal, good=good, estimator=estimator), -1) for item, total in darks.repeated]
@@ -152,7 +160,8 @@ def fit_flat_noise(
     most_read = most_read_variance(means, good) if darks.effective == 0 else None
     if acquisition.instrument.counting and not darks.sums:
         most_read = 0.0  # a counter has no electronic noise
-    fit = _fit(powers, groups, in_fit, most_read)
+    screen = _has_screen(acquisition.instrument)
+    fit = _fit(powers, groups, in_fit, most_read, screen)
     # a flat above full well or bent by nonlinearity lies below the line: drop the brightest while it does
     bent: list[str] = []
     while True:
@@ -165,7 +174,7 @@ def fit_flat_noise(
             break
         in_fit[worst] = False
         bent.append(stacks[worst][0].name)
-        fit = _fit(powers, groups, in_fit, most_read)
+        fit = _fit(powers, groups, in_fit, most_read, screen)
     half = 1.959964 * fit.gain_sd_DN
     if np.all(fit.gain_DN < half):
         best = int(np.argmax(fit.gain_DN / half))
@@ -216,8 +225,37 @@ def pairs_of_singles(flats: Sequence[tuple[Series, KeptSums]]) -> tuple[FlatPair
     )
 
 
-def _pair_power(pair: FlatPair, darks: DarkFrames, good: NDArray[np.bool_]) -> NoisePower:
-    """Noise power of one exposure from a pair of single flats, DN^2."""
+def _has_screen(instrument: Instrument) -> bool:
+    """Whether a screen that gives light is declared."""
+    layers = instrument.scintillator or ()
+    elements = [frozenset(material_from_name(layer.material).mass_fractions) for layer in layers]
+    return bool(elements) and not instrument.counting and not set(elements) <= set(_PHOTOCONDUCTORS)
+
+
+def _shapes_of_beams(
+    pairs: Sequence[FlatPair], darks: DarkFrames, good: NDArray[np.bool_]
+) -> dict[Beam, NDArray[np.float64]]:
+    """Shape of each beam over its mean (row, column), from all of its single flats, the bright ones above all.
+
+    A dim flat's own noise may be as large as its signal.
+    """
+    shapes: dict[Beam, NDArray[np.float64]] = {}
+    for beam in {pair.beam for pair in pairs}:
+        members = {item.name: (item, total) for pair in pairs if pair.beam == beam for item, total in _both(pair)}
+        total_DN = np.zeros(good.shape)
+        for item, total in members.values():
+            total_DN += total.frames * item.averaged * (total.mean_DN - darks.of(item))
+        mean_DN = float(np.mean(total_DN[good]))
+        shapes[beam] = total_DN / mean_DN if mean_DN > 0 else np.ones(good.shape)
+    return shapes
+
+
+def _both(pair: FlatPair) -> tuple[tuple[Series, KeptSums], tuple[Series, KeptSums]]:
+    return pair.first, pair.second
+
+
+def _pair_power(pair: FlatPair, darks: DarkFrames, good: NDArray[np.bool_], shape: NDArray[np.float64]) -> NoisePower:
+    """Noise power of one exposure from a pair of single flats of a beam of this shape (row, column), DN^2."""
     (first, first_sum), (second, second_sum) = pair.first, pair.second
     counts = (darks.exposures_of(first), darks.exposures_of(second))
     found = compute_difference_power(
@@ -227,6 +265,7 @@ def _pair_power(pair: FlatPair, darks: DarkFrames, good: NDArray[np.bool_]) -> N
         dark_exposures=counts,
         same_dark=darks.key_of(first) == darks.key_of(second),
         good=good,
+        shape=shape,
     )
     return replace(found, modes=pair.share * found.modes)
 
@@ -256,7 +295,11 @@ def _power(
 
 
 def _fit(
-    powers: Sequence[NoisePower], groups: Sequence[int], usable: Sequence[bool], most_read_DN2: float | None
+    powers: Sequence[NoisePower],
+    groups: Sequence[int],
+    usable: Sequence[bool],
+    most_read_DN2: float | None,
+    screen: bool,
 ) -> SpreadFit:
     """The fit to the usable powers; groups of them numbered anew."""
     kept = [index for index, keep in enumerate(usable) if keep]
@@ -266,6 +309,7 @@ def _fit(
         [powers[index] for index in kept],
         group=[renumbered[groups[index]] for index in kept],
         most_read_DN2=most_read_DN2,
+        screen=screen,
     )
 
 

@@ -193,6 +193,7 @@ class NoisePower:
             out of the pixels' own noise).
         between_series: whether the two frames of a difference come from different series, so that slow changes of the beam's
             shape are in it.
+        change_DN2: what a change of the beam's shape between the two, of relative variance 1, adds to the variance; 0: not known.
         shown: what the squares show of noise; None: what whole ones do.
         row_variance_DN2, column_variance_DN2: of offsets common to a row or to a column of one exposure, with the standard
             deviations row_sd_DN2, column_sd_DN2.
@@ -207,6 +208,7 @@ class NoisePower:
     column_variance_DN2: float = 0.0
     column_sd_DN2: float = 0.0
     between_series: bool = False
+    change_DN2: float = 0.0
     shown: Shown | None = None
 
     @property
@@ -226,7 +228,7 @@ class NoisePower:
 
     def times(self, factor: float) -> "NoisePower":
         """The power times a known factor."""
-        names = ("power_DN2", "row_variance_DN2", "row_sd_DN2", "column_variance_DN2", "column_sd_DN2")
+        names = ("power_DN2", "row_variance_DN2", "row_sd_DN2", "column_variance_DN2", "column_sd_DN2", "change_DN2")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
     def smeared(self, power: FloatArray) -> FloatArray:
@@ -435,6 +437,7 @@ def compute_difference_power(
     same_dark: bool,
     good: NDArray[np.bool_],
     side: int | None = None,
+    shape: FloatArray | None = None,
 ) -> NoisePower:
     """Noise power of one exposure from two mean frames of the same beam, at the same or another level, DN^2.
 
@@ -449,6 +452,8 @@ def compute_difference_power(
         same_dark: whether it was the same dark frame.
         good: pixels to use (row, column).
         side: of the squares, px; None: `square_side_px`.
+        shape: the beam's shape, by which differences are divided (row, column); None: that of the two frames, whose own noise
+            adds to the power where it is not far below their signal.
 
     Raises:
         InputError: a frame without signal.
@@ -462,11 +467,18 @@ def compute_difference_power(
     elif not same_dark:
         read += sum(1.0 / (n * level**2) for n, level in zip(dark_exposures, levels, strict=True) if n > 0)
     quantum = sum(1.0 / (n * level) for n, level in zip(exposures, levels, strict=True))
-    shape = 0.5 * (first / levels[0] + second / levels[1])
+    if shape is None:
+        shape = 0.5 * (first / levels[0] + second / levels[1])
     summed = _PowerSum(signal_DN=shape, good=good, side=side, divided=True)
     summed.add((second / levels[1] - first / levels[0]) / math.sqrt(read))
     found = summed.result(single=1.0, degrees=1.0)
-    return replace(found, signal_DN=found.signal_DN * quantum / read, common_mode=0.0, between_series=True)
+    return replace(
+        found,
+        signal_DN=found.signal_DN * quantum / read,
+        common_mode=0.0,
+        between_series=True,
+        change_DN2=1.0 / read,
+    )
 
 
 class _PowerSum:

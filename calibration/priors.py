@@ -6,7 +6,11 @@ spectrum model, escape), and how well a line repeats itself (the discrepancies).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,10 +37,10 @@ class Prior:
 PRIORS: dict[str, Prior] = {
     "inherent_filtration_mm_Al": Prior(
         centre=1.0,
-        sd=1.0,
+        sd=1.5,
         low=0.0,
         high=12.0,
-        reason="exit window, oil, housing and air: 0 to 2.5 mm Al in most tubes, beyond what is declared",
+        reason="window, oil, housing and air beyond the declared: 0 to 2.5 mm Al in most industrial tubes, to 4.5 in medical ones",
     ),
     "log_scintillator_thickness": Prior(
         centre=-0.15,
@@ -46,19 +50,20 @@ PRIORS: dict[str, Prior] = {
         reason="of a declared one: columns fill 0.75 to 1 of a layer, grains 0.5 to 0.7 unless the label allows for it",
     ),
     "kV_error": Prior(
-        centre=-0.005,
-        sd=0.015,
+        centre=0.0,
+        sd=0.01,
         low=-0.09,
         high=0.06,
-        reason="generators are set to about 1 %; the mean of a rippling voltage lies by half of the ripple (2-8 %) below its peak",
+        reason="generators are set to about 1 %; the mean of a rippling voltage lies by half of its ripple below the peak",
     ),
     "kV_tilt": Prior(
         centre=0.0, sd=0.003, reason="the error differs between voltages, by 0.3 % from 40 to 110 kV (kV meters' own)"
     ),
     "kV_variance": Prior(
-        centre=1e-4,
-        sd=3e-4,
-        reason="relative variance of the voltage in an exposure: 2e-4 at 5 % ripple of a converter, 1.6e-3 of six pulses",
+        centre=2.7e-4,
+        sd=4.8e-4,
+        low=0.0,
+        reason="relative variance of the voltage in an exposure: an eighth of the squared ripple, mean and sd over the ripples",
     ),
     "log_output": Prior(
         centre=0.0, sd=0.3, reason="tube output over the model's: current, distance, worn anodes and fill factor"
@@ -76,8 +81,8 @@ PRIORS: dict[str, Prior] = {
     ),
     "yield_exponent": Prior(
         centre=0.0,
-        sd=0.03,
-        reason="output against voltage beyond the models: 3 % from 40 to 110 kV; dose reports of two tubes agree within 4 %",
+        sd=0.05,
+        reason="output against voltage: exponents of SpekPy's six models differ by 0.03 (sd), dose reports of two tubes leave 0.04",
     ),
     "hardness_exponent": Prior(
         centre=0.0,
@@ -90,9 +95,9 @@ PRIORS: dict[str, Prior] = {
         reason="how that changes for each e-fold of kV: PTB's spectra want -0.16, PTB's qualities -0.1 to +0.06",
     ),
     "anode_roughness_um": Prior(
-        centre=0.5,
-        sd=1.0,
-        reason="of the anode's metal beyond a smooth one: 1 um in PTB's spectra, 0.4 to 1.3 by mean energies, -0.4 by HVLs",
+        centre=1.0,
+        sd=1.5,
+        reason="of the anode's metal beyond a smooth one: -0.4 to 1.3 um in PTB's spectra and qualities, a few um in worn anodes",
     ),
     "escape_scale": Prior(
         centre=-0.4,
@@ -135,6 +140,54 @@ PRIORS: dict[str, Prior] = {
         reason="light's Swank factor changes by a few per cent from 30 to 90 keV (depth of interaction)",
     ),
 }
+# Ripple r of a voltage: by how much it dips below its peak, relative to that. The mean of a dip as a sine's lies r / 2 lower and
+# its relative variance is r^2 / 8, so that both are known together. Its order of magnitude differs between generators: each is
+# equally likely from those of constant potential (0.2 %) to six pulses (13.4 %).
+KV_RIPPLES = (0.002, 0.134)
+
+
+def ripple_from_latent(latent: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ripple of the voltage over its peak, its logarithm uniform where `latent` is a standard Gaussian, of any shape."""
+    from scipy.special import ndtr
+
+    low, high = KV_RIPPLES
+    return np.asarray(low * np.exp(math.log(high / low) * ndtr(latent)))
+
+
+def draw_parameters(priors: Mapping[str, Prior], draws: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Parameter sets as the priors have them (draw, parameter), the voltage's error and variance with their ripple.
+
+    Of the shares of other attenuation tables each is drawn by itself.
+    """
+    from scipy.stats import truncnorm
+
+    columns = {
+        name: truncnorm.rvs(
+            (prior.low - prior.centre) / prior.sd,
+            (prior.high - prior.centre) / prior.sd,
+            loc=prior.centre,
+            scale=prior.sd,
+            size=draws,
+            random_state=rng,
+        )
+        for name, prior in priors.items()
+    }
+    if priors.get("kV_variance") is PRIORS["kV_variance"]:
+        ripple = ripple_from_latent(rng.standard_normal(draws))
+        columns["kV_error"] = columns["kV_error"] - 0.5 * ripple
+        columns["kV_variance"] = ripple**2 / 8.0
+    return np.stack(list(columns.values()), axis=1)
+
+
+def spread_of(prior: Prior) -> float:
+    """Standard deviation of a parameter before anything is measured: its own, and what the voltage's ripple adds to an error."""
+    if prior is not PRIORS["kV_error"]:
+        return prior.spread
+    low, high = KV_RIPPLES
+    mean, square = ((high**power - low**power) / (power * math.log(high / low)) for power in (1, 2))
+    return math.hypot(prior.spread, 0.5 * math.sqrt(square - mean**2))
+
+
 # parameters by which a line departs from tables and models, beyond what its sheet or its adjustment leaves open
 DEPARTURES = (
     "kV_tilt",

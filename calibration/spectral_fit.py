@@ -58,6 +58,8 @@ from .priors import (
     TABLE_SHARE,
     UNDECLARED_SCINTILLATOR,
     Prior,
+    ripple_from_latent,
+    spread_of,
 )
 
 _ROUND_DRAWS = 1024
@@ -500,6 +502,10 @@ class _Posterior:
         self.data = data
         names = model.names
         shapes = {name for name in names if name in SHAPE_PARAMETERS or absorber_of_parameter(name)}
+        # what a voltage's ripple takes from its mean and adds to its variance go together
+        self.rippling = priors["kV_variance"] is PRIORS["kV_variance"]
+        if self.rippling:
+            shapes.add("kV_variance")
         self.shape = np.array([i for i, name in enumerate(names) if name in shapes])
         self.linear = np.array([i for i, name in enumerate(names) if name not in shapes])
         self.linear_names = [names[i] for i in self.linear]
@@ -548,6 +554,11 @@ class _Posterior:
 
             chosen = u[:, self.alternative] > float(ndtri(1.0 - GADOLINIUM_SHARE))
             full[:, self.shape[self.alternative]] = chosen
+        if self.rippling:
+            error, variance = (self.model.names.index(name) for name in ("kV_error", "kV_variance"))
+            ripple = ripple_from_latent(u[:, int(np.flatnonzero(self.shape == variance)[0])])
+            full[:, error] -= 0.5 * ripple
+            full[:, variance] = ripple**2 / 8.0
         return full
 
     def discrepancies(self, u: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -666,7 +677,7 @@ class _Posterior:
 
     def log_likelihood(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log likelihood of draws (draw, dimension), the linear parameters integrated out; -inf out of bounds."""
-        shapes = u[:, : len(self.shape)]
+        shapes = (self.parameters(u) - self.centre)[:, self.shape] / self.sd[self.shape]
         inside = np.all((shapes >= self.low[self.shape]) & (shapes <= self.high[self.shape]), axis=1)
         inside &= np.all(np.abs(u[:, len(self.shape) :]) <= _WIDEST_SIZE, axis=1)
         result = np.full(len(u), -np.inf)
@@ -974,7 +985,7 @@ def _undetermined(names: Sequence[str], samples: NDArray[np.float64], priors: di
     for name in own:
         if name == "log_DN_per_keV":
             continue
-        share = float(np.std(samples[:, names.index(name)])) / priors[name].spread
+        share = float(np.std(samples[:, names.index(name)])) / spread_of(priors[name])
         if share > 0.7:
             result.append(f"{name}: {100 * min(share, 1.0):.0f} % of the prior's width is left")
     columns = samples[:, [names.index(name) for name in own]]

@@ -31,6 +31,11 @@ _SILENT = 1e-6  # of the brightest series' power: below that a series is known a
 _MOST_STEPS = 30
 _SETTLED = 0.01  # of chi-square: a tenth of a standard deviation
 _MOST_ROUNDS = 4  # of fits with a scatter of series that is known better each time
+# Changes of the beam's shape between series have one size, any standard deviation equally likely (Gelman, Bayesian Analysis 1
+# (2006) 515); fewer pairs than these leave its mean square unbounded. Sizes are those at which the pair that tells most would
+# tell it from none, times these.
+_LEAST_CHANGES = 4
+_CHANGE_SIZES = np.geomspace(1e-3, 1e6, 181)
 _CHANCE = 1e-3  # that series which agree look as if they did not, and a warning stands where nothing is wrong
 _REWEIGHTED = 3  # times: the power that the weights come from then no longer moves
 _BOUNDS = {
@@ -54,8 +59,9 @@ _STARTS = (
 # the gain by less than a share is known to; where it is known better than that, at steps of its standard deviation.
 _LOG_REACH = (math.log(0.25), math.log(_LONGEST_TAIL_PX))
 _REACH_STEP = math.log(1.5)
-# Assumed, since no survey of panels says it: a tail (the low-frequency drop of IEC 62220-1) is as likely as none, and its share of
-# the light follows a beta law of mean 0.1, in one case of ten any share.
+# Light that diffuses through a screen has a tail, however small (Swank, Appl. Opt. 12 (1973) 1865); without a screen a tail (the
+# low-frequency drop of IEC 62220-1) is as likely as none. Assumed, since no survey of panels says it: its share of the light
+# follows a beta law of mean 0.1, in one case of ten any share.
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
@@ -218,6 +224,16 @@ class _Normal:
         return np.asarray(np.linalg.pinv(self.matrix / np.outer(scale, scale), rcond=1e-10) / np.outer(scale, scale))
 
 
+def _most_of_power(measured: FloatArray, modes: FloatArray, cells: int) -> FloatArray:
+    """What a power is at most of which this was measured (cell,), with chance for all of so many `cells`.
+
+    Source: Wilson and Hilferty, as in `electronic_shape`, and Donoho and Johnstone.
+    """
+    farthest = math.sqrt(2.0 * math.log(max(cells, 2)))
+    root = 1.0 - 1.0 / (9.0 * modes) - farthest / (3.0 * np.sqrt(modes))
+    return np.where(root > 0, measured / np.maximum(root, 1e-3) ** 3, math.inf)
+
+
 class _Problem:
     """Powers of the series; linear in all but the spread.
 
@@ -225,7 +241,10 @@ class _Problem:
     and weight x signal^2, cell by cell, are all that a fit asks of them.
     """
 
-    def __init__(self, series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None) -> None:
+    def __init__(
+        self, series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None, *, screen: bool
+    ) -> None:
+        self.no_tail = 0.0 if screen else _NO_TAIL
         self.series = list(series)
         self.group = list(group)
         self.groups = max(group, default=-1) + 1
@@ -242,6 +261,8 @@ class _Problem:
             # cells of one bin scatter as overlapping squares do, wide ones as their modes say
             self.independent += float(np.sum(spread_of_bins(item.square_px) ** (1.0 / np.sum(means > 0, axis=1))))
         self.drifting = tuple(number for number, item in enumerate(series) if item.between_series)
+        # standard deviation of the power of each series' slow changes, where others tell it
+        self.slow_sd_DN2 = np.full(len(self.series), math.inf)
         darks = [item for item, number in zip(series, group, strict=True) if number < 0]
         self.electronic = {
             side: electronic_shape([item for item in darks if item.square_px == side], side) for side in self.sides
@@ -249,8 +270,9 @@ class _Problem:
         self.most_read_DN2 = math.inf
         if min(group) >= 0:
             # darks were not repeated, but white noise is at no frequency more than what was measured there
+            cells = sum(data.size for data in self.data)
             pairs = zip(self.data, self.modes, strict=True)
-            measured = [float(np.min(data * (1.0 + 5.0 / np.sqrt(modes)))) for data, modes in pairs]
+            measured = [float(np.min(_most_of_power(data, modes, cells))) for data, modes in pairs]
             self.most_read_DN2 = min([*measured, math.inf if most_read_DN2 is None else most_read_DN2])
         # each series has a level of its own: weights begin from its mean
         self.weigh([np.full(data.size, max(float(np.mean(data)), 1e-12)) for data in self.data])
@@ -346,6 +368,7 @@ class _Problem:
             matrix[own, read] += of_read
             matrix[read, own] += of_read
             right[own] += weighted.T @ self.data[number]
+            matrix[own, own] += 1.0 / self.slow_sd_DN2[number] ** 2
         if gains is not None:
             centre, width = WHITE_FRACTION_PRIOR
             for group, gain in enumerate(gains):
@@ -386,6 +409,42 @@ class _Problem:
         """A + W (group,), DN."""
         return np.asarray(coefficients[: self.groups] + coefficients[self.groups : 2 * self.groups])
 
+    def learn_changes(self, normal: _Normal, inflation: float) -> None:
+        """Take from all pairs of series how far the beam's shape changes between two, which none of them exceeds by much.
+
+        A change is relative to the level, so that bright pairs tell what dim ones may hold. Each pair's coefficients E and F are
+        Gaussian about 0, with one standard deviation for all, relative to the level: its mean square over its posterior.
+
+        Args:
+            normal: normal equations with nothing known of the changes, all that else is fitted included.
+            inflation: what chi-square is divided by.
+        """
+        first = 2 * self.groups + 1
+        pairs = [
+            (number, [first + 2 * order, first + 2 * order + 1])
+            for order, number in enumerate(self.drifting)
+            if self.series[number].change_DN2 > 0
+        ]
+        if len(pairs) < _LEAST_CHANGES:
+            return
+        own = [place for _, both in pairs for place in both]
+        rest = [place for place in range(len(normal.right)) if place not in set(own)]
+        unit = np.repeat([self.series[number].change_DN2 for number, _ in pairs], 2)
+        others = _Normal(normal.matrix[np.ix_(rest, rest)], normal.right[rest], normal.square)
+        through = normal.matrix[np.ix_(own, rest)] @ others.covariance()
+        information = normal.matrix[np.ix_(own, own)] - through @ normal.matrix[np.ix_(rest, own)]
+        told = (normal.right[own] - through @ others.right) * unit
+        known, directions = np.linalg.eigh(information * np.outer(unit, unit) / inflation)
+        known, told = np.clip(known, 0.0, None), directions.T @ told / inflation
+        size = _CHANGE_SIZES[:, None] / math.sqrt(float(known[-1]))
+        raised = 1.0 + known * size**2
+        evidence = np.sum(0.5 * (told * size) ** 2 / raised - 0.5 * np.log(raised), axis=1)
+        # sizes are equally likely and stand at equal steps of their logarithm
+        weight = np.exp(evidence - evidence.max()) * size[:, 0]
+        mean_square = float(np.sum(weight * size[:, 0] ** 2) / weight.sum())
+        for number, _ in pairs:
+            self.slow_sd_DN2[number] = math.sqrt(mean_square) * self.series[number].change_DN2
+
     def reweight(self, spread: Spread, coefficients: FloatArray) -> None:
         """Weights from the fitted power: those from the measured one favour bins that came out low."""
         shapes = self.in_cells(spread)
@@ -400,7 +459,11 @@ class _Problem:
             if number in self.drifting:
                 place = read + 1 + 2 * self.drifting.index(number)
                 slow = _cells(item.square_px)[0] @ _slow(item.square_px)[:, usable(item.square_px)].T
-                power += slow @ coefficients[place : place + 2]
+                # a pair's own coefficients follow its noise, and weights that do so favour what came out low
+                known = np.isfinite(self.slow_sd_DN2[number])
+                power += slow @ (
+                    np.full(2, 0.5 * self.slow_sd_DN2[number]) if known else coefficients[place : place + 2]
+                )
             expected.append(np.maximum(power, 0.05 * np.minimum(data, float(np.mean(data)))))
         self.weigh(expected)
 
@@ -574,7 +637,21 @@ def _cores(problem: _Problem) -> dict[str, _Candidate]:
             found[family] = _fitted(problem, family, [found[family].theta] if family in found else _starts(family))
         best = min(found.values(), key=lambda item: _criterion(problem, item))
         problem.reweight(best.spread, best.coefficients)
+        _learn_changes(problem, found[_MOST_GENERAL])
     return {family: _fitted(problem, family, _starts(family)) for family in _CORES}
+
+
+def _learn_changes(problem: _Problem, item: _Candidate) -> None:
+    """What all pairs of series tell of slow changes, whatever the spread is near this one."""
+    problem.slow_sd_DN2[:] = math.inf
+    coefficients, chi_square = problem.solve(item.spread)
+    normal = problem.normal(
+        problem.in_cells(item.spread),
+        problem.gains(coefficients),
+        coefficients[: problem.groups],
+        _slopes(problem, item.family, item.theta, range(len(item.theta))),
+    )
+    problem.learn_changes(normal, max(1.0, chi_square / problem.independent))
 
 
 def _criterion(problem: _Problem, candidate: _Candidate) -> float:
@@ -588,7 +665,8 @@ def _criterion(problem: _Problem, candidate: _Candidate) -> float:
 
 def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _Candidate]]:
     """Spreads with this core, without a tail and with tails of all reaches, orders and shares, each with its prior probability."""
-    yield _NO_TAIL, core
+    if problem.no_tail > 0:
+        yield problem.no_tail, core
     families = [family for family, (model, *_, names) in _FAMILIES.items() if set(names) == {*core.names, *_TAIL}]
     for family in families:
         names = _FAMILIES[family][2]
@@ -596,11 +674,11 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
         for reach_mass, best in _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             if variance <= 0.0:
-                yield (1.0 - _NO_TAIL) * reach_mass / len(families), best
+                yield (1.0 - problem.no_tail) * reach_mass / len(families), best
                 continue
             sd = min(math.sqrt(variance), _MOST_SD)
             for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
-                density = (1.0 - _NO_TAIL) * _share_density(share)
+                density = (1.0 - problem.no_tail) * _share_density(share)
                 mass = width * density * reach_mass / len(families)
                 yield mass, _with_share(problem, best, share_at, share)
 
@@ -655,7 +733,7 @@ def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
     cores = _cores(problem)
     collecting = [item for item in cores.values() if item.spread.model == "aperture"]
     core = min(collecting, key=lambda item: _criterion(problem, item))
-    found = [(1.0, item) for item in cores.values() if item.spread.model != "aperture"]
+    found = [(2.0 * problem.no_tail, item) for item in cores.values() if item.spread.model != "aperture"]
     found += _with_tails(problem, core)
     lit = [(mass, item) for mass, item in found if mass > 0 and np.all(item.coefficients[: problem.groups] > 0)]
     return [
@@ -669,6 +747,7 @@ def fit_spread(
     *,
     group: Sequence[int],
     most_read_DN2: float | None = None,
+    screen: bool = False,
 ) -> SpreadFit:
     """Spread, gains and read noise from the noise power of series (weighted least squares, weights from the fit itself).
 
@@ -682,6 +761,7 @@ def fit_spread(
         series: noise powers, darks included (signal 0).
         group: per series, the index of its kV and filter; -1 for darks.
         most_read_DN2: read variance that the darks allow at most, where they were not repeated; 0: there is none.
+        screen: whether a screen is known to spread light.
 
     Raises:
         FitError: no series with signal, or the least-squares problem has no solution.
@@ -692,7 +772,7 @@ def fit_spread(
     """
     if not any(index >= 0 for index in group):
         raise FitError("the noise fit needs at least one flat series with two or more frames")
-    fit = _fit_of(series, group, most_read_DN2)
+    fit = _fit_of(series, group, most_read_DN2, screen)
     degrees = len(series) - len(fit.gain_DN) - 1
     scatter = 0.0
     for _ in range(_MOST_ROUNDS):
@@ -705,15 +785,16 @@ def fit_spread(
             [replace(item, modes=share * item.modes) for item, share in zip(series, shares, strict=True)],
             group,
             most_read_DN2,
+            screen,
         )
         sampling = zip(fit.series_ratio, shares, strict=True)
         fit = replace(fit, series_ratio=tuple((ratio, sd * math.sqrt(share)) for (ratio, sd), share in sampling))
     return fit
 
 
-def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None) -> SpreadFit:
+def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None, screen: bool) -> SpreadFit:
     """`fit_spread` with series that are believed as far as their modes say."""
-    problem = _Problem(series, group, most_read_DN2)
+    problem = _Problem(series, group, most_read_DN2, screen=screen)
     members = _members(problem)
     drifting = _drifting(problem, _likeliest(members))
     if drifting != problem.drifting:
@@ -1027,8 +1108,10 @@ def _other_route(problem: _Problem, item: _Candidate, expected: Sequence[FloatAr
 
 
 def _line_variances(series: Sequence[NoisePower], group: Sequence[int]) -> tuple[float, float, float]:
-    """Variance of rows' and of columns' offsets in the darks (DN^2), and its standard deviation; 0 without repeated darks."""
+    """Variance of rows' and of columns' offsets (DN^2), and its standard deviation: from repeated darks, else from pairs of single
+    flats; 0 without either."""
     darks = [item for item, number in zip(series, group, strict=True) if number < 0]
+    darks = darks or [item for item in series if item.between_series]
     if not darks:
         return 0.0, 0.0, 0.0
     found, sds = [], []

@@ -183,6 +183,27 @@ def test_single_averaged_flats_at_two_levels_hold_the_noise_of_one_exposure():
     assert abs(found) < 4.0 / math.sqrt(6 * weight.sum()) + 0.003
 
 
+def test_flats_no_brighter_than_their_noise_are_divided_by_the_beams_shape_and_not_by_themselves():
+    rng = np.random.default_rng(8)
+    level, count = 3.0, 20
+    gain = 1.0 + 0.02 * rng.standard_normal(SHAPE)
+    found, alone = [], []
+    for seed in range(4):
+        flats = [
+            gain * frames_of(count, seed=300 + 2 * seed + part, level=level / SIGNAL * LEVEL).mean(axis=0)
+            for part in (0, 1)
+        ]
+        known = {"exposures": (count, count), "dark_exposures": (0, 0), "same_dark": True, "good": np.ones(SHAPE, bool)}
+        found.append(compute_difference_power(*flats, shape=gain, **known))
+        alone.append(compute_difference_power(*flats, **known))
+    expected = smeared(GAIN * found[0].signal_DN * SPREAD.noise_power(found[0].square_px) + READ_DN2)
+    misfits = [
+        float(np.mean([np.nanmean(item.power_DN2 / expected) for item in items])) - 1.0 for items in (found, alone)
+    ]
+    assert abs(misfits[0]) < 4.0 / np.sqrt(4 * found[0].modes.sum()) + 0.01
+    assert misfits[1] > 0.2
+
+
 def test_correlation_of_neighbours_is_that_of_the_spread_and_its_interval_holds_it():
     found = compute_noise_power([frames_of(20)], signal_DN=LEVEL, good=np.ones(SHAPE, bool))
     quanta = GAIN * SIGNAL * SPREAD.noise_power(found.square_px)

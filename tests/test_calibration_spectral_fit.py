@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import binom, truncnorm
+from scipy.stats import binom
 
 from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, filters_from_text
 from raytwin.calibration import spectral_fit
-from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY
+from raytwin.calibration.priors import GAIN_DISCREPANCY, LEVEL_DISCREPANCY, draw_parameters
 from raytwin.calibration.spectral_fit import (
     OTHER_SCINTILLATOR,
     SHAPE_PARAMETERS,
@@ -48,11 +48,7 @@ def model():
 
 def from_prior(model, rng):
     """One parameter set drawn from the priors."""
-    values = []
-    for prior in priors_for(model, scintillator_declared=True).values():
-        low, high = (prior.low - prior.centre) / prior.sd, (prior.high - prior.centre) / prior.sd
-        values.append(prior.centre + prior.sd * truncnorm.rvs(low, high, random_state=rng))
-    full = np.array(values)
+    full = draw_parameters(priors_for(model, scintillator_declared=True), 1, rng)[0]
     full[model.names.index("log_DN_per_keV")] = math.log(0.1)
     return full
 
@@ -441,3 +437,20 @@ def test_an_unknown_gain_carries_no_weight(model):
         object.__setattr__(levels[-1], "photon_transfer_slope_DN", wide)
     posterior = fit_spectrum(levels, INSTRUMENT, rng=np.random.default_rng(0)).posterior
     assert np.std(posterior.column("log_DN_per_keV")) > 0.2
+
+
+@pytest.mark.parametrize("ripple", [0.0, 0.11])
+def test_a_voltage_that_ripples_is_met_by_its_mean_and_variance_together(model, ripple):
+    """Mean and variance of a sine's dip, as far as two voltages tell them; the level at a third one lies in its interval."""
+    truth = typical(model, kV_error=0.003 - 0.5 * ripple, kV_variance=ripple**2 / 8.0, inherent_filtration_mm_Al=1.2)
+    posterior = fit_spectrum(levels_of(model, truth, BEAMS), INSTRUMENT, rng=np.random.default_rng(8)).posterior
+    error, variance = posterior.column("kV_error"), posterior.column("kV_variance")
+    # what the voltage lacks in the mean, beyond how well it is set, is its ripple
+    own = error + 0.5 * np.sqrt(8.0 * variance)
+    assert abs(np.mean(own)) < 0.01 and np.std(own) < 0.012
+    assert np.corrcoef(error, variance)[0, 1] < -0.5
+    for new in (OpenBeam(kV=60.0, filters=filters_from_text("Cu:0.05")), OpenBeam(kV=90.0, filters=())):
+        draws = np.log(model.signal(posterior.samples, new).rate_DN_per_mAs)
+        exact = float(np.log(model.signal(truth[None, :], new).rate_DN_per_mAs[0]))
+        low, high = np.quantile(draws, [0.025, 0.975])
+        assert low < exact < high

@@ -1,10 +1,12 @@
 """Spread, gains and read noise from noise power: within their own standard deviations, whatever the kernel is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from raytwin.calibration.noise_power import compute_noise_power
+from raytwin.calibration.noise_power import compute_difference_power, compute_noise_power
 from raytwin.calibration.spread_fit import fit_spread
 from raytwin.errors import FitError
 from raytwin.generator.spread.noise import sample_frame_noise
@@ -134,6 +136,62 @@ def test_a_kernel_of_no_family_widens_the_gain_s_interval_until_it_holds_the_tru
     fit = fit_spread(series, group=[*groups, -1])
     assert abs(fit.gain_DN[0] - 3.0) < 2.5 * fit.gain_sd_DN[0]
     assert fit.gain_DN[0] == pytest.approx(3.0, rel=0.08)
+
+
+def pairs_of_flats(spread, *, change, seed, told):
+    """Noise powers of single flats in pairs, their read variance brought to one exposure's; change: of the beam's shape, rms.
+
+    Args:
+        told: whether a pair knows what a change of the shape would add to it.
+    """
+    rng = np.random.default_rng(seed)
+    found = []
+    side = 64
+    smooth = np.add.outer(np.arange(SHAPE[0]), 0.7 * np.arange(SHAPE[1])) / 40.0
+    for level in (50.0, 400.0, 2000.0):
+        for _ in range(2):
+            count = 20
+            mean = np.full(SHAPE, level)
+            noise = {"gain_DN": 10.0, "white_fraction": WHITE, "read_variance_DN2": READ_DN2, "rng": rng}
+            flats = []
+            for _ in range(2):
+                shape = 1.0 + np.sqrt(2.0) * change * np.sin(smooth * rng.uniform(2.0, 4.0) + rng.uniform(0.0, 6.0))
+                drawn = [sample_frame_noise(mean, spread=spread, **noise) for _ in range(count)]
+                flats.append(level * shape + np.mean(drawn, axis=0))
+            power = compute_difference_power(
+                *flats,
+                exposures=(count, count),
+                dark_exposures=(0, 0),
+                same_dark=True,
+                good=GOOD,
+                side=side,
+                shape=np.ones(SHAPE),
+            )
+            found.append(power if told else replace(power, change_DN2=0.0))
+    return found
+
+
+def test_bright_pairs_tell_how_much_of_dim_ones_is_a_change_of_the_beam():
+    """Changes are relative to the level: dim pairs then show the tail that free changes of each pair would hide."""
+    spread = SPREADS["exponential tail"]
+    fits = [
+        fit_spread(pairs_of_flats(spread, change=0.003, seed=3, told=told), group=[0] * 6, screen=True)
+        for told in (True, False)
+    ]
+    for fit in fits:
+        assert abs(fit.gain_DN[0] - 10.0) < 3.0 * fit.gain_sd_DN[0]
+    assert fits[0].gain_sd_DN[0] < 0.8 * fits[1].gain_sd_DN[0]
+
+
+def test_a_screen_is_never_taken_for_one_without_a_tail():
+    """Frames too small to show a tail leave it open; its core is then not known better than that."""
+    spread = Spread(sigma_px=0.7, tail_share=0.15, tail_px=1.0)
+    series = powers(spread, seed=5, count=4)
+    screen, other = (fit_spread(series, group=GROUPS, screen=declared) for declared in (True, False))
+    assert abs(screen.sigma_px - 0.7) < 3.0 * screen.sigma_sd_px
+    assert screen.family.endswith(("tail", "layer")) and screen.spread.tail_share > 0
+    assert any("tail" not in family for family in other.criteria)
+    assert not any("tail" not in family for family in screen.criteria)
 
 
 def test_darks_alone_cannot_give_a_gain():

@@ -1,11 +1,12 @@
 """Calibration against the truth of the virtual lab: errors, and how often the stated 95 % intervals hold the truth.
 
     python validation/calibration_coverage.py [--seeds 40] [--first 0] [--size 64] [--frames 20] [--json FILE]
-        [--sessions FOLDER] [--protocol calibration] [--family NAME]... [--leave-out NAME]... [--no-unkindness]
+        [--sessions FOLDER] [--protocol two_voltages] [--family NAME]... [--leave-out NAME]... [--no-unkindness]
 
 Each seed is another hidden system with its unkindness, drawn from all families of tubes and detectors, from those that
-`--family` names alone (none: the plain line), or from all but those that `--leave-out` names. Flats are stored frame by
-frame, or as averages (`--protocol averaged`, `averaged_pairs`). A system that could not be calibrated is a row of its own:
+`--family` names alone (none: the plain line), or from all but those that `--leave-out` names. Protocols say which flats
+calibrate (40 and 90 kV behind 0.05 mm Cu; these and 1 mm Al; these and 60 kV; 90 kV alone), the others being predicted; or
+that flats are stored as averages, once or in pairs. A system that could not be calibrated is a row of its own:
 what is not answered covers nothing. `z` is (answer - truth) over the interval's half width / 1.96: its spread should be
 1 where only sampling noise is at work and below 1 where the interval carries systematic uncertainty. `predicted` rows
 compare predictions at settings that the calibration never saw with the lab's noise-free expectation, `validate` rows
@@ -18,6 +19,7 @@ import math
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from scipy.stats import beta
 from tqdm import tqdm
 
 from raytwin.acquisition import open_acquisition
+from raytwin.acquisition.setting import text_from_filters
 from raytwin.calibration.calibrate import calibrate_twin, calibration_answer
 from raytwin.calibration.validate import validate_twin
 from raytwin.errors import InputError, RaytwinError
@@ -35,6 +38,39 @@ from raytwin.lab.families import FAMILIES
 from raytwin.lab.protocols import run_protocol, truth_path
 from raytwin.lab.unkindness import NONE
 
+# beams that calibrate; the lab's session is the same for all of them
+COPPER = "Cu:0.05"
+PROTOCOLS: dict[str, tuple[tuple[float, str], ...]] = {
+    "two_voltages": ((40.0, COPPER), (90.0, COPPER)),
+    "foils": ((40.0, COPPER), (90.0, COPPER), (40.0, "Al:1"), (90.0, "Al:1")),
+    "three_voltages": ((40.0, COPPER), (60.0, COPPER), (90.0, COPPER)),
+    "one_voltage": ((90.0, COPPER),),
+}
+
+
+class Part:
+    """A session whose flats calibrate where their beam is among some; of beams that are not, one series of each is predicted."""
+
+    def __init__(self, acquisition: Any, beams: tuple[tuple[float, str], ...]) -> None:
+        self.path, self.instrument, self.scenes = acquisition.path, acquisition.instrument, acquisition.scenes
+        kept: list[Any] = []
+        longest: dict[tuple[float, str], Any] = {}
+        for item in acquisition.series:
+            beam = (item.kV, text_from_filters(item.filters))
+            if item.kind != "flat" or (beam in beams and item.role == "calibration"):
+                kept.append(item)
+            elif beam in beams and beam not in {(40.0, COPPER), (90.0, COPPER)}:
+                kept.append(replace(item, role="calibration"))
+            elif item.role == "evaluation":
+                kept.append(item)
+            else:
+                longest[beam] = replace(item, role="evaluation")
+        self.series = tuple(sorted([*kept, *longest.values()], key=lambda item: item.index))
+
+    def of_kind(self, *kinds: str) -> tuple[Any, ...]:
+        """Series of some kinds."""
+        return tuple(item for item in self.series if item.kind in kinds)
+
 
 def measure_seed(
     seed: int,
@@ -42,7 +78,7 @@ def measure_seed(
     size: int,
     frames: int,
     sessions: Path | None = None,
-    protocol: str = "calibration",
+    protocol: str = "two_voltages",
     families: tuple[str, ...] | None = None,
     unkind: bool = True,
 ) -> list[dict[str, Any]]:
@@ -55,14 +91,15 @@ def measure_seed(
 
     with tempfile.TemporaryDirectory() as folder:
         drawn = "all" if families is None else "_".join(families) or "none"
-        name = f"{protocol}_{seed}_{size}_{frames}_{drawn}{'' if unkind else '_plain'}.h5"
+        session = "calibration" if protocol in PROTOCOLS else protocol
+        name = f"{session}_{seed}_{size}_{frames}_{drawn}{'' if unkind else '_plain'}.h5"
         path = (sessions or Path(folder)) / name
         if truth_path(path).exists():
             truth = json.loads(truth_path(path).read_text(encoding="utf-8"))
         else:
             truth = run_protocol(
                 path,
-                protocol=protocol,
+                protocol=session,
                 seed=seed,
                 rows=size,
                 columns=size,
@@ -70,7 +107,8 @@ def measure_seed(
                 families=families,
                 unkindness=None if unkind else NONE,
             )
-        with open_acquisition(path) as acquisition:
+        with open_acquisition(path) as whole:
+            acquisition: Any = Part(whole, PROTOCOLS[protocol]) if protocol in PROTOCOLS else whole
             twin = calibrate_twin(acquisition, rng=np.random.default_rng(seed))
             try:
                 compared = validate_twin(twin, acquisition).rows
@@ -185,7 +223,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--sessions", type=Path, help="folder where lab sessions are kept for the next run")
-    parser.add_argument("--protocol", default="calibration", choices=("calibration", "averaged", "averaged_pairs"))
+    parser.add_argument("--protocol", default="two_voltages", choices=(*PROTOCOLS, "averaged", "averaged_pairs"))
     parser.add_argument("--family", action="append", help="draw from these families alone; none: the plain line")
     parser.add_argument("--leave-out", action="append", default=[], help="families not to draw from")
     parser.add_argument("--no-unkindness", action="store_true")

@@ -55,6 +55,8 @@ from raytwin.calibration.priors import (
     PRIORS,
     SHARES_CORRELATION,
     TABLE_SHARE,
+    draw_parameters,
+    spread_of,
 )
 from raytwin.generator.line.twin import Twin
 from raytwin.generator.predictions.predict import predict_flatfield
@@ -262,7 +264,7 @@ def prior_sd() -> dict[str, float]:
         "light depth": "light_depth_slope",
     }
     return {
-        **{name: PRIORS[parameter].spread for name, parameter in of_twin.items()},
+        **{name: spread_of(PRIORS[parameter]) for name, parameter in of_twin.items()},
         "scale": 20.0,
         **{f"{material} {what}": sd for material in ("Al", "Cu") for what, sd in tables.items()},
     }
@@ -275,6 +277,12 @@ def prior_covariance(names: Sequence[str]) -> Array:
     for material in ("Al", "Cu"):
         first, second = names.index(f"{material} first table"), names.index(f"{material} second table")
         covariance[first, second] = covariance[second, first] = SHARES_CORRELATION * TABLE_SHARE.sd**2
+    # a ripple takes from the voltage's mean and adds to its variance
+    both = names.index("voltage"), names.index("voltage variance")
+    drawn = draw_parameters(
+        {name: PRIORS[name] for name in ("kV_error", "kV_variance")}, 100_000, np.random.default_rng(0)
+    )
+    covariance[np.ix_(both, both)] = np.cov(drawn.T)
     return covariance
 
 

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLARED_SCINTILLATOR
+from ...calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLARED_SCINTILLATOR, spread_of
 from ...generator.effects import EFFECTS, AppliedEffect, Effect
 from ...generator.effects.effect import Parameter
 from ...generator.line.twin import Estimate, SpectralPosterior, Twin
@@ -259,7 +259,7 @@ def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
     """
     result = []
     for name in posterior.names:
-        sd = PRIORS.get(name, ATTENUATION_SCALE).spread
+        sd = spread_of(PRIORS.get(name, ATTENUATION_SCALE))
         if name == "log_scintillator_thickness" and "not declared" in str(posterior.prior.get(name, "")):
             sd = UNDECLARED_SCINTILLATOR.sd
         if name in ("log_output", "log_DN_per_keV"):

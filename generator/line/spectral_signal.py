@@ -357,6 +357,15 @@ class SpectralModel:
         """Half of kV^2 d2 Phi / d kV2 (draw, energy), over a step on both sides."""
         return self._fluence_of_nodes(kV, _second_difference_shares(kV_error), top)
 
+    def _varying_fluence(
+        self, kV: float, kV_error: NDArray[np.float64], variance: NDArray[np.float64], top: int
+    ) -> NDArray[np.float64]:
+        """The same (draw, energy) where the voltage varies by a relative variance (draw, 1)."""
+        if not np.any(variance):
+            return self._fluence_at(kV, kV_error, top)
+        shares = _node_shares(_KV_ERRORS, kV_error) + variance * _second_difference_shares(kV_error)
+        return self._fluence_of_nodes(kV, shares, top)
+
     def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
         usual = float(np.max(self._kV_error(samples, beam.kV), initial=0.0)) <= _USUAL_KV_ERROR
@@ -661,7 +670,8 @@ class SpectralModel:
             elif name in {"kV_tilt", "kV_variance"}:
                 if name == "kV_tilt":
                     above, below = (
-                        self._fluence_at(beam.kV, kV_error + step, top) for step in (_TILT_STEP, -_TILT_STEP)
+                        self._varying_fluence(beam.kV, kV_error + step, variance, top)
+                        for step in (_TILT_STEP, -_TILT_STEP)
                     )
                     moved_photons = behind * (above - below)
                     scale = math.log(beam.kV / REFERENCE_KV) / (2.0 * _TILT_STEP)

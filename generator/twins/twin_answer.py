@@ -120,21 +120,22 @@ def twin_table(twin: Twin) -> Table:
 
 
 def equivalent_filtration(spectral: SpectralPosterior, *, seen_by_detector: bool = True) -> Estimate:
-    """Filtration that nobody declared, as mm of aluminium: aluminium itself, the metal of a rough anode, the detector's cover.
+    """Filtration that nobody declared, as mm of aluminium: aluminium itself, the metal of a rough anode, the detector's cover, and
+    scintillator that gives no light.
 
     Measurements tell the sum of these, hardly its parts. Layers count by their attenuation at 30 keV, where a beam of 40 to
     60 kV behind thin filters has its mean energy.
 
     Args:
         spectral: the posterior of a line or of a tube.
-        seen_by_detector: False: without the detector's cover, which a dosimeter does not see.
+        seen_by_detector: False: without what lies in front of the detector, which a dosimeter does not see.
 
     Returns:
         Median and 95 % interval, mm Al.
     """
     layers = [("anode_roughness_um", spectral.anode, 1e-3)]
     if seen_by_detector:
-        layers.append(("cover_mm_C", "C", 1.0))
+        layers += [("cover_mm_C", "C", 1.0), ("dead_layer_um", spectral.scintillator[0].material, 1e-3)]
     total = spectral.column("inherent_filtration_mm_Al").copy()
     for name, material, unit_mm in layers:
         if name in spectral.names:

@@ -394,6 +394,8 @@ def reads_on(self, name, default=None):
         pass
 h5py.AttributeManager.get = reads_on
 _hdf5._ATTRIBUTE_S = 0.5
+from raytwin.generator.twins import twin_io
+twin_io._READING_S = 2.0
 from raytwin.cli import main
 sys.argv = ["raytwin", *sys.argv[1:]]
 sys.exit(main())
@@ -401,13 +403,14 @@ sys.exit(main())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes cannot be copied there")
-def test_a_library_that_reads_on_without_end_is_one_line_too(files):
-    command = [sys.executable, "-c", ENDLESS, "check", str(files["session"])]
+@pytest.mark.parametrize("kind", ["session", "twin"])
+def test_a_library_that_reads_on_without_end_is_one_line_too(files, kind):
+    command = [sys.executable, "-c", ENDLESS, "check", str(files[kind])]
     died = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert died.returncode == 2
     assert died.stdout == ""
     (line,) = died.stderr.splitlines()
-    assert "session.h5" in line and "without end" in line
+    assert files[kind].name in line and "without end" in line
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes cannot be copied there")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._guard import bounded
 from ...acquisition.instrument import LAYER_FIELDS, Instrument
 from ...acquisition.setting import filters_from_text, text_from_filters
 from ...errors import FileFormatError, InputError
@@ -35,6 +36,7 @@ from ..spread.psf import Spread
 
 FORMAT = "raytwin-twin"
 VERSION = 1
+_READING_S = 20.0  # of processor time, for what takes a second or two: at some damaged files HDF5 reads on without end
 _LARGEST_EXPONENT = math.log(sys.float_info.max)
 TUBE = "tube"
 _SDS_OF_EFFECTS = ("strength_sd", "law_sd")
@@ -199,7 +201,7 @@ def read_any_twin(path: str | os.PathLike[str]) -> Twin | TubeTwin:
 
     if not os.path.isfile(path):
         raise FileFormatError("twin", received=path, expected="an existing file that `raytwin calibrate` wrote")
-    with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file:
+    with open_hdf5(path, what="a twin file that `raytwin calibrate` wrote") as file, bounded(_READING_S):
         try:
             found = (_text(file.attrs.get("format", "no format")), int(file.attrs.get("version", 0)))
             if found != (FORMAT, VERSION):

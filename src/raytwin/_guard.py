@@ -24,16 +24,21 @@ _is_copy = False
 def bounded(seconds: float) -> Iterator[None]:
     """End the copy that runs a command if the block takes more processor time (s); nothing where there is no copy.
 
-    For calls into a library that holds the interpreter: no handler in Python would be asked.
+    For calls into a library that holds the interpreter: no handler in Python would be asked. A block within another counts for
+    both.
     """
     if not _is_copy:
         yield
         return
-    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    outer = signal.getitimer(signal.ITIMER_VIRTUAL)[0]
+    own = min(seconds, outer) if outer > 0 else seconds
+    signal.setitimer(signal.ITIMER_VIRTUAL, own)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        left = signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)[0]
+        if outer > 0:
+            signal.setitimer(signal.ITIMER_VIRTUAL, max(outer - (own - left), 1e-3))
 
 
 def code_of_child(words: Sequence[str]) -> int | None:

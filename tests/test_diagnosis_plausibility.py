@@ -296,7 +296,7 @@ def test_inherent_filtration_is_what_flats_behind_two_filters_have():
     # nothing to tell it by: what is usual, and what may be
     alone = _inherent_mm_Al([bare, flat("other", 60.0, ("Cu:0.1",), 10.0)], maps)
     assert alone[0] == 1.0
-    assert (min(alone), max(alone)) == (0.0, 3.0)
+    assert (min(alone), max(alone)) == (0.0, 4.0)  # two prior standard deviations
 
 
 def test_paths_that_a_harder_beam_would_make_right_are_no_fault_of_the_maps():

@@ -284,7 +284,7 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
     item = SimpleNamespace(
         series=stated,
         name="wedge_80kV",
-        request=SimpleNamespace(beam_on=True, source_object_mm=None),
+        request=SimpleNamespace(beam_on=True, source_object_mm=None, exposure_ms=20.0),
         own_noise=False,
         divided=False,
         calibrates=True,
@@ -311,6 +311,8 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         return local_nuisances(probes, signal, {"Al": (thinner, {})}, sharp=False, beams_differ=beams_differ)
 
     usual, wider = columns(1.0), columns(3.0)
+    # all exposures 20 us longer or shorter than stated
+    np.testing.assert_allclose(usual["length of exposures"], 0.02 / 20.0 * signal.ravel())
     name = "hardness at 80 kV behind Al"
     assert name not in usual
     of_beam = 3.0 * scales.ATTENUATION_OF_BEAM_SD / scales.THICKNESS_SD

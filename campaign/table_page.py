@@ -18,9 +18,11 @@ from ..reports import (
     Step,
 )
 from ..reports.chart import Shape
+from .lab_line import REFERENCE_MS
 from .table import WIDE, signed
 
 _DASH = "–"
+_WORDS = {"equivalent": "equivalent", "different": "different", "not_stated": "not stated"}
 _KINDS: tuple[tuple[str, str, str, Shape], ...] = (
     ("measured", "measured test images", MEASURED, "square"),
     ("generated", "generated test images", AFTER, "circle"),
@@ -36,7 +38,7 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
     notes = _notes(result)
     return ResultPage(
         heading="Contrast at POD 90 %, generated against measured",
-        answer=_answer(pairs, margin, pending=pending),
+        answer=_answer(result, pairs),
         key_figures=tuple(_key_figure(row) for row in pairs),
         proof=(a90_chart(rows), difference_chart(pairs, margin=margin)) if pairs else (),
         steps=() if not pending else (Step(text="Go on where this run stopped.", command="raytwin table -o FOLDER"),),
@@ -50,6 +52,7 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
                     " products without bone reach, measured ones for measured images, generated ones for generated images.",
                 ),
                 table=_table(rows),
+                items=tuple(_equivalence(row["compare"], _exposure(row)) for row in pairs),
             ),
             Section(title="False alarms", text=_alarm_text(plan), table=_alarms(pairs)),
             Section(
@@ -65,21 +68,21 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
     )
 
 
-def _answer(pairs: Sequence[Mapping[str, Any]], margin: float, *, pending: Sequence[float]) -> tuple[str, ...]:
+def _answer(result: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    margin = result["plan"]["margin"]
     lines = []
-    if pending:
-        told = ", ".join(f"{exposure:g} ms" for exposure in pending)
-        lines.append(f"This table is not finished. Still to come: {told}.")
-    same = [row for row in pairs if row["compare"]["verdict"].startswith("equivalent")]
-    apart = [row for row in pairs if row["compare"]["verdict"].startswith("different")]
-    open_ = [row for row in pairs if row not in same and row not in apart]
-    for found, text in (
-        (same, f"Generated and measured test images give the same a90 within {margin:g} at"),
-        (apart, f"They differ by more than {margin:g} allows at"),
-        (open_, f"These test sets cannot say whether both agree within {margin:g} at"),
+    if result["pending"]:
+        lines.append(f"This table is not finished. Still to come: {_exposures(result['pending'])}.")
+    if result["published_pending"]:
+        lines.append(f"Images generated as published are still to come at {_exposures(result['published_pending'])}.")
+    for state, text in (
+        ("equivalent", f"Generated and measured test images give the same a90 within {margin:g} at"),
+        ("different", "Generated and measured test images give different a90 at"),
+        ("not_stated", f"These test sets cannot say whether both agree within {margin:g} at"),
     ):
+        found = [row["exposure_ms"] for row in pairs if row["compare"]["equivalence"] == state]
         if found:
-            lines.append(f"{text} {', '.join(_exposure(row) for row in found)}.")
+            lines.append(f"{text} {_exposures(found)}.")
     return tuple(lines)
 
 
@@ -129,7 +132,7 @@ def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Ch
         x=[row["exposure_ms"] for row in known],
         y=[one["value"] for one in found],
         y_ends=(ends[0], ends[1]),
-        names=[f"{_exposure(row)}: {row['compare']['verdict']}" for row in known],
+        names=[_equivalence(row["compare"], _exposure(row)) for row in known],
         label="difference of a90",
     )
     return Chart(
@@ -194,7 +197,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
                 _interval(row["generated"]),
                 _interval(row["measured"]),
                 _signed(difference),
-                _DASH if compared is None else str(compared["verdict"]),
+                _DASH if compared is None else _WORDS[compared["equivalence"]],
                 _hits(row["generated"]),
                 _hits(row["measured"]),
             )
@@ -205,7 +208,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
             "generated",
             "measured",
             "difference",
-            "equivalence",
+            "agree",
             "found, generated",
             "found, measured",
         ),
@@ -251,7 +254,7 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
             _interval(row["published"]["generated"]),
             _interval(row["published"]["measured"]),
             _signed(row["published"]["compare"]["difference_a90"] or {}),
-            str(row["published"]["compare"]["verdict"]),
+            _WORDS[row["published"]["compare"]["equivalence"]],
         )
         for row in pairs
         if row["published"]
@@ -263,10 +266,11 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
             " and on the measured ones.",
         ),
         table=SortedTable(
-            header=("exposure", "generated as published", "measured", "difference", "equivalence"),
+            header=("exposure", "generated as published", "measured", "difference", "agree"),
             rows=tuple(rows),
             words=frozenset({0, 4}),
         ),
+        items=tuple(_equivalence(row["published"]["compare"], _exposure(row)) for row in pairs if row["published"]),
     )
 
 
@@ -339,7 +343,15 @@ def _end(curve: Mapping[str, Any], name: str) -> float:
 
 
 def _exposure(row: Mapping[str, Any]) -> str:
-    return "1 s" if row["exposure_ms"] == 1000.0 else f"{row['exposure_ms']:g} ms"
+    return _exposures([row["exposure_ms"]])
+
+
+def _exposures(values: Sequence[float]) -> str:
+    return ", ".join("1 s" if value == REFERENCE_MS else f"{value:g} ms" for value in values)
+
+
+def _equivalence(compared: Mapping[str, Any], exposure: str) -> str:
+    return f"{exposure}: {_WORDS[compared['equivalence']]}, for {compared['reason']}."
 
 
 def _number(value: float | None) -> str:

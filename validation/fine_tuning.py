@@ -201,7 +201,7 @@ def until_usable(rows: list[dict]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("build/fine_tuning"))
-    parser.add_argument("--networks", type=int, default=2, help="of each start and length (2)")
+    parser.add_argument("--networks", type=int, default=3, help="of each start and length (3)")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     folder = options.output

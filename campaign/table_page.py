@@ -50,6 +50,7 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
                     " networks find the same products, the interval is clustered by both (see the notes).",
                     f"Each network marks at the threshold that {100 * plan['alarm_share']:g} % of the {plan['line']['boneless']}"
                     " products without bone reach, measured ones for measured images, generated ones for generated images.",
+                    "Found: looks at products with a bone in which it was marked, in generated | measured images.",
                 ),
                 table=_table(rows),
                 items=tuple(_equivalence(row["compare"], _exposure(row)) for row in pairs),
@@ -123,8 +124,8 @@ def a90_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
 
 def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Chart:
     """Generated less measured a90 with its 95 % interval, and the margin."""
-    known = [row for row in pairs if (row["compare"]["difference_a90"] or {}).get("value") is not None]
-    found = [row["compare"]["difference_a90"] for row in known]
+    known = [row for row in pairs if _difference(row["compare"]).get("value") is not None]
+    found = [_difference(row["compare"]) for row in known]
     ends = tuple([one["value"] if one[name] is None else one[name] for one in found] for name in ("low", "high"))
     exposures = [row["exposure_ms"] for row in pairs]
     reach = 1.1 * max([2.0 * margin, *(abs(value) for values in ends for value in values)])
@@ -190,7 +191,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
     shown = []
     for row in rows:
         compared = row["compare"]
-        difference = {} if compared is None else compared["difference_a90"] or {}
+        difference = {} if compared is None else _difference(compared)
         shown.append(
             (
                 _exposure(row),
@@ -198,8 +199,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
                 _interval(row["measured"]),
                 _signed(difference),
                 _DASH if compared is None else _WORDS[compared["equivalence"]],
-                _hits(row["generated"]),
-                _hits(row["measured"]),
+                f"{_hits(row['generated'])} | {_hits(row['measured'])}",
             )
         )
     return SortedTable(
@@ -209,8 +209,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
             "measured",
             "difference",
             "agree",
-            "found, generated",
-            "found, measured",
+            "found",
         ),
         rows=tuple(shown),
         words=frozenset({0, 4}),
@@ -253,7 +252,7 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
             _exposure(row),
             _interval(row["published"]["generated"]),
             _interval(row["published"]["measured"]),
-            _signed(row["published"]["compare"]["difference_a90"] or {}),
+            _signed(_difference(row["published"]["compare"])),
             _WORDS[row["published"]["compare"]["equivalence"]],
         )
         for row in pairs
@@ -366,12 +365,20 @@ def _interval(curve: Mapping[str, Any] | None) -> str:
     return f"{_number(curve['a90'])} ({_number(ends['low'])} to {_number(ends['high'])}){wide}"
 
 
+def _difference(compared: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Difference of the two a90; without its interval where that may be too narrow."""
+    found = dict(compared["difference_a90"] or {})
+    return found | {"low": None, "high": None} if found and compared["correlation_at_bound"] else found
+
+
 def _signed(difference: Mapping[str, Any]) -> str:
     if difference.get("value") is None:
         return _DASH
+    if difference["low"] is None and difference["high"] is None:
+        return signed(difference["value"])
     ends = (_DASH if difference[end] is None else signed(difference[end]) for end in ("low", "high"))
     return f"{signed(difference['value'])} ({' to '.join(ends)})"
 
 
 def _hits(curve: Mapping[str, Any] | None) -> str:
-    return _DASH if curve is None else f"{curve['n_hits']} of {curve['n']}"
+    return _DASH if curve is None else str(curve["n_hits"])

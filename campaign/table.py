@@ -119,6 +119,14 @@ def plan_of(*, exposures_ms: Sequence[float] = PAPER_EXPOSURES_MS, line: Mapping
     return TablePlan(line=made, **words)
 
 
+_KINDS = ("measured", "generated")
+# verdict of two one-sided tests -> what a row states; a difference within the margin is equivalence
+_STATES = {
+    "equivalent": "equivalent",
+    "different within the margin": "equivalent",
+    "different": "different",
+    "inconclusive": "not_stated",
+}
 # recipe of the images -> what networks learn from and are tried on, and what its files' names begin with
 _ARMS = {"raytwin": ("train", "test", ""), "published": ("published_train", "published", "published_")}
 
@@ -236,7 +244,7 @@ class _Work:
         tried = write_generated(self.chain, self.plan.line, exposure, test)
         networks = f"{mark}networks_{number}"
         self._train(learnt, networks)
-        names = {kind: f"{mark}{kind}_{number}" for kind in ("measured", "generated")}
+        names = {kind: f"{mark}{kind}_{number}" for kind in _KINDS}
         curves = {
             kind: self._curve(_Trial(name=names[kind], networks=networks, images=images))
             for kind, images in (("measured", f"real_{number}.h5"), ("generated", tried))
@@ -298,9 +306,23 @@ class _Work:
         ]
         found = self.chain.step_or_reason(name, [*words, "--size-margin", f"{self.plan.margin:g}"])
         kept = {
-            key: found.get(key) for key in ("difference_a90", "size_equivalence", "correlation", "paired", "repeats")
+            key: found.get(key)
+            for key in (
+                "difference_a90",
+                "size_equivalence",
+                "correlation",
+                "correlation_at_bound",
+                "curve_test",
+                "paired",
+                "repeats",
+            )
         }
-        return {**kept, "warnings": found["warnings"], "verdict": verdict_text(kept, curves, margin=self.plan.margin)}
+        return {
+            **kept,
+            "warnings": found["warnings"],
+            "equivalence": equivalence_of(kept, curves),
+            "reason": reason_text(kept, curves, margin=self.plan.margin),
+        }
 
 
 def recipe_of(plan: TablePlan) -> "Recipe":
@@ -352,22 +374,32 @@ def half_width(curve: Mapping[str, Any]) -> float | None:
     return float((high - low) / 2.0 / curve["a90"])
 
 
-def verdict_text(compared: Mapping[str, Any], curves: Mapping[str, Mapping[str, Any]], *, margin: float) -> str:
-    """Whether generated and measured agree at the margin, or why that is not said."""
-    missing = [kind for kind in ("measured", "generated") if curves[kind]["a90"] is None]
+def equivalence_of(compared: Mapping[str, Any], curves: Mapping[str, Mapping[str, Any]]) -> str:
+    """`equivalent`, `different`, or `not_stated` where the data cannot say whether both a90 agree at the margin."""
+    test = compared["size_equivalence"]
+    if test is None or compared["correlation_at_bound"] or any(curves[kind]["a90"] is None for kind in _KINDS):
+        return "not_stated"
+    return _STATES[str(test["verdict"])]
+
+
+def reason_text(compared: Mapping[str, Any], curves: Mapping[str, Mapping[str, Any]], *, margin: float) -> str:
+    """The interval that states equivalence or difference, or why neither is stated."""
+    missing = [kind for kind in _KINDS if curves[kind]["a90"] is None]
     if missing:
-        return f"not stated: the {' and the '.join(missing)} images support no a90"
+        return f"the {' and the '.join(missing)} images support no a90"
     test = compared["size_equivalence"]
     if test is None:
-        return "not stated: the two curves could not be compared"
+        return "the two curves could not be compared"
+    if compared["correlation_at_bound"]:
+        return "the two curves are more alike than the interval of their difference can hold"
     if test["low"] is None or test["high"] is None:
-        return "not stated: the difference has no 90 % interval"
-    ends = f"90 % interval of the difference {signed(test['low'])} to {signed(test['high'])}"
+        return "the difference has no 90 % interval"
+    ends = f"the 90 % interval of the difference, {signed(test['low'])} to {signed(test['high'])},"
     return {
-        "equivalent": f"equivalent at {margin:g} ({ends})",
-        "different within the margin": f"equivalent at {margin:g}, and different from 0 ({ends})",
-        "different": f"different ({ends})",
-        "inconclusive": f"not stated: the {ends} reaches beyond +-{margin:g}",
+        "equivalent": f"{ends} lies within +-{margin:g}",
+        "different within the margin": f"{ends} lies within +-{margin:g}; the 95 % interval leaves out 0",
+        "different": f"{ends} reaches beyond +-{margin:g}; the 95 % interval leaves out 0",
+        "inconclusive": f"{ends} reaches beyond +-{margin:g}",
     }[str(test["verdict"])]
 
 

@@ -18,9 +18,11 @@ from ..reports import (
     Step,
 )
 from ..reports.chart import Shape
+from .lab_line import REFERENCE_MS
 from .table import WIDE, signed
 
 _DASH = "–"
+_WORDS = {"equivalent": "equivalent", "different": "different", "not_stated": "not stated"}
 _KINDS: tuple[tuple[str, str, str, Shape], ...] = (
     ("measured", "measured test images", MEASURED, "square"),
     ("generated", "generated test images", AFTER, "circle"),
@@ -36,7 +38,7 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
     notes = _notes(result)
     return ResultPage(
         heading="Contrast at POD 90 %, generated against measured",
-        answer=_answer(pairs, margin, pending=pending),
+        answer=_answer(result, pairs),
         key_figures=tuple(_key_figure(row) for row in pairs),
         proof=(a90_chart(rows), difference_chart(pairs, margin=margin)) if pairs else (),
         steps=() if not pending else (Step(text="Go on where this run stopped.", command="raytwin table -o FOLDER"),),
@@ -48,8 +50,10 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
                     " networks find the same products, the interval is clustered by both (see the notes).",
                     f"Each network marks at the threshold that {100 * plan['alarm_share']:g} % of the {plan['line']['boneless']}"
                     " products without bone reach, measured ones for measured images, generated ones for generated images.",
+                    "Found: looks at products with a bone in which it was marked, in generated | measured images.",
                 ),
                 table=_table(rows),
+                items=tuple(_equivalence(row["compare"], _exposure(row)) for row in pairs),
             ),
             Section(title="False alarms", text=_alarm_text(plan), table=_alarms(pairs)),
             Section(
@@ -65,21 +69,21 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
     )
 
 
-def _answer(pairs: Sequence[Mapping[str, Any]], margin: float, *, pending: Sequence[float]) -> tuple[str, ...]:
+def _answer(result: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    margin = result["plan"]["margin"]
     lines = []
-    if pending:
-        told = ", ".join(f"{exposure:g} ms" for exposure in pending)
-        lines.append(f"This table is not finished. Still to come: {told}.")
-    same = [row for row in pairs if row["compare"]["verdict"].startswith("equivalent")]
-    apart = [row for row in pairs if row["compare"]["verdict"].startswith("different")]
-    open_ = [row for row in pairs if row not in same and row not in apart]
-    for found, text in (
-        (same, f"Generated and measured test images give the same a90 within {margin:g} at"),
-        (apart, f"They differ by more than {margin:g} allows at"),
-        (open_, f"These test sets cannot say whether both agree within {margin:g} at"),
+    if result["pending"]:
+        lines.append(f"This table is not finished. Still to come: {_exposures(result['pending'])}.")
+    if result["published_pending"]:
+        lines.append(f"Images generated as published are still to come at {_exposures(result['published_pending'])}.")
+    for state, text in (
+        ("equivalent", f"Generated and measured test images give the same a90 within {margin:g} at"),
+        ("different", "Generated and measured test images give different a90 at"),
+        ("not_stated", f"These test sets cannot say whether both agree within {margin:g} at"),
     ):
+        found = [row["exposure_ms"] for row in pairs if row["compare"]["equivalence"] == state]
         if found:
-            lines.append(f"{text} {', '.join(_exposure(row) for row in found)}.")
+            lines.append(f"{text} {_exposures(found)}.")
     return tuple(lines)
 
 
@@ -120,8 +124,8 @@ def a90_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
 
 def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Chart:
     """Generated less measured a90 with its 95 % interval, and the margin."""
-    known = [row for row in pairs if (row["compare"]["difference_a90"] or {}).get("value") is not None]
-    found = [row["compare"]["difference_a90"] for row in known]
+    known = [row for row in pairs if _difference(row["compare"]).get("value") is not None]
+    found = [_difference(row["compare"]) for row in known]
     ends = tuple([one["value"] if one[name] is None else one[name] for one in found] for name in ("low", "high"))
     exposures = [row["exposure_ms"] for row in pairs]
     reach = 1.1 * max([2.0 * margin, *(abs(value) for values in ends for value in values)])
@@ -129,7 +133,7 @@ def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Ch
         x=[row["exposure_ms"] for row in known],
         y=[one["value"] for one in found],
         y_ends=(ends[0], ends[1]),
-        names=[f"{_exposure(row)}: {row['compare']['verdict']}" for row in known],
+        names=[_equivalence(row["compare"], _exposure(row)) for row in known],
         label="difference of a90",
     )
     return Chart(
@@ -187,16 +191,15 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
     shown = []
     for row in rows:
         compared = row["compare"]
-        difference = {} if compared is None else compared["difference_a90"] or {}
+        difference = {} if compared is None else _difference(compared)
         shown.append(
             (
                 _exposure(row),
                 _interval(row["generated"]),
                 _interval(row["measured"]),
                 _signed(difference),
-                _DASH if compared is None else str(compared["verdict"]),
-                _hits(row["generated"]),
-                _hits(row["measured"]),
+                _DASH if compared is None else _WORDS[compared["equivalence"]],
+                f"{_hits(row['generated'])} | {_hits(row['measured'])}",
             )
         )
     return SortedTable(
@@ -205,9 +208,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
             "generated",
             "measured",
             "difference",
-            "equivalence",
-            "found, generated",
-            "found, measured",
+            "agree",
+            "found",
         ),
         rows=tuple(shown),
         words=frozenset({0, 4}),
@@ -250,8 +252,8 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
             _exposure(row),
             _interval(row["published"]["generated"]),
             _interval(row["published"]["measured"]),
-            _signed(row["published"]["compare"]["difference_a90"] or {}),
-            str(row["published"]["compare"]["verdict"]),
+            _signed(_difference(row["published"]["compare"])),
+            _WORDS[row["published"]["compare"]["equivalence"]],
         )
         for row in pairs
         if row["published"]
@@ -263,10 +265,11 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
             " and on the measured ones.",
         ),
         table=SortedTable(
-            header=("exposure", "generated as published", "measured", "difference", "equivalence"),
+            header=("exposure", "generated as published", "measured", "difference", "agree"),
             rows=tuple(rows),
             words=frozenset({0, 4}),
         ),
+        items=tuple(_equivalence(row["published"]["compare"], _exposure(row)) for row in pairs if row["published"]),
     )
 
 
@@ -339,7 +342,15 @@ def _end(curve: Mapping[str, Any], name: str) -> float:
 
 
 def _exposure(row: Mapping[str, Any]) -> str:
-    return "1 s" if row["exposure_ms"] == 1000.0 else f"{row['exposure_ms']:g} ms"
+    return _exposures([row["exposure_ms"]])
+
+
+def _exposures(values: Sequence[float]) -> str:
+    return ", ".join("1 s" if value == REFERENCE_MS else f"{value:g} ms" for value in values)
+
+
+def _equivalence(compared: Mapping[str, Any], exposure: str) -> str:
+    return f"{exposure}: {_WORDS[compared['equivalence']]}, for {compared['reason']}."
 
 
 def _number(value: float | None) -> str:
@@ -354,12 +365,20 @@ def _interval(curve: Mapping[str, Any] | None) -> str:
     return f"{_number(curve['a90'])} ({_number(ends['low'])} to {_number(ends['high'])}){wide}"
 
 
+def _difference(compared: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Difference of the two a90; without its interval where that may be too narrow."""
+    found = dict(compared["difference_a90"] or {})
+    return found | {"low": None, "high": None} if found and compared["correlation_at_bound"] else found
+
+
 def _signed(difference: Mapping[str, Any]) -> str:
     if difference.get("value") is None:
         return _DASH
+    if difference["low"] is None and difference["high"] is None:
+        return signed(difference["value"])
     ends = (_DASH if difference[end] is None else signed(difference[end]) for end in ("low", "high"))
     return f"{signed(difference['value'])} ({' to '.join(ends)})"
 
 
 def _hits(curve: Mapping[str, Any] | None) -> str:
-    return _DASH if curve is None else f"{curve['n_hits']} of {curve['n']}"
+    return _DASH if curve is None else str(curve["n_hits"])

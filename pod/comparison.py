@@ -29,6 +29,8 @@ from .trials import Trials
 
 Array = NDArray[np.float64]
 
+_MOST_ALIKE = 0.99  # correlation of two a90 that intervals take: 1 would say that the difference is known exactly
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
@@ -70,7 +72,8 @@ class Comparison:
     difference_a90 (second - first) and ratio_a90 (second / first); equivalence_low, equivalence_high: 90 % interval of
     the ratio; p_equivalence: the larger of the two one-sided p-values; correlation: of the two a90, from shared images
     and networks; paired: what is shared (`image`, `network`, `image and network`, `nothing`); size_equivalence: at a margin in
-    the sizes' unit, None where none was stated.
+    the sizes' unit, None where none was stated; correlation_at_bound: the spreads of both a90 and of their difference ask for
+    a correlation above 1, so that the interval of the difference, made with 0.99, may be too narrow.
     """
 
     first: PodFit
@@ -87,6 +90,7 @@ class Comparison:
     curve_test: CurveTest | None
     warnings: tuple[str, ...]
     size_equivalence: SizeEquivalence | None = None
+    correlation_at_bound: bool = False
 
 
 def compare_pod(
@@ -137,9 +141,13 @@ def compare_pod(
         )
     pairs = [word for word, given in (("image", shared_images), ("network", shared_networks)) if given]
     paired = " and ".join(pairs) or "nothing"
-    correlation = 0.0
+    correlation, at_bound = 0.0, False
     if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
-        correlation = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
+        correlation, at_bound = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
+    if at_bound:
+        notes.append(
+            "the difference spreads less than any correlation of the two a90 allows: its interval may be too narrow"
+        )
     empty = Interval(value=None, low=None, high=None)
     # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood
     freedoms = [math.inf if fit.degrees_of_freedom is None else fit.degrees_of_freedom for fit in fits]
@@ -198,6 +206,7 @@ def compare_pod(
         paired=paired,
         curve_test=test,
         warnings=tuple(notes),
+        correlation_at_bound=at_bound,
         size_equivalence=None
         if size_margin is None
         else _size_equivalence(fits, difference, shares, margin=size_margin, correlation=correlation),
@@ -281,8 +290,10 @@ def _p_equivalence(middle: float, logs: Interval, edge: float, freedom: float) -
 
 def _correlation(
     first: Trials, second: Trials, fits: tuple[PodFit, ...], *, log_size: bool, shared: list[str], repeats: str
-) -> float:
-    """Correlation of the two a90 from what they share, by the clustered spread of their difference, as pooled curves.
+) -> tuple[float, bool]:
+    """Correlation of the two a90 from what they share, and whether the spreads ask for one above 1.
+
+    By the clustered spread of their difference, as pooled curves.
 
     Each look adds to a90 what its score says; summed over both tables with opposite signs these make the difference.
     Its variance is clustered by network and image (`robust.clustered_total`). The correlation is the one with which the
@@ -293,7 +304,7 @@ def _correlation(
     for table, fit, sign in zip((first, second), fits, (-1.0, 1.0), strict=True):
         curve = fit.curve
         if curve is None:
-            return 0.0
+            return 0.0, False
         x90 = (curve.link.eta_from_pod(0.9) - curve.coefficients[0]) / curve.coefficients[1]
         gradient = -np.array([1.0, x90]) / curve.coefficients[1]
         groups = [codes for codes in (table.network, table.image) if codes is not None and codes.max() > 0]
@@ -301,7 +312,7 @@ def _correlation(
         if groups and not apart:
             clustered = clustered_curve(table, curve, groups=groups, log_size=log_size)
             if clustered is None:
-                return 0.0
+                return 0.0, False
             variance, freedom = clustered.variance(gradient)
         arms.append(math.sqrt(float(variance)) * float(student_quantile(TWO_SIDED, freedom)))
         scores = score_rows(table, curve, log_size=log_size)
@@ -309,14 +320,14 @@ def _correlation(
     both = _stacked(first, second, shared)
     codes = [one for one in (both.network, both.image) if one is not None]
     if not codes or not all(arm > 0 for arm in arms):
-        return 0.0
+        return 0.0, False
     if apart and len(codes) > 1:
         codes = [np.unique(codes[0] * (int(codes[1].max()) + 1) + codes[1], return_inverse=True)[1].astype(np.intp)]
     of_difference, its_freedom = clustered_total(np.concatenate(influences), codes)
     arm = math.sqrt(of_difference) * float(student_quantile(TWO_SIDED, its_freedom))
     value = (arms[0] ** 2 + arms[1] ** 2 - arm**2) / (2 * arms[0] * arms[1])
     # what is shared moves both alike; an estimate below 0 is noise of few images or networks
-    return min(max(value, 0.0), 0.99)
+    return min(max(value, 0.0), _MOST_ALIKE), value > 1.0 + 1e-9
 
 
 def _curve_test(

@@ -11,7 +11,7 @@ import pytest
 from raytwin.acquisition import DatasetRow, write_dataset
 from raytwin.campaign import table as table_module
 from raytwin.campaign import trial as trial_module
-from raytwin.campaign.table import alarms_at, half_width, networks_text, plan_of, run_table, verdict_text
+from raytwin.campaign.table import alarms_at, equivalence_of, half_width, networks_text, plan_of, reason_text, run_table
 from raytwin.campaign.table_page import table_page
 from raytwin.cli import main
 from raytwin.errors import InputError
@@ -135,11 +135,11 @@ def test_equal_curves_are_equivalent_and_a_planted_difference_is_found(made):
     assert first["generated"] is None
     assert first["compare"] is None
     assert second["measured"]["a90"] == pytest.approx(0.12, abs=0.02)
-    assert second["compare"]["verdict"].startswith("equivalent at 0.02")
+    assert second["compare"]["equivalence"] == "equivalent"
     assert second["compare"]["paired"] == "image and network"
     assert second["alarms_on_measured"]["n"] == 30
     published = second["published"]["compare"]
-    assert published["verdict"].startswith("different (90 %")
+    assert published["equivalence"] == "different"
     assert published["difference_a90"]["low"] < 0.07 < published["difference_a90"]["high"]
 
 
@@ -185,11 +185,12 @@ def test_an_a90_that_is_missing_is_refused_with_the_reason_and_the_page_says_so(
     row = result["rows"][1]
     row["measured"] |= {"a90": None, "a90_95_interval": {"low": None, "high": None}, "half_width": None}
     row["compare"] |= {"difference_a90": {"value": None, "low": None, "high": None}}
-    row["compare"]["verdict"] = verdict_text(row["compare"], row, margin=0.02)
-    assert row["compare"]["verdict"] == "not stated: the measured images support no a90"
+    row["compare"]["equivalence"] = equivalence_of(row["compare"], row)
+    row["compare"]["reason"] = reason_text(row["compare"], row, margin=0.02)
     page = table_page(result)
     assert "These test sets cannot say whether both agree within 0.02 at 50 ms." in page.answer
-    assert page.sections[0].table.rows[1][2:5] == ("–", "–", row["compare"]["verdict"])
+    assert page.sections[0].table.rows[1][2:5] == ("–", "–", "not stated")
+    assert page.sections[0].items == ("50 ms: not stated, for the measured images support no a90.",)
 
 
 def test_the_page_of_an_unfinished_table_says_what_is_to_come(made, tmp_path):
@@ -251,25 +252,34 @@ def test_half_the_width_of_an_interval_is_a_share_of_the_a90():
 
 
 @pytest.mark.parametrize(
-    ("test", "expected"),
+    ("test", "state", "reason"),
     [
-        ({"verdict": "equivalent", "low": -0.01, "high": 0.015}, "equivalent at 0.02 (90 % interval"),
+        (("equivalent", -0.01, 0.015), "equivalent", "-0.010 to +0.015, lies within +-0.02"),
         (
-            {"verdict": "different within the margin", "low": 0.01, "high": 0.015},
-            "equivalent at 0.02, and different from 0",
+            ("different within the margin", 0.01, 0.015),
+            "equivalent",
+            "lies within +-0.02; the 95 % interval leaves out 0",
         ),
-        ({"verdict": "different", "low": 0.03, "high": 0.05}, "different (90 % interval"),
         (
-            {"verdict": "inconclusive", "low": -0.03, "high": 0.01},
-            "not stated: the 90 % interval of the difference -0.030 to",
+            ("different", 0.03, 0.05),
+            "different",
+            "+0.030 to +0.050, reaches beyond +-0.02; the 95 % interval leaves out 0",
         ),
-        ({"verdict": "inconclusive", "low": None, "high": 0.01}, "not stated: the difference has no 90 % interval"),
-        (None, "not stated: the two curves could not be compared"),
+        (("inconclusive", -0.03, -0.0001), "not_stated", "-0.030 to 0.000, reaches beyond +-0.02"),
+        (("inconclusive", None, 0.01), "not_stated", "the difference has no 90 % interval"),
+        (None, "not_stated", "the two curves could not be compared"),
     ],
 )
-def test_equivalence_is_stated_or_refused_with_the_reason(test, expected):
+def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
     curves = {kind: {"a90": 0.1} for kind in ("measured", "generated")}
-    assert verdict_text({"size_equivalence": test}, curves, margin=0.02).startswith(expected)
+    compared = {
+        "correlation_at_bound": False,
+        "size_equivalence": None if test is None else dict(zip(("verdict", "low", "high"), test, strict=True)),
+    }
+    assert equivalence_of(compared, curves) == state
+    assert reason_text(compared, curves, margin=0.02).endswith(reason)
+    compared["correlation_at_bound"] = True
+    assert equivalence_of(compared, curves) == "not_stated"
 
 
 @pytest.mark.parametrize(

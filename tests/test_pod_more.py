@@ -303,6 +303,7 @@ def test_a_table_equals_itself():
     assert found.difference_a90.value == 0
     assert found.ratio_a90.value == 1
     assert found.correlation > 0.98
+    assert not found.correlation_at_bound  # nothing differs
     assert found.verdict == "equivalent"
     assert found.curve_test.p == pytest.approx(1, abs=1e-6)
 
@@ -318,6 +319,16 @@ def test_a_shift_is_found_and_pairing_narrows_the_interval():
     assert paired.verdict == "different"
     assert paired.difference_a90.value == pytest.approx(paired.second.a90 - paired.first.a90)
     assert paired.p_equivalence > 0.5
+
+
+def test_spreads_that_no_correlation_explains_are_said(monkeypatch):
+    one, two = two_tables(2, shift=1.3)
+    words = {"link": "logit", "repeats": "cluster", "shared_images": True, "shared_networks": True}
+    assert not compare_pod(one, two, **words).correlation_at_bound
+    monkeypatch.setattr("raytwin.pod.comparison._correlation", lambda *tables, **options: (0.99, True))
+    found = compare_pod(one, two, **words)
+    assert found.correlation_at_bound
+    assert any("spreads less than any correlation" in line for line in found.warnings)
 
 
 def test_a_wide_margin_makes_equivalent_what_a_narrow_one_leaves_open():

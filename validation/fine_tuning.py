@@ -85,9 +85,9 @@ length_mm = [14, 24]
 name = "stone"
 shape = "superellipsoid"
 material = "granite"
-length_mm = [1.2, 5]
-width_mm = [1, 4]
-height_mm = [0.8, 3.5]
+length_mm = [0.8, 3]
+width_mm = [0.6, 2]
+height_mm = [0.3, 1.5]
 """,
     "heaps of nylon beads with spongy bone": """
 [[product]]
@@ -100,8 +100,8 @@ pixel_mm = 0.25
 name = "bone"
 shape = "cone"
 material = "spongiosa_icru44"
-diameter_mm = [1.5, 7]
-length_mm = [1.5, 7]
+diameter_mm = [1, 5]
+length_mm = [1, 5]
 """,
 }
 
@@ -201,7 +201,7 @@ def until_usable(rows: list[dict]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("build/fine_tuning"))
-    parser.add_argument("--networks", type=int, default=2, help="of each start and length (2)")
+    parser.add_argument("--networks", type=int, default=3, help="of each start and length (3)")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     folder = options.output

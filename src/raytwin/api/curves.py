@@ -174,6 +174,7 @@ class PodComparison(Result):
                 "curve_test": None if test is None else asdict(test),
                 "paired": found.paired,
                 "correlation": found.correlation,
+                "correlation_at_bound": found.correlation_at_bound,
                 "repeats": self.repeats,
                 "warnings": self.warnings,
             }

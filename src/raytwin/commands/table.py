@@ -126,7 +126,7 @@ def _line(row: dict[str, Any]) -> str:
             )
             told.append(f"{kind} {value};")
     if row["compare"] is not None:
-        told.append(str(row["compare"]["verdict"]))
+        told.append(f"{row['compare']['equivalence'].replace('_', ' ')}: {row['compare']['reason']}")
     return " ".join(told).rstrip(";")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import only_one
 from .chain import Chain, Run, Tell, claim_folder
 from .demo_gap import GapPlan, run_gap
 from .lab_line import LabLine, measure_line, write_generated, write_measured
@@ -114,24 +115,27 @@ def run_demo(plan: DemoPlan, directory: Path, *, run: Run, tell: Tell) -> dict[s
         RaytwinError: a step failed.
     """
     claim_folder(directory, asdict(plan), what="a demo")
-    chain = Chain(directory=directory, run=run, tell=tell)
-    exposures = [1000.0, *plan.exposures_ms]
-    line = measure_line(chain, plan.line)
-    write_measured(chain, plan.line, exposures)
-    for exposure in plan.exposures_ms:
-        for name in ("train", "test", "published"):
-            write_generated(chain, plan.line, exposure, name)
-    found = _networks(chain, plan, exposures)
-    gap = run_gap(directory, plan.gap, seed=plan.seed, step=chain.step)
-    return {
-        "plan": asdict(plan),
-        **line,
-        **found,
-        "gap": gap,
-        "a90_table": a90_table(found["pod"], found["compare"], exposures),
-        "noise": {f"{exposure:g}ms": noise_comparison(directory, f"{exposure:g}ms") for exposure in plan.exposures_ms},
-        "commands": chain.commands,
-    }
+    with only_one(directory, "a demo"):
+        chain = Chain(directory=directory, run=run, tell=tell)
+        exposures = [1000.0, *plan.exposures_ms]
+        line = measure_line(chain, plan.line)
+        write_measured(chain, plan.line, exposures)
+        for exposure in plan.exposures_ms:
+            for name in ("train", "test", "published"):
+                write_generated(chain, plan.line, exposure, name)
+        found = _networks(chain, plan, exposures)
+        gap = run_gap(directory, plan.gap, seed=plan.seed, step=chain.step)
+        return {
+            "plan": asdict(plan),
+            **line,
+            **found,
+            "gap": gap,
+            "a90_table": a90_table(found["pod"], found["compare"], exposures),
+            "noise": {
+                f"{exposure:g}ms": noise_comparison(directory, f"{exposure:g}ms") for exposure in plan.exposures_ms
+            },
+            "commands": chain.commands,
+        }
 
 
 def _networks(chain: Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
 from ..errors import InputError
-from ..files import whole_file
+from ..files import only_one, whole_file
 from ._plain import canonical, plain, read_object
 from .chain import Chain, Run, Tell, claim_folder
 from .lab_line import REFERENCE_MS, LabLine, measure_line, write_generated, write_measured
@@ -171,20 +171,21 @@ def run_table(
     from ..segmentation._torch import load_torch
 
     claim_folder(directory, plain(asdict(plan)), what="a table")
-    load_torch().set_num_threads(1)  # hits and misses do not depend on the machine's cores
-    chain = Chain(directory=directory, run=run, tell=tell)
-    exposures = (REFERENCE_MS, *sorted(plan.line.exposures_ms, reverse=True))
-    line = measure_line(chain, plan.line)
-    write_measured(chain, plan.line, exposures)
-    work = _Work(plan=plan, chain=chain, workers=workers, version=version, line=line)
-    rows: dict[float, dict[str, Any]] = {}
-    for exposure in exposures:
-        rows[exposure] = work.row(exposure)
-        each(work.answer(rows, exposures))
-    for exposure in exposures[1:] if plan.published else ():
-        rows[exposure]["published"] = work.arm(exposure, "published")
-        each(work.answer(rows, exposures))
-    return work.answer(rows, exposures)
+    with only_one(directory, "a table"):
+        load_torch().set_num_threads(1)  # hits and misses do not depend on the machine's cores
+        chain = Chain(directory=directory, run=run, tell=tell)
+        exposures = (REFERENCE_MS, *sorted(plan.line.exposures_ms, reverse=True))
+        line = measure_line(chain, plan.line)
+        write_measured(chain, plan.line, exposures)
+        work = _Work(plan=plan, chain=chain, workers=workers, version=version, line=line)
+        rows: dict[float, dict[str, Any]] = {}
+        for exposure in exposures:
+            rows[exposure] = work.row(exposure)
+            each(work.answer(rows, exposures))
+        for exposure in exposures[1:] if plan.published else ():
+            rows[exposure]["published"] = work.arm(exposure, "published")
+            each(work.answer(rows, exposures))
+        return work.answer(rows, exposures)
 
 
 @dataclass(slots=True)

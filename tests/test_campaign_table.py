@@ -11,10 +11,14 @@ import pytest
 from raytwin.acquisition import DatasetRow, write_dataset
 from raytwin.campaign import table as table_module
 from raytwin.campaign import trial as trial_module
+from raytwin.campaign._plain import plain
+from raytwin.campaign.chain import claim_folder
+from raytwin.campaign.demo import PAPER_PLAN, run_demo
 from raytwin.campaign.table import alarms_at, equivalence_of, half_width, networks_text, plan_of, reason_text, run_table
 from raytwin.campaign.table_page import table_page
 from raytwin.cli import main
 from raytwin.errors import InputError
+from raytwin.files import only_one
 from raytwin.reports import write_result_page
 from raytwin.segmentation import Detection, write_detections
 
@@ -334,3 +338,21 @@ def test_a_small_table_is_the_same_bytes_with_two_workers_and_after_a_stop(tmp_p
     run_table(plan, tmp_path / "stopped", run=main, version="1", workers=2)
     for name in ("table.json", "hits_generated_50ms.csv", "hits_published_measured_50ms.csv"):
         assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("what", "start"),
+    [
+        ("a table", lambda folder: run_table(PLAN, folder, run=run, version="0")),
+        ("a demo", lambda folder: run_demo(PAPER_PLAN, folder, run=run, tell=print)),
+    ],
+)
+def test_a_second_run_in_a_folder_is_refused_and_leaves_it_as_it_was(what, start, tmp_path):
+    plan = PLAN if what == "a table" else PAPER_PLAN
+    claim_folder(
+        tmp_path, plain(dataclasses.asdict(plan)) if what == "a table" else dataclasses.asdict(plan), what=what
+    )
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with only_one(tmp_path, what), pytest.raises(InputError, match=f"where {what} is running"):
+        start(tmp_path)
+    assert sorted({path.name for path in tmp_path.iterdir()} - {".lock"}) == before

@@ -312,7 +312,6 @@ class _Work:
                 "difference_a90",
                 "size_equivalence",
                 "correlation",
-                "correlation_at_bound",
                 "curve_test",
                 "paired",
                 "repeats",
@@ -378,7 +377,7 @@ def half_width(curve: Mapping[str, Any]) -> float | None:
 def equivalence_of(compared: Mapping[str, Any], curves: Mapping[str, Mapping[str, Any]]) -> str:
     """`equivalent`, `different`, or `not_stated` where the data cannot say whether both a90 agree at the margin."""
     test = compared["size_equivalence"]
-    if test is None or compared["correlation_at_bound"] or any(curves[kind]["a90"] is None for kind in _KINDS):
+    if test is None or any(curves[kind]["a90"] is None for kind in _KINDS):
         return "not_stated"
     return _STATES[str(test["verdict"])]
 
@@ -391,8 +390,6 @@ def reason_text(compared: Mapping[str, Any], curves: Mapping[str, Mapping[str, A
     test = compared["size_equivalence"]
     if test is None:
         return "the two curves could not be compared"
-    if compared["correlation_at_bound"]:
-        return "the two curves are more alike than the interval of their difference can hold"
     if test["low"] is None or test["high"] is None:
         return "the difference has no 90 % interval"
     ends = f"the 90 % interval of the difference, {signed(test['low'])} to {signed(test['high'])},"

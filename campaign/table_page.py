@@ -366,9 +366,8 @@ def _interval(curve: Mapping[str, Any] | None) -> str:
 
 
 def _difference(compared: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Difference of the two a90; without its interval where that may be too narrow."""
-    found = dict(compared["difference_a90"] or {})
-    return found | {"low": None, "high": None} if found and compared["correlation_at_bound"] else found
+    """Difference of the two a90 with its interval; empty where there is none."""
+    return dict(compared["difference_a90"] or {})
 
 
 def _signed(difference: Mapping[str, Any]) -> str:

@@ -73,7 +73,7 @@ class Comparison:
     the ratio; p_equivalence: the larger of the two one-sided p-values; correlation: of the two a90, from shared images
     and networks; paired: what is shared (`image`, `network`, `image and network`, `nothing`); size_equivalence: at a margin in
     the sizes' unit, None where none was stated; correlation_at_bound: the spreads of both a90 and of their difference ask for
-    a correlation above 1, so that the interval of the difference, made with 0.99, may be too narrow.
+    a correlation above 1, which is none: the interval of the difference is that of a90 that share nothing.
     """
 
     first: PodFit
@@ -145,8 +145,10 @@ def compare_pod(
     if pairs and all(fit.curve is not None and fit.c1 is not None and fit.c1 > 0 for fit in fits):
         correlation, at_bound = _correlation(first, second, fits, log_size=log_size, shared=pairs, repeats=repeats)
     if at_bound:
+        # what the two share narrows the interval: without it, it is as wide as it can be
+        correlation = 0.0
         notes.append(
-            "the difference spreads less than any correlation of the two a90 allows: its interval may be too narrow"
+            "the difference spreads less than any correlation of the two a90 allows: its interval is that of a90 that share nothing"
         )
     empty = Interval(value=None, low=None, high=None)
     # the 90 % interval: the 95 % interval's arms shortened, which is exact for a quadratic log-likelihood

@@ -277,13 +277,10 @@ def test_half_the_width_of_an_interval_is_a_share_of_the_a90():
 def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
     curves = {kind: {"a90": 0.1} for kind in ("measured", "generated")}
     compared = {
-        "correlation_at_bound": False,
         "size_equivalence": None if test is None else dict(zip(("verdict", "low", "high"), test, strict=True)),
     }
     assert equivalence_of(compared, curves) == state
     assert reason_text(compared, curves, margin=0.02).endswith(reason)
-    compared["correlation_at_bound"] = True
-    assert equivalence_of(compared, curves) == "not_stated"
 
 
 @pytest.mark.parametrize(

@@ -322,12 +322,16 @@ def test_a_shift_is_found_and_pairing_narrows_the_interval():
 
 
 def test_spreads_that_no_correlation_explains_are_said(monkeypatch):
-    one, two = two_tables(2, shift=1.3)
+    one, two = two_tables(2, shift=1.3, images=120, networks=30)
     words = {"link": "logit", "repeats": "cluster", "shared_images": True, "shared_networks": True}
-    assert not compare_pod(one, two, **words).correlation_at_bound
+    plain = compare_pod(one, two, **words)
+    assert not plain.correlation_at_bound and plain.correlation > 0.0
     monkeypatch.setattr("raytwin.pod.comparison._correlation", lambda *tables, **options: (0.99, True))
     found = compare_pod(one, two, **words)
     assert found.correlation_at_bound
+    # as wide as where nothing is shared
+    apart = compare_pod(one, two, link="logit", repeats="cluster")
+    assert (found.difference_a90, found.correlation) == (apart.difference_a90, 0.0)
     assert any("spreads less than any correlation" in line for line in found.warnings)
 
 

@@ -122,7 +122,7 @@ def fit_flat_noise(
         tell: called with the name of the stage.
 
     Raises:
-        InputError: no flat has signal above dark.
+        InputError: no flat has signal above dark, or none has noise.
         FitError: the noise tells no gain.
     """
     tell("noise power")
@@ -153,6 +153,13 @@ def fit_flat_noise(
             received="flats no brighter than the darks",
             expected="flats with signal above dark",
             remedy="check that the series' kinds are not swapped",
+        )
+    if not any(np.any(power.power_DN2 > 0) for power, group in found if group >= 0):
+        raise InputError(
+            f"acquisition {acquisition.path}",
+            received="flats whose frames do not differ in any pixel",
+            expected="frames with noise of their own, from which the gain comes",
+            remedy="take them again: these are copies of one frame, or images without noise",
         )
     tell("spread and gain")
     # darks that are single means bound the read noise by their difference

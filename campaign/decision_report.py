@@ -4,12 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from ..reports import AFTER, BEFORE, QUIET, Band, Chart, Figure, Line, Points, Rule
+from ..reports import AFTER, BEFORE, QUIET, Chart, Figure, Line, Points, Rule
 from ..reports.chart import Shape
 from ._ticks import few_ticks
 from .decision import FAILS, IMPOSSIBLE, LIKELY, MEETS, OPEN, WORDS, Change, change_text
+from .pod_page import curve_marks
 
 _DASH = "–"
 _ORDER = (MEETS, LIKELY, OPEN, FAILS, IMPOSSIBLE)
@@ -147,27 +146,12 @@ def charts_of_both_sizes(row: Mapping[str, Any], answer: Mapping[str, Any]) -> l
     """POD of a setting over contrast and over length in mm, each with its 95 % band."""
     charts = []
     for size, curve in ((answer["size"], row), (answer["other_size"], row["other_size"])):
-        marks: list[Any] = [Rule(at=0.9)]
-        line = curve["line"]
-        if line:
-            at, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
-            marks += [Band(x=at, low=low, high=high), Line(x=at, y=pod)]
-        if curve["points"]:
-            marks.append(
-                Points(
-                    x=[point["size"] for point in curve["points"]],
-                    y=[point["hits"] / point["n"] for point in curve["points"]],
-                    names=[f"{point['hits']} of {point['n']}" for point in curve["points"]],
-                    colour="#111111",
-                    size_px=6.0,
-                )
-            )
         title = "contrast" if size == "contrast" else "length of the object, mm"
         charts.append(
             Chart(
                 name=f"pod_over_{'contrast' if size == 'contrast' else 'length'}",
                 alt=f"POD over {title} with its 95 % band; dots: share of hits in groups of like size.",
-                marks=marks,
+                marks=[Rule(at=0.9), *curve_marks(curve)],
                 x_label=title,
                 y_label="probability of detection",
                 y_ends=(-0.03, 1.03),

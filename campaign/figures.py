@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
-from ..diagnosis.report.explanation import axis_text
+from ..diagnosis.report.figures import gap_chart
 from ..errors import RaytwinError
-from ..generator.line.twin import Twin
+from ..generator.line.twin import Estimate, Twin
 from ..pod.repeats import fit_pod
-from ..reports import AFTER, BEFORE, Bars, Chart, Figure, Line, Picture, Points, Rule
+from ..reports import AFTER, BEFORE, Chart, Figure, Line, Picture, Points, Rule
 from ..reports.chart import SERIES_COLOURS, Shape
 from .demo_gap import WithheldFrame
-from .twin_page import gain_picture, map_pictures, photon_transfer_charts
+from .pod_page import a90_chart
+from .twin_page import error_chart, gain_picture, map_pictures, photon_transfer_charts
 
 # kind of test images, as files and as the table name them, and how they are drawn
 _KINDS: tuple[tuple[str, str, str, str, Shape], ...] = (
@@ -46,53 +47,35 @@ def demo_figures(
     shorter = [exposure for exposure in exposures if exposure != max(exposures)]
     examples: list[Figure] = list(example_pictures(directory, shorter, reference_ms=max(exposures)))
     return {
-        "a90": [a90_chart(result["a90_table"])],
+        "a90": [exposures_chart(result["a90_table"])],
         "pod": [pod_chart(hits, result["pod"], exposure) for exposure in exposures],
         "maps": [gain_picture(twin), *map_pictures(twin), *photon_transfer_charts(twin)],
         "validation": list(validation_charts(result["validation"]["rows"])),
         "reference": examples[:1],
         "examples": examples[1:],
         "training": [training_chart(name, entry["networks"]) for name, entry in result["training"].items()],
-        "gap": [gap_chart(result["gap"]["diagnosis"])],
+        "gap": [gap_chart(gap_parts(result["gap"]["diagnosis"]), added=True)],
         "withheld": list(withheld_pictures(withheld)),
     }
 
 
-def a90_chart(table: Sequence[Mapping[str, Any]]) -> Chart:
+def gap_parts(diagnosis: Mapping[str, Any]) -> list[tuple[str, float, float, float]]:
+    """The gap as a whole and by axis, before, after and floor, from diagnosis.json."""
+    parts = [{"axis": "all", **diagnosis["gap"]}, *diagnosis["held_out"]]
+    return [(one["axis"], one["before"], one["after"], one["floor"]) for one in parts]
+
+
+def exposures_chart(table: Sequence[Mapping[str, Any]]) -> Chart:
     """Contrast at POD 90 % against exposure, measured and generated, with two-sided 95 % intervals."""
-    marks: list[Any] = []
-    for place, (_, key, label, colour, shape) in enumerate(_KINDS):
-        found = [(row["exposure_ms"], row[key]) for row in table if row[key] and row[key]["a90"] is not None]
-        if not found:
-            continue
-        # side by side: intervals of one exposure must not hide each other
-        x = [exposure * (1.0 + 0.05 * (2 * place - 1)) for exposure, _ in found]
-        ends = [
-            [entry[end] if entry[end] is not None else entry["a90"] for _, entry in found] for end in ("low", "high")
-        ]
-        marks.append(
-            Points(
-                x=x,
-                y=[entry["a90"] for _, entry in found],
-                y_ends=(ends[0], ends[1]),
-                names=[f"{exposure:g} ms" for exposure, _ in found],
-                colour=colour,
-                shape=shape,
-                label=label,
-            )
-        )
-    exposures = sorted({float(row["exposure_ms"]) for row in table})
-    return Chart(
-        name="a90_of_exposure",
-        title="a90 against exposure",
-        alt="Contrast at POD 90 % with its 95 % interval, measured and generated test images.",
-        marks=marks,
-        x_label="exposure, ms",
-        y_label="contrast at POD 90 %",
-        x_scale="log",
-        x_ticks={one: f"{one:g}" for one in exposures},
-        x_ends=(exposures[0] / 1.3, exposures[-1] * 1.3),
-    )
+    kinds = []
+    for _, key, label, colour, shape in _KINDS:
+        known = {row["exposure_ms"]: row[key] for row in table if row[key] and row[key]["a90"] is not None}
+        found = {
+            exposure: (one["a90"], *(one["a90"] if one[end] is None else one[end] for end in ("low", "high")))
+            for exposure, one in known.items()
+        }
+        kinds.append((label, colour, shape, found))
+    return a90_chart(kinds)
 
 
 def pod_chart(hits: Mapping[str, Sequence[Mapping[str, str]]], answers: Mapping[str, Any], exposure_ms: float) -> Chart:
@@ -152,28 +135,13 @@ def _short(setting: str) -> str:
 
 def validation_charts(rows: Sequence[Mapping[str, Any]]) -> tuple[Chart, ...]:
     """Predicted over measured mean and noise of flats that calibration did not see, with 95 % intervals."""
-    names = [_short(str(row["setting"])) for row in rows]
-    charts = []
-    for key, title in (("mean_DN", "mean"), ("sd_DN", "noise")):
-        measured = np.array([row[f"measured_{key}"] for row in rows])
-        value, low, high = (
-            100.0 * (np.array([row[key][end] for row in rows]) / measured - 1.0) for end in ("value", "low", "high")
+    return tuple(
+        error_chart(
+            title,
+            [(_short(str(row["setting"])), row[f"measured_{key}"], Estimate(**row[key]), "not seen") for row in rows],
         )
-        y = np.arange(len(rows), dtype=np.float64)
-        charts.append(
-            Chart(
-                name=f"errors_of_{title}",
-                title=f"Error of the {title}",
-                alt="Predicted over measured less 1, with 95 % intervals.",
-                marks=[Rule(at=0.0, along="x"), Points(x=value, y=y, x_ends=(low, high), names=names)],
-                x_label="predicted over measured - 1, %",
-                y_ticks=dict(zip(map(float, y), names, strict=True)),
-                y_ends=(-0.7, len(rows) - 0.3),
-                downwards=True,
-                height_px=120 + 34 * len(rows),
-            )
-        )
-    return tuple(charts)
+        for key, title in (("mean_DN", "mean"), ("sd_DN", "noise"))
+    )
 
 
 def example_pictures(directory: Path, exposures: Sequence[float], *, reference_ms: float) -> tuple[Picture, ...]:
@@ -230,32 +198,6 @@ def training_chart(name: str, networks: Sequence[Mapping[str, Any]]) -> Chart:
         marks=marks,
         x_label="epoch",
         y_label="loss",
-    )
-
-
-def gap_chart(diagnosis: Mapping[str, Any]) -> Chart:
-    """The gap on data that the fit did not use, before and after the effect was added, by axis; from diagnosis.json."""
-    gap = diagnosis["gap"]
-    rows = [("everything", gap["before"], gap["after"], gap["floor"])]
-    rows += [(axis_text(one["axis"]), one["before"], one["after"], one["floor"]) for one in diagnosis["held_out"]]
-    names, before, after, floor = (list(column) for column in zip(*rows, strict=True))
-    y = np.arange(len(rows), dtype=np.float64)
-    bars: dict[str, Any] = {"thickness": 0.34, "names": names, "numbers": True}
-    return Chart(
-        name="gap",
-        title="Gap on series that the fit did not use",
-        alt="Root mean square of measured less expected, in units of what noise and calibration allow.",
-        marks=[
-            Bars(y=y - 0.19, length=before, colour=BEFORE, label="before", **bars),
-            Bars(y=y + 0.19, length=after, colour=AFTER, label="after", **bars),
-            Points(x=floor, y=y, colour="#111111", shape="diamond", label="measured against measured", names=names),
-        ],
-        x_label="gap (1: noise alone)",
-        x_ends=(0.0, 1.15 * max(*before, *after, *floor)),
-        y_ticks=dict(zip(map(float, y), names, strict=True)),
-        y_ends=(-0.6, len(rows) - 0.4),
-        downwards=True,
-        height_px=110 + 42 * len(rows),
     )
 
 

@@ -10,6 +10,7 @@ from ..pod import PodFit, ResponseFit, Trials
 from ..pod.band import curve_rows
 from ..pod.plots import grouped_hits
 from ..reports import AFTER, BEFORE, Band, Chart, KeyFigure, Line, Points, ResultPage, Rule, Section, SortedTable, Step
+from ..reports.chart import Mark, Shape
 
 _BOUNDS = {"modified": "likelihood ratio, for few trials", "likelihood_ratio": "likelihood ratio", "wald": "Wald"}
 
@@ -105,6 +106,75 @@ def pod_chart(fit: PodFit, trials: Trials, *, size: str, bound: float | None) ->
         y_ends=(-0.03, 1.03),
         wide=True,
         height_px=420,
+    )
+
+
+def curve_marks(
+    curve: Mapping[str, Any],
+    *,
+    colour: str = AFTER,
+    label: str = "",
+    dashed: bool = False,
+    band: bool = True,
+    of_points: tuple[str, Shape] = ("#111111", "circle"),
+) -> list[Mark]:
+    """A fitted curve with its 95 % band, and the share of hits in groups of like size; empty where there is neither.
+
+    curve: `line` (columns size, pod, low, high; None where a band has no end) and `points` (size, hits, n) of a fit's answer.
+    """
+    marks: list[Mark] = []
+    line, points = curve["line"], curve["points"]
+    if line:
+        size, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
+        marks += [Band(x=size, low=low, high=high, colour=colour)] if band else []
+        marks.append(Line(x=size, y=pod, colour=colour, label=label, dashed=dashed))
+    if points:
+        marks.append(
+            Points(
+                x=[one["size"] for one in points],
+                y=[one["hits"] / one["n"] for one in points],
+                names=[f"{one['hits']} of {one['n']}" for one in points],
+                colour=of_points[0],
+                shape=of_points[1],
+                label="" if line else label,
+                size_px=6.0,
+            )
+        )
+    return marks
+
+
+def a90_chart(kinds: Sequence[tuple[str, str, Shape, Mapping[float, tuple[float, float, float]]]]) -> Chart:
+    """Contrast at POD 90 % with its 95 % interval against exposure.
+
+    kinds: of test images: label, colour, shape, and exposure, ms -> (a90, low, high).
+    """
+    marks: list[Mark] = []
+    for place, (label, colour, shape, found) in enumerate(kinds):
+        if found:
+            a90, low, high = (list(column) for column in zip(*found.values(), strict=True))
+            marks.append(
+                Points(
+                    # side by side: intervals of one exposure must not hide each other
+                    x=[exposure * (1.0 + 0.06 * (place - 0.5 * (len(kinds) - 1))) for exposure in found],
+                    y=a90,
+                    y_ends=(low, high),
+                    names=[f"{exposure:g} ms" for exposure in found],
+                    colour=colour,
+                    shape=shape,
+                    label=label,
+                )
+            )
+    exposures = sorted({exposure for *_, found in kinds for exposure in found})
+    return Chart(
+        name="a90_of_exposure",
+        title="a90 against exposure",
+        alt="Contrast at POD 90 % with its 95 % interval against exposure, by kind of test images.",
+        marks=marks,
+        x_label="exposure, ms",
+        y_label="contrast at POD 90 %",
+        x_scale="log",
+        x_ticks={exposure: f"{exposure:g}" for exposure in exposures},
+        x_ends=(exposures[0] / 1.3, exposures[-1] * 1.3) if exposures else None,
     )
 
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from ..acquisition.dataset_io import read_dataset
 from ..errors import RaytwinError
-from ..reports import AFTER, BEFORE, MEASURED, QUIET, Band, Chart, Figure, Line, Points, Rule, SortedTable, write_page
+from ..reports import AFTER, BEFORE, MEASURED, QUIET, Chart, Figure, Points, Rule, SortedTable, write_page
 from ..reports.chart import Shape
 from ._ticks import few_ticks
 from .decision_report import decision_part
+from .pod_page import curve_marks
 from .sweep_choice import paces
 from .sweep_file import Campaign
 from .sweep_trial import EXAMPLE
@@ -240,22 +241,7 @@ def curve_charts(fitted: Sequence[Mapping[str, Any]], *, size: str) -> list[Char
     charts = []
     for number, row in enumerate(ranked[:_MOST_CURVES], start=1):
         colour, _ = _KINDS[_kind(row)]
-        marks: list[Any] = [Rule(at=0.9)]
-        line = row["line"]
-        if line:
-            # where a band has no end there is null
-            at, pod, low, high = (np.array(line[name], dtype=float) for name in ("size", "pod", "low", "high"))
-            marks += [Band(x=at, low=low, high=high, colour=colour), Line(x=at, y=pod, colour=colour)]
-        if row["points"]:
-            marks.append(
-                Points(
-                    x=[point["size"] for point in row["points"]],
-                    y=[point["hits"] / point["n"] for point in row["points"]],
-                    names=[f"{point['hits']} of {point['n']}" for point in row["points"]],
-                    colour="#111111",
-                    size_px=6.0,
-                )
-            )
+        marks = [Rule(at=0.9), *curve_marks(row, colour=colour)]
         if row["a90"] is not None:
             marks.append(Points(x=[row["a90"]], y=[0.9], colour=colour, shape="diamond", names=["a90"], size_px=10.0))
         charts.append(

@@ -9,7 +9,6 @@ from ..reports import (
     MEASURED,
     Chart,
     KeyFigure,
-    Line,
     Points,
     ResultPage,
     Rule,
@@ -19,6 +18,7 @@ from ..reports import (
 )
 from ..reports.chart import Shape
 from .lab_line import REFERENCE_MS
+from .pod_page import a90_chart, curve_marks
 from .table import WIDE, signed
 
 _DASH = "–"
@@ -40,7 +40,7 @@ def table_page(result: Mapping[str, Any]) -> ResultPage:
         heading="Contrast at POD 90 %, generated against measured",
         answer=_answer(result, pairs),
         key_figures=tuple(_key_figure(row) for row in pairs),
-        proof=(a90_chart(rows), difference_chart(pairs, margin=margin)) if pairs else (),
+        proof=(exposures_chart(rows), difference_chart(pairs, margin=margin)) if pairs else (),
         steps=() if not pending else (Step(text="Go on where this run stopped.", command="raytwin table -o FOLDER"),),
         sections=(
             Section(
@@ -92,34 +92,16 @@ def _key_figure(row: Mapping[str, Any]) -> KeyFigure:
     return KeyFigure(value=value, text=f"a90 at {_exposure(row)}: generated | measured")
 
 
-def a90_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
+def exposures_chart(rows: Sequence[Mapping[str, Any]]) -> Chart:
     """a90 with its interval against exposure."""
-    marks: list[Any] = []
     published: tuple[str, str, str, Shape] = ("published", "generated as published", BEFORE, "triangle")
-    for place, (kind, label, colour, shape) in enumerate((*_KINDS, published)):
-        curves = [(row["exposure_ms"], _curve_of(row, kind)) for row in rows]
-        known = [(exposure, curve) for exposure, curve in curves if curve and curve["a90"] is not None]
-        if not known:
-            continue
-        # side by side: intervals of one exposure must not hide each other
-        x = [exposure * (1.0 + 0.06 * (place - 1)) for exposure, _ in known]
-        a90 = [curve["a90"] for _, curve in known]
-        ends = tuple([_end(curve, name) for _, curve in known] for name in ("low", "high"))
-        names = [f"{exposure:g} ms" for exposure, _ in known]
-        marks.append(
-            Points(x=x, y=a90, y_ends=(ends[0], ends[1]), names=names, colour=colour, shape=shape, label=label)
-        )
-    exposures = [row["exposure_ms"] for row in rows]
-    return Chart(
-        name="a90_of_exposure",
-        alt="Contrast at POD 90 % with its 95 % interval against exposure, measured and generated test images.",
-        marks=marks,
-        x_label="exposure, ms",
-        y_label="contrast at POD 90 %",
-        x_scale="log",
-        x_ticks={exposure: f"{exposure:g}" for exposure in exposures},
-        x_ends=(min(exposures) / 1.3, max(exposures) * 1.3),
-    )
+    kinds = []
+    for kind, label, colour, shape in (*_KINDS, published):
+        curves = {row["exposure_ms"]: _curve_of(row, kind) for row in rows}
+        known = {exposure: curve for exposure, curve in curves.items() if curve and curve["a90"] is not None}
+        found = {exposure: (one["a90"], _end(one, "low"), _end(one, "high")) for exposure, one in known.items()}
+        kinds.append((label, colour, shape, found))
+    return a90_chart(kinds)
 
 
 def difference_chart(pairs: Sequence[Mapping[str, Any]], *, margin: float) -> Chart:
@@ -161,21 +143,9 @@ def pod_chart(row: Mapping[str, Any]) -> Chart:
         curve = row[kind]
         if curve is None:
             continue
-        if curve["line"] is not None:
-            line = curve["line"]
-            marks.append(Line(x=line["size"], y=line["pod"], colour=colour, label=label, dashed=kind == "measured"))
-        points = curve["points"]
-        if points:
-            marks.append(
-                Points(
-                    x=[one["size"] for one in points],
-                    y=[one["hits"] / one["n"] for one in points],
-                    names=[f"{one['hits']} of {one['n']}" for one in points],
-                    colour=colour,
-                    shape=shape,
-                    label="" if curve["line"] is not None else label,
-                )
-            )
+        marks += curve_marks(
+            curve, colour=colour, label=label, dashed=kind == "measured", band=False, of_points=(colour, shape)
+        )
     return Chart(
         name=f"pod_{row['exposure_ms']:g}ms",
         title=_exposure(row),

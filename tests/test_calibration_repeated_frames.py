@@ -267,6 +267,20 @@ def test_copies_of_a_frame_are_counted_once(tmp_path):
     assert any("10 of 20 frames are copies" in line for line in found["copied"].warnings)
 
 
+def test_series_of_one_frame_over_and_over_are_refused_in_one_line(tmp_path):
+    rng = np.random.default_rng(4)
+    instrument = Instrument(bits=16, pixel_mm=0.15, source_detector_mm=1059.0)
+    with write_acquisition(tmp_path / "copies.h5", instrument) as writer:
+        dark = np.repeat(exposures(np.zeros(SHAPE), 1, rng), 8, axis=0)
+        writer.add_series("dark", kind="dark", frames=dark, exposure_ms=20.0)
+        for exposure_ms, level in LEVELS.items():
+            setting = Setting(kV=40.0, power_W=20.0, exposure_ms=exposure_ms)
+            frames = np.repeat(exposures(np.full(SHAPE, level), 1, rng), 10, axis=0)
+            writer.add_series(f"flat_{exposure_ms:g}", kind="flat", frames=frames, setting=setting)
+    with pytest.raises(InputError, match="flats whose frames do not differ in any pixel"):
+        transfer_of(tmp_path / "copies.h5")
+
+
 def test_a_beam_with_repeated_flats_takes_nothing_from_objects(tmp_path):
     with_objects, without = tmp_path / "with.h5", tmp_path / "without.h5"
     for path, objects in ((with_objects, 2), (without, 0)):

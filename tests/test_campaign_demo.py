@@ -17,9 +17,10 @@ from raytwin.campaign.demo_gap import (
     withheld_rows,
     withheld_text,
 )
-from raytwin.campaign.figures import a90_chart, gap_chart, pod_chart, withheld_pictures
+from raytwin.campaign.figures import exposures_chart, gap_parts, pod_chart, withheld_pictures
 from raytwin.campaign.report import missing_a90
 from raytwin.cli import main
+from raytwin.diagnosis.report.figures import gap_chart
 from raytwin.generator.effects import AppliedEffect
 from raytwin.lab.protocols import run_protocol
 from raytwin.lab.unkindness import NONE
@@ -128,11 +129,11 @@ def test_the_chapter_says_what_the_diagnosis_said_and_no_more(verdict, effects, 
     assert told in text
     assert not_told not in text
     assert "from 6.6 to 1.0" in text
-    rows = list(csv.DictReader(io.StringIO(gap_chart(found).numbers_csv())))
-    assert [(row["mark"], row["name"], row["x"]) for row in rows if row["name"] == "everything"] == [
-        ("before", "everything", "6.6"),
-        ("after", "everything", "1"),
-        ("measured against measured", "everything", "0.9"),
+    rows = list(csv.DictReader(io.StringIO(gap_chart(gap_parts(found), added=True).numbers_csv())))
+    assert [(row["mark"], row["name"], row["x"]) for row in rows if row["name"] == "all"] == [
+        ("before", "all", "6.6"),
+        ("after", "all", "1"),
+        ("measured against measured", "all", "0.9"),
     ]
 
 
@@ -148,7 +149,7 @@ def test_charts_of_detection_hold_every_trial_and_every_a90():
         {"exposure_ms": 1000.0, "real": entry, "generated": None},
         {"exposure_ms": 50.0, "real": None, "generated": entry},
     ]
-    told = list(csv.DictReader(io.StringIO(a90_chart(rows).numbers_csv())))
+    told = list(csv.DictReader(io.StringIO(exposures_chart(rows).numbers_csv())))
     assert [(row["mark"], row["name"], row["y_low"]) for row in told] == [
         ("measured", "1000 ms", "0.07"),
         ("generated", "50 ms", "0.07"),

@@ -20,7 +20,7 @@ from raytwin.diagnosis.probes.moving_picture import MovingPicture
 from raytwin.diagnosis.probes.registration import Placement, register, register_drawn, resample
 from raytwin.diagnosis.probes.scalar_context import Areas, ScalarContext
 from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, _codes, look_at_series, summarise_series
-from raytwin.diagnosis.session.usable import SeenSeries
+from raytwin.diagnosis.session.usable import counted_copies
 from raytwin.errors import InputError
 from raytwin.generator.effects import EFFECTS
 
@@ -533,9 +533,8 @@ def test_copies_are_counted_once_for_the_series_that_calibrate_and_once_for_all_
         SimpleNamespace(name=name, calibrates=name in ("dark", "flat"), series=SimpleNamespace(n_frames=11))
         for name in looks
     )
-    seen = SimpleNamespace(kept=kept, looks=looks)
     # frames that are all alike can be copies or not: nothing tells
-    assert SeenSeries.counted_copies.fget(seen) == {"flat": (3, 20), "later": (3, 10)}
+    assert counted_copies(kept, looks) == {"flat": (3, 20), "later": (3, 10)}
 
 
 def test_between_the_strengths_that_are_asked_copies_are_foretold_within_their_chance():

@@ -18,7 +18,7 @@ from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
 from ..session.session import SessionSeries
 from ..session.summaries import CODES_FRAMES, SeriesSummary
-from ..session.usable import SeenSeries
+from ..session.usable import SeenSeries, counted_copies
 from .calibrated_maps import CalibratedMaps, exposure_of
 from .defects import counting_series
 from .forward_model import Change, ForwardModel
@@ -233,7 +233,7 @@ def session_model(
     """
     signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
     lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
-    counting = counting_series(placed.kept)
+    counting, copies = counting_series(placed.kept), counted_copies(placed.kept, seen.looks)
     series = []
     before: float | None = None
     for item in placed.kept:
@@ -248,7 +248,7 @@ def session_model(
             previous_DN=before,
             code_range=summaries[item.name].code_range,
             counts_all=item.name == counting,
-            repeatable=seen.counted_copies.get(item.name, (0, 0))[1],
+            repeatable=copies[item.name][1] if item.name in copies else 0,
         )
         alone = expected_scalars(expected, context)
         tells = item.name in placed.telling

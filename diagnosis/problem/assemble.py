@@ -38,7 +38,7 @@ from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from ..session.even_maps import Map
 from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
-from ..session.usable import SeenSeries, look_at_all, stated_series, summarise_all
+from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all
 from .known_effects import lasting, with_found
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns
@@ -207,7 +207,7 @@ def _measured(
         memory={
             item.name: memory_of(seen.looks[item.name], outlying) for item in seen.kept if item.series.kind == "dark"
         },
-        copies={name: count for name, (count, _) in seen.counted_copies.items()},
+        copies={name: count for name, (count, _) in counted_copies(placed.kept, seen.looks).items()},
         clean=clean,
         outliers=int(np.count_nonzero(outlying)),
         skipped=seen.skipped,

@@ -178,8 +178,9 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
         level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
-        "length of exposures": scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal,
     }
+    if item.request.exposure_ms > 0:
+        images["length of exposures"] = scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal
     for number, shape in enumerate(_shapes(signal.shape)):
         images[f"shape {number} of {item.name}"] = shape * signal
     if item.divided:

@@ -149,10 +149,12 @@ def transmission_curves(diagnosis: Diagnosis, after: Sequence[NDArray[np.floatin
 def held_out_chart(diagnosis: Diagnosis) -> Chart:
     """Held-out gap as a whole and by axis, before and after, with the floor of measured against measured."""
     gap = diagnosis.gap
-    rows = [
-        ("all", gap.before, gap.after, gap.floor),
-        *((axis_text(name), before, after, floor) for name, before, after, floor in diagnosis.held_out),
-    ]
+    return gap_chart([("all", gap.before, gap.after, gap.floor), *diagnosis.held_out], added=bool(diagnosis.added))
+
+
+def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) -> Chart:
+    """Gap on data that the fit did not use: parts as (`all` or an axis, before, after, floor); after where an effect was added."""
+    rows = [(name if name == "all" else axis_text(name), before, after, floor) for name, before, after, floor in parts]
     y = np.arange(len(rows), dtype=float)
     names = [row[0] for row in rows]
     largest = max(max(row[1:]) for row in rows)
@@ -169,7 +171,7 @@ def held_out_chart(diagnosis: Diagnosis) -> Chart:
             numbers=True,
         )
     ]
-    if diagnosis.added:
+    if added:
         after = [row[2] for row in rows]
         marks.append(
             Bars(y=y + 0.19, length=after, thickness=0.34, colour=AFTER, label="after", names=names, numbers=True)

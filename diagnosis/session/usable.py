@@ -36,24 +36,21 @@ class SeenSeries:
     saturation_DN: float | None
     skipped: tuple[str, ...]
 
-    @property
-    def counted_copies(self) -> dict[str, tuple[int, int]]:
-        """Frames that are copies of earlier ones of their series, and those that may be, of all series that calibrate and of all
-        others: by name of the last of each."""
-        found: dict[str, tuple[int, int]] = {}
-        for calibrates in (True, False):
-            members = [
-                item
-                for item in self.kept
-                if item.calibrates == calibrates and np.any(self.looks[item.name].stack_variance_DN2 > 0)
-            ]
-            if members:
-                looks = [self.looks[item.name] for item in members]
-                found[members[-1].name] = (
-                    sum(look.copies for look in looks),
-                    sum(item.series.n_frames - 1 for item in members),
-                )
-        return found
+
+def counted_copies(kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook]) -> dict[str, tuple[int, int]]:
+    """Frames that are copies of earlier ones of their series, and those that may be: of all series that calibrate, and of all others.
+
+    Each pair by the name of the last of these series, which counts them. Series without any noise are left out.
+    """
+    found: dict[str, tuple[int, int]] = {}
+    for calibrates in (True, False):
+        members = [
+            item for item in kept if item.calibrates == calibrates and np.any(looks[item.name].stack_variance_DN2 > 0)
+        ]
+        if members:
+            copies = sum(looks[item.name].copies for item in members)
+            found[members[-1].name] = copies, sum(item.series.n_frames - 1 for item in members)
+    return found
 
 
 def stated_series(

@@ -1,4 +1,4 @@
-"""Anode heel: exp(-mu_anode tau u), u from -1/2 to 1/2 across the field."""
+"""Anode heel: exp(-mu_anode tau (o + u + c u^2)), u from -1/2 to 1/2 across the field."""
 
 import math
 from collections.abc import Mapping
@@ -47,7 +47,7 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
 
     def path_of(direction_deg: float) -> FloatArray:
         u = _field_coordinate(context.shape, direction_deg)
-        return path * (u + parameters["curvature"] * u**2)
+        return path * (parameters["offset"] + u + parameters["curvature"] * u**2)
 
     across = path_of(parameters["direction_deg"] - request.panel_rotation_deg)
     behind = context.project("heel", rows)
@@ -65,7 +65,7 @@ def _tilt(state: LineState, parameters: Mapping[str, float], context: LineContex
 HEEL = Effect(
     id="heel",
     title="anode heel",
-    law=r"N(E) \to N(E)\,e^{-\mu_\mathrm{anode}(E)\,\tau\,(u + c\,u^2)},\quad u \in [-\tfrac12, \tfrac12]\ \text{across the field}",
+    law=r"N(E) \to N(E)\,e^{-\mu_\mathrm{anode}(E)\,\tau\,(o + u + c\,u^2)},\quad u \in [-\tfrac12, \tfrac12]\ \text{across}",
     parameters=(
         Parameter(
             name="strength",
@@ -94,6 +94,16 @@ HEEL = Effect(
             source="cot(anode angle) times the field's angle: 0.24 for 12 degrees and 51 mm at 1 m",
             log=False,
         ),
+        Parameter(
+            name="offset",
+            unit="",
+            low=-0.5,
+            high=0.5,
+            default=0.0,
+            source="path in the middle of the field over its change across it: an anode that roughens lengthens every path (1/2: all "
+            "but those at one border), another anode some of them",
+            log=False,
+        ),
     ),
     stage="arrivals",
     reference="path z cot(alpha + phi) in the anode, to second order in the position: Braun (1978), doi:10.1088/0031-9155/23/5/005",
@@ -104,6 +114,11 @@ HEEL = Effect(
     shows=Shows(series=LIT_SERIES, axis="position"),
     either_onset=True,
     absorbed="maps of beams",
-    grid=Grid(shares=(0.8,)),
+    grid=Grid(
+        shares=(0.8,),
+        variants=tuple(
+            {"direction_deg": direction, "offset": offset} for direction in (90.0, 270.0) for offset in (0.0, 0.4)
+        ),
+    ),
     variation=Variation(random="sides"),
 )

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
@@ -41,6 +42,19 @@ def diagnose(
     Raises:
         InputError: nothing in the session can be judged.
     """
+    # thousands of small matrices: threads would wait for each other longer than they work
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _diagnosed(acquisition, twin, rng, without, priors, progress)
+
+
+def _diagnosed(
+    acquisition: AcquisitionFile,
+    twin: Twin | None,
+    rng: np.random.Generator,
+    without: Sequence[str],
+    priors: Priors | None,
+    progress: Callable[[str], None] | None,
+) -> Diagnosis:
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
     unseen = unseen_in_squares() if session.factor > 1 else {}
     try:

@@ -99,10 +99,10 @@ def noise(rng, factors):
     return factors @ rng.standard_normal(factors.shape[1]) + rng.standard_normal(len(factors))
 
 
-def seen(residual, factors=None, *, places=GROUPS):
+def seen(residual, factors=None, *, places=GROUPS, series=GROUPS):
     """Probes as they are weighed; without nuisances where no factors are given."""
     factors = np.zeros((PROBES, 1)) if factors is None else factors
-    return Observed(residual=residual, nuisances=Nuisances(factors), groups=GROUPS, places=places)
+    return Observed(residual=residual, nuisances=Nuisances(factors), groups=GROUPS, places=places, series=GROUPS)
 
 
 def weigh(residual, factors, chosen, **options):
@@ -733,10 +733,12 @@ def test_the_likelihood_beside_an_effect_is_that_of_its_law_and_what_it_may_be_o
     assert added == pytest.approx((0.2**2 + 0.1**2) * float(effective @ effective), rel=0.1)
 
 
-@pytest.mark.parametrize(("share", "named"), [(0.02, False), (0.6, True)])
-def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_is_off(share, named):
+@pytest.mark.parametrize(("share", "elsewhere", "named"), [(0.02, False, False), (0.02, True, True), (0.6, True, True)])
+def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_acts_and_is_off(share, elsewhere, named):
     rng = np.random.default_rng(8)
     strong, weak, *others = independent((300, 1.0), (200, 1.0), *[(10, 1.0)] * 8)
+    if not elsewhere:
+        weak = one_node("effect1", strong.response(1.0) * rng.choice((-1.0, 1.0), PROBES), low=0.01, high=100.0)
     off = 1.0 + 0.2 * rng.standard_normal(PROBES)
     residual = 800.0 * strong.response(1.0) * off + 800.0 * share * weak.response(1.0) + rng.standard_normal(PROBES)
     wide = [replace(one, high=5000.0) for one in (strong, weak, *others)]

@@ -77,6 +77,7 @@ def weighed(line, shown):
         nuisances=Nuisances(line.factors),
         groups=GROUPS,
         places=GROUPS,
+        series=GROUPS,
         given=(Point(curve=effects[0], strength=STRENGTH, level=0.1, strength_sd=0.12),),
     )
     seen = [(one, fit_effects(one, effects)) for one in map(observed.off_by, LEVELS.up_to(FARTHEST_LEVEL).levels)]
@@ -126,7 +127,9 @@ def test_the_evidence_does_not_hang_on_which_effects_the_twin_has(line):
     """All that differs is a strength that is known to 12 % from one that may be any."""
     shown = line.motion + 0.5 * line.tail
     own = Point(curve=curve("motion", line.motion), strength=STRENGTH, level=0.0, strength_sd=0.12)
-    bare = Observed(residual=line.noise + shown, nuisances=Nuisances(line.factors), groups=GROUPS, places=GROUPS)
+    bare = Observed(
+        residual=line.noise + shown, nuisances=Nuisances(line.factors), groups=GROUPS, places=GROUPS, series=GROUPS
+    )
     given = Observed(**{**bare.__dict__, "given": (own,)})
     assert given.standing("motion").log_likelihood == bare.log_likelihood
     free = 0.12 * line.motion

@@ -141,7 +141,9 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
 
     curves = [item.curve(answer([item])[0]) for item in variants]
     groups = np.zeros(PROBES, dtype=np.intp)
-    observed = Observed(residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups)
+    observed = Observed(
+        residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups, series=groups
+    )
     hypotheses = weigh_hypotheses([(observed, fit_effects(observed, curves))], parts=groups, part_names=("all",))
     return refine(
         hypotheses,

@@ -92,7 +92,9 @@ def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
 
     def unknown(displaced_sds):
         residual = whitening.apply((displaced_sds * found)[None, :])[0]
-        seen = Observed(residual=residual, nuisances=shared, groups=problem.groups, places=problem.places)
+        seen = Observed(
+            residual=residual, nuisances=shared, groups=problem.groups, places=problem.places, series=problem.series_of
+        )
         return beyond(seen, problem.parts, problem.part_names)
 
     assert unknown(0.0).log_evidence < 0.0

@@ -1,9 +1,9 @@
 """Model discrepancy: how far laws of an effect's kind depart from ours, and what effects do by chance.
 
 At a level k a law is off by a random factor of relative size k in each group of probes, by half of that in each probe of its own,
-and by a share of that in probes of a place where it acts but foretells less. What it leaves may look like another effect, a share of
-k times as large as what it does. Levels are no choice for a session: evidence is averaged over them, with the frequencies that laws
-of many shapes have shown (`discrepancy.toml`). The shares below are choices: no script has fitted them.
+and by a share of that in probes of a place where it acts but foretells less. What it leaves in a series may look like another effect,
+up to k times as large as what it does there. Levels are no choice for a session: evidence is averaged over them, with the frequencies
+that laws of many shapes have shown (`discrepancy.toml`). The shares below are choices: no script has fitted them.
 """
 
 import math
@@ -64,8 +64,6 @@ def _learnt() -> Levels:
 
 
 LEVELS = _learnt()
-# of a level: what a law leaves in the shape of another effect, over what it does
-LEAK_SHARE = 0.5
 # beyond it a law does not carry the probes: what is off by more than half of itself explains anything
 FARTHEST_LEVEL = 0.4
 USUAL_LEVEL = 0.1  # of refinement, of laws that a twin has, and of what is fitted on half of a session
@@ -179,19 +177,17 @@ def log_rest(ratio: float, *, another: bool = False) -> float:
 def leak_density(ratio: NDArray[np.float64], level: float, least: float) -> NDArray[np.float64]:
     """Density, in the logarithm of it, of what a law leaves in the shape of another effect over what it does itself.
 
-    Even from `least`, below which it does not show, to LEAK_SHARE times the level, and falling as a Gaussian beyond; nothing where a
-    law of this level leaves nothing that shows.
+    Even from `least`, below which it does not show, to the level, and falling as a Gaussian beyond; nothing where a law of this level
+    leaves nothing that shows.
     """
-    most = LEAK_SHARE * level
-    if most <= least:
+    if level <= least:
         return np.zeros_like(ratio)
-    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / most) ** 2)) / _leak_width(most, least))
+    return np.asarray(np.where(ratio < least, 0.0, np.exp(-0.5 * (ratio / level) ** 2)) / _leak_width(level, least))
 
 
 def leak_below(ratio: float, level: float, least: float) -> float:
     """Probability that it is less, or does not show at all."""
-    most = LEAK_SHARE * level
-    if most <= least:
+    if level <= least:
         return 1.0
     if ratio <= least:
         return 0.0

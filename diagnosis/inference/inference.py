@@ -158,10 +158,10 @@ def _left_by_given(
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
-    length = math.hypot(*(observed.length(point.curve, point.strength) for point in observed.given))
+    squares = np.sum([observed.squares_by_series(one.curve, one.strength) for one in observed.given], axis=0)
     levels = [(1.0, observed.given[0].level)]
     return max(
-        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, length, levels)
+        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, squares, levels)
         for effect in others
     )
 

@@ -37,15 +37,16 @@ class Observed:
     """A residual and its covariance.
 
     Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
-    one factor; places (probe,), within which it is off by a share of no more than what is seen there; root (probe,): standard
-    deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still in the residual:
-    `standing` takes them off.
+    one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law leaves
+    nothing that shows in a series that it does not move; root (probe,): standard deviations of the probes in the units of the first
+    (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
     """
 
     residual: NDArray[np.float64]
     nuisances: Nuisances
     groups: NDArray[np.intp]
     places: NDArray[np.intp]
+    series: NDArray[np.intp]
     root: NDArray[np.float64] | None = None
     given: tuple[Point, ...] = ()
 
@@ -136,18 +137,30 @@ class Observed:
             nuisances=self.nuisances.of_probes(probes),
             groups=self.groups[probes],
             places=self.places[probes],
+            series=self.series[probes],
             root=None if self.root is None else self.root[probes],
         )
 
     def length(self, curve: Curve, strength: float) -> float:
         """How far a curve (in these units) moves the probes at a strength, by its law and by chance, nuisances aside; sd."""
-        moved = curve.response(strength)[None, :]
-        if curve.spread is not None:
-            moved = np.concatenate([moved, strength * curve.spread.T])
+        moved = self._moved(curve, strength)
         squares = float(np.trace(self.nuisances.inner(moved, moved)))
         if curve.jitter is not None:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
+
+    def squares_by_series(self, curve: Curve, strength: float) -> NDArray[np.float64]:
+        """How far a curve (in these units) moves the probes of each series, as `length`, squared (series,)."""
+        squares = np.sum(self.nuisances.solve_all(self._moved(curve, strength)) ** 2, axis=0)
+        if curve.jitter is not None:
+            squares = squares + strength**2 * curve.jitter
+        return np.asarray(np.bincount(self.series, weights=squares), dtype=np.float64)
+
+    @staticmethod
+    def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:
+        """Rows (1 + chance, probe): what a curve's law does at a strength, and what it does by chance."""
+        moved = curve.response(strength)[None, :]
+        return moved if curve.spread is None else np.concatenate([moved, strength * curve.spread.T])
 
 
 def slope(curve: Curve, strength: float) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral, log_mean_exp
@@ -127,27 +128,33 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
 
     The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
     """
-    lengths = {effect: observed.length(fit.curve, fit.best) for effect, fit in pair.fits.items()}
-    strong, weak = sorted(lengths, key=lambda effect: -lengths[effect])
+    squares = {effect: observed.squares_by_series(fit.curve, fit.best) for effect, fit in pair.fits.items()}
+    strong, weak = sorted(squares, key=lambda effect: -float(np.sum(squares[effect])))
     first = pair.fits[strong]
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     return strong, left_in_place(
-        observed, pair.fits[weak], lengths[strong], list(zip(shares, LEVELS.levels, strict=False))
+        observed, pair.fits[weak], squares[strong], list(zip(shares, LEVELS.levels, strict=False))
     )
 
 
-def left_in_place(observed: Observed, second: CurveFit, length: float, levels: Sequence[tuple[float, float]]) -> float:
+def left_in_place(
+    observed: Observed, second: CurveFit, squares: NDArray[np.float64], levels: Sequence[tuple[float, float]]
+) -> float:
     """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
 
     Args:
         observed: what is weighed.
         second: the effect's fit beside that law.
-        length: how far the law moves the probes, standard deviations.
+        squares: how far the law moves the probes of each series, squared standard deviations (series,).
         levels: by which it is off, each after its probability.
     """
-    ratios = observed.length(second.curve, second.best) / max(length, 1e-12) * second.strengths / second.best
-    least = 1.0 / max(length, 1.0)  # a standard deviation
+    own = observed.squares_by_series(second.curve, second.best)
+    # of what it would have to leave in a series over what it does there, as much as the effect shows there; a series that a law does
+    # not move is left as it is to a standard deviation
+    ratio = max(math.sqrt(float(np.sum(own**2 / (squares + 1.0))) / max(float(np.sum(own)), 1e-12)), 1e-12)
+    ratios = ratio * second.strengths / second.best
+    least = ratio / max(math.sqrt(float(np.sum(own))), 1.0)  # a standard deviation
     density = sum(share * leak_density(ratios, level, least) for share, level in levels)
     low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
     top = float(second.log_likelihood.max())

@@ -111,6 +111,7 @@ def weigh_problem(
         residual=whitening.apply(problem.residual_without(had)[None, :])[0],
         nuisances=Nuisances(whitening.factors),
         groups=problem.groups,
+        series=problem.series_of,
         places=problem.places,
         given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
     )

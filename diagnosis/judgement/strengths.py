@@ -169,6 +169,7 @@ def strengths_on(
         residual=problem.residual_without(had)[fit],
         nuisances=Nuisances(problem.factors[fit]),
         groups=problem.groups[fit],
+        series=problem.series_of[fit],
         places=problem.places[fit],
         given=tuple(
             replace(point, curve=point.curve.of_probes(fit))

@@ -323,6 +323,24 @@ def test_seeds_may_be_generators_and_progress_a_function(inside, capsys):
         rt.calibrate("session.h5", seed="now")
 
 
+def test_open_files_are_a_short_table_and_open_again_from_a_pickle(inside):
+    with rt.open_acquisition("session.h5") as session, rt.read_dataset("references.h5") as dataset:
+        for opened in (session, dataset):
+            lines = repr(opened).splitlines()
+            assert len(lines) <= LINES and opened.path in lines[0] and "closed" not in lines[0]
+            assert "<table>" in opened._repr_html_()
+            with pickle.loads(pickle.dumps(opened)) as again:
+                assert repr(again) == repr(opened)
+        assert all(item.name in repr(session) for item in session.series)
+    assert "closed" in repr(session).splitlines()[0] and "closed" in repr(dataset).splitlines()[0]
+
+
+def test_a_mistyped_name_has_its_neighbour_suggested():
+    code = "import raytwin as rt\nrt.calibrat"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.splitlines()[-1].endswith("Did you mean: 'calibrate'?")
+
+
 def test_pairs_in_memory_are_saved_trained_on_and_equal_the_file(inside, capsys):
     pairs = made("pairs in memory", capsys)
     pairs.save("saved.h5")
@@ -350,6 +368,11 @@ def test_paths_open_files_lists_and_frames_are_taken_alike(inside, capsys):
     assert twin.predict(setting) == twin.predict(words) == rt.predict("twin.h5", words)
 
 
+def closed():
+    with rt.open_acquisition("session.h5") as session:
+        return session
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -365,6 +388,30 @@ def test_paths_open_files_lists_and_frames_are_taken_alike(inside, capsys):
         (lambda: rt.lab_session("x.h5", protocol="calibration", sizes=3), "sizes"),
         (lambda: rt.diagnose("session.h5", task={"measured": "x"}), "an output folder"),
         (lambda: rt.export("twin.h5", "x", to="geant4"), "one of csv, gvxr"),
+        (lambda: rt.calibrate(3), "acquisition: got int"),
+        (lambda: rt.calibrate([3]), "got 3 (int); expected the path of an acquisition file"),
+        (
+            lambda: rt.calibrate("."),
+            "a folder; expected an acquisition file; folders of frames are read by `raytwin import`",
+        ),
+        (lambda: rt.calibrate("session.h5", progress=3), "progress: got 3"),
+        (lambda: rt.validate("session_twin.h5", None), "acquisition: got NoneType"),
+        (lambda: rt.check(3), "got 3 (int)"),
+        (lambda: rt.check(closed()), "session.h5: got a closed file"),
+        (lambda: rt.calibrate(closed()), "session.h5: got a closed file"),
+        (lambda: closed().series[0].read_frames(0, 1), "got a closed file"),
+        (lambda: next(closed().series[0].iter_frames()), "got a closed file"),
+        (lambda: rt.open_acquisition(None), "expected the path of an acquisition file"),
+        (lambda: rt.read_dataset(3), "expected the path of a dataset file"),
+        (lambda: rt.read_twin("twin.h5").save(3), "expected the path of a file to write"),
+        (lambda: rt.read_twin("virtual_lb"), "did you mean virtual_lab?"),
+        (lambda: rt.predict("twin.h5", kV=60, power_W=1, exposure_ms=1, filter=3), "filter: got 3"),
+        (lambda: rt.generate("twin.h5", "references.h5", low=3, high=HIGH, n=1, seed=1), "setting: got 3"),
+        (lambda: rt.Setting(kV="sixty", exposure_ms=1), "kV: got 'sixty'; expected a number, in kV"),
+        (lambda: rt.spectrum(kV="sixty"), "kV: got 'sixty'; expected a number, in kV"),
+        (lambda: rt.mu(3, kV=60), "material: got 3; expected a name"),
+        (lambda: rt.compare("hits.csv", "other_hits.csv", margin="x"), "margin: got 'x'; expected a number"),
+        (lambda: rt.fit_pod({}), "table: got a table without columns"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_error_and_leaves_nothing(inside, call, message):

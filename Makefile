@@ -61,10 +61,11 @@ lock: $(READY)
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
 
-# the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes
+# the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes;
+# after `make demo` the demo's page too
 test-page: $(READY)
 	$(BIN)/python -m pip install --quiet playwright
-	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py
+	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py tests/test_campaign_*.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow

@@ -818,3 +818,13 @@ def test_the_shipped_twin_goes_by_its_name(line):
 def test_outlooks_without_contrast_to_noise_are_all_kept():
     pair = LONG
     assert keep_best([Outlook(pair=pair)], keep=1, of="all")[0].kept
+
+
+@pytest.mark.browser
+def test_the_page_fits_asks_nobody_and_draws_its_figures(line, whole, check_page):
+    folder, answer = whole
+    campaign = read_campaign(line / "campaign.toml")
+    for name, interactive in (("alive", True), ("static", False)):
+        page = folder / f"{name}.html"
+        write_report(answer, page, campaign=campaign, seconds={}, version="1", interactive=interactive)
+        check_page(page, static=not interactive)

@@ -49,10 +49,12 @@ _WAY = """raytwin: a calibrated digital twin of an X-ray inspection line.
   raytwin demo                          the main job end to end on the virtual lab, in minutes
 
 With measurements of your own:
+  raytwin check FOLDER                            what they allow, what looks wrong, what is missing
   raytwin import images FOLDER -o session.h5      your files -> an acquisition file
   raytwin calibrate session.h5 -o twin.h5         darks and flats -> the twin
   raytwin info twin.h5                            the twin in a table
   raytwin predict twin.h5 --kv 60 --power-w 30 --exposure-ms 20
+  raytwin explore twin.h5                         all of it on a page in the browser
   raytwin diagnose session.h5 -o diagnosis        where and why measured and simulated differ
 
 Before any measurement:

@@ -98,6 +98,7 @@ validation-simulators: $(READY)
 	for line in usual coarse hard soft three even counting; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
 	for line in csi gos "flat panel"; do OMP_NUM_THREADS=1 $(BIN)/python validation/catsim_sessions.py --line "$$line" --json "build/catsim_$$line.json" || exit 1; done
 	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
+	$(BIN)/python validation/export_in_simulators.py --json build/export_in_simulators.json
 
 # how far laws of a kind depart from ours, for diagnosis/inference/discrepancy.toml: an hour on one core
 discrepancy: $(READY)

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 import raytwin as rt
 from raytwin.cli import main
 from raytwin.generator.line.twin import Twin
+from raytwin.materials import material_from_name, mu_per_mm
 from raytwin.results import LINES, same_value
 
 ROOT = Path(__file__).parents[1]
@@ -419,6 +420,39 @@ def test_what_cannot_be_used_is_one_clear_error_and_leaves_nothing(inside, call,
     with pytest.raises(rt.InputError, match=re.escape(message)):
         call()
     assert sorted(os.listdir()) == before
+
+
+def test_an_export_for_gvxr_gives_the_level_by_gvxrs_own_rule(make_model_twin, tmp_path):
+    """Photons a cm2 at 1 m, a pixel of (pitch)^2 at the detector's distance, the table of responses in keV; images are in MeV."""
+    twin = make_model_twin((16, 24))
+    rt.export(twin, tmp_path, to="gvxr", settings=[HIGH])
+    page = json.loads((tmp_path / "gvxr_0.json").read_text())
+    assert page["WindowSize"] == page["Detector"]["NumberOfPixels"] == [24, 16]
+    energies, photons = np.array([(one["Energy"], one["PhotonCount"]) for one in page["Source"]["Beam"]]).T
+    response_keV = np.interp(energies, *np.array(page["Detector"]["Energy response"]["LUT"]).T)
+    distance_m = -page["Source"]["Position"][1] / 1000.0
+    pixel_cm2 = math.prod(page["Detector"]["Spacing"][:2]) / 100.0
+    image_MeV = photons @ response_keV * pixel_cm2 / distance_m**2 / 1000.0
+    DN_per_keV = json.loads((tmp_path / "noise.json").read_text())["DN_per_keV"]
+    assert image_MeV * 1000.0 * DN_per_keV == pytest.approx(rt.predict(twin, HIGH).mean_DN.value, rel=1e-5)
+
+
+def test_an_export_for_gecatsim_says_by_how_much_its_slab_departs(make_model_twin, tmp_path):
+    """gecatsim's Detection_EI, written out: E (1 - exp(-mu depth)), the depth and gain of the file, all cross sections together."""
+    twin = make_model_twin((16, 16))
+    (said,) = rt.export(twin, tmp_path, to="xcist", settings=[HIGH]).warnings
+    scanner = dict(line.split(" = ") for line in (tmp_path / "scanner.cfg").read_text().splitlines())
+    lines = (tmp_path / "spectrum_0.dat").read_text().splitlines()[1:]
+    energies, photons = np.array([[float(cell) for cell in line.split(",")] for line in lines]).T
+    depth_mm, gain = float(scanner["scanner.detectorDepth"]), float(scanner["scanner.detectionGain"].split()[0])
+    material = scanner["scanner.detectorMaterial"].strip('"')
+    stopped = 1.0 - np.exp(-depth_mm * mu_per_mm(material_from_name(material), energies))
+    setting = rt.predict(twin, HIGH).setting
+    pixel_mm, distance_mm = float(scanner["scanner.detectorColSize"]), float(scanner["scanner.sdd"])
+    slab_DN = photons @ (energies * stopped) * gain * setting.tube_load_mAs * (pixel_mm * 1000.0 / distance_mm) ** 2
+    share = slab_DN / rt.predict(twin, HIGH).mean_DN.value - 1.0
+    stated_percent = float(re.search(r"level ([+-][0-9.]+) %", said)[1])
+    assert stated_percent == pytest.approx(100.0 * share, abs=0.06) and stated_percent > 2.0
 
 
 def test_open_signal_follows_from_the_exported_spectrum_and_response(make_model_twin, tmp_path):

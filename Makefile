@@ -61,10 +61,11 @@ lock: $(READY)
 test: $(READY) check
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m 'not slow and not browser'
 
-# the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes
+# the page of `raytwin explore` and the pages of results in Debian's Chromium (apt-get install chromium), some minutes;
+# after `make demo` the demo's page too
 test-page: $(READY)
 	$(BIN)/python -m pip install --quiet playwright
-	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py
+	$(BIN)/python -m pytest -q -m browser tests/test_explore_page.py tests/test_reports.py tests/test_campaign_*.py
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow
@@ -97,6 +98,7 @@ validation-simulators: $(READY)
 	for line in usual coarse hard soft three even counting; do OMP_NUM_THREADS=1 $(BIN)/python validation/second_simulator.py --line $$line --json build/second_simulator_$$line.json || exit 1; done
 	for line in csi gos "flat panel"; do OMP_NUM_THREADS=1 $(BIN)/python validation/catsim_sessions.py --line "$$line" --json "build/catsim_$$line.json" || exit 1; done
 	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
+	$(BIN)/python validation/export_in_simulators.py --json build/export_in_simulators.json
 
 # how far laws of a kind depart from ours, for diagnosis/inference/discrepancy.toml: an hour on one core
 discrepancy: $(READY)

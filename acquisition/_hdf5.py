@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from .._guard import bounded
 from ..errors import FileFormatError, InputError
+from ..files import given_path
 
 # What h5py and HDF5 raise at bytes that are not what they should be: whatever they like. `MemoryError` is an extent that
 # no memory holds, `AttributeError` and `IndexError` come from h5py's own code after a call that failed.
@@ -41,10 +41,13 @@ _ATTRIBUTE_S = (
 
 def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
     """Open an HDF5 file for reading; `what` says in the message which kind of file was expected."""
-    location = Path(path)
+    location = given_path(path, expected=what)
+    if location.is_dir():
+        raise FileFormatError(
+            str(path), received="a folder", expected=what, remedy="folders of frames are read by `raytwin import`"
+        )
     if not location.is_file():
-        given = "a folder" if location.is_dir() else "no such file"
-        raise FileFormatError(str(path), received=given, expected=what, remedy="check the path")
+        raise FileFormatError(str(path), received="no such file", expected=what, remedy="check the path")
     try:
         return h5py.File(location, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
     except HDF5_ERRORS as error:
@@ -61,6 +64,18 @@ def open_hdf5(path: str | os.PathLike[str], *, what: str) -> Any:
             expected=what,
             remedy="other layouts are read by `raytwin import`",
         ) from None
+
+
+def check_open(handle: Any, *, where: str) -> None:
+    """Refuse what belongs to a file that was closed.
+
+    Raises:
+        InputError: the file is closed.
+    """
+    if isinstance(handle, h5py.HLObject) and not handle:
+        raise InputError(
+            where, received="a closed file", expected="an open file", remedy="open it again, or give its path"
+        )
 
 
 def _reason(error: BaseException) -> str:

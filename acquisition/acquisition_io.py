@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
+from ..results import Table
 from ._hdf5 import (
     check_format,
+    check_open,
     check_stored,
     child,
     frames_per_piece,
@@ -107,6 +109,7 @@ class Series:
         Raises:
             FileFormatError: a frame that cannot be read or holds a value that is not finite; the series is named.
         """
+        check_open(self._frames, where=self._where)
         chunks = self._frames.chunks
         pixels = self.shape[0] * self.shape[1]
         step = frames_per_piece(
@@ -130,6 +133,7 @@ class Series:
         return self._read(first, max(first, last))
 
     def _read(self, start: int, stop: int) -> NDArray[Any]:
+        check_open(self._frames, where=self._where)
         with reading(self._where):
             frames: NDArray[Any] = self._frames[start:stop]
         wide = frames.dtype.kind in "iu" and frames.dtype not in (np.uint8, np.uint16) and frames.size > 0
@@ -220,7 +224,7 @@ class Scene:
         return inside
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True, repr=False)
 class AcquisitionFile:
     """An open acquisition file; use it in a `with` block.
 
@@ -244,9 +248,39 @@ class AcquisitionFile:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return self._table().as_text()
+
+    def _repr_html_(self) -> str:
+        return self._table().as_html()
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        # opened again where it arrives: an HDF5 handle does not survive the way there
+        return open_acquisition, (self.path,)
+
+    def _table(self) -> Table:
+        rows = tuple(
+            (item.name, item.kind, str(item.n_frames), "" if item.setting is None else str(item.setting), item.scene)
+            for item in self.series
+        )
+        closed = "" if self._file else ", closed"
+        return Table(
+            title=f"Acquisition {self.path}: {len(self.series)} series, {len(self.scenes)} scenes{closed}",
+            header=("series", "kind", "frames", "setting", "scene"),
+            rows=rows,
+        )
+
     def close(self) -> None:
         """Close the file; its series and scenes cannot be read afterwards."""
         self._file.close()
+
+    def check_open(self) -> None:
+        """Refuse a file that was closed.
+
+        Raises:
+            InputError: `close` was called, or the `with` block has ended.
+        """
+        check_open(self._file, where=self.path)
 
     def of_kind(self, *kinds: str) -> tuple[Series, ...]:
         """The series of these kinds, in order of time."""

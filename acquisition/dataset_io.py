@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
+from ..results import Table
 from ._hdf5 import (
     check_format,
+    check_open,
     check_stored,
     child,
     mark_as_pictures,
@@ -74,7 +76,7 @@ _COLUMNS = tuple(field.name for field in fields(DatasetRow))
 _NUMBERS = ("size_mm", "contrast")
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True, repr=False)
 class Dataset:
     """An open dataset file; use it in a `with` block. `len()` is the number of image pairs.
 
@@ -96,6 +98,27 @@ class Dataset:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return self._table().as_text()
+
+    def _repr_html_(self) -> str:
+        return self._table().as_html()
+
+    def _table(self) -> Table:
+        groups: dict[tuple[str, str], list[DatasetRow]] = {}
+        for row in self.rows:
+            groups.setdefault((row.split, row.setting), []).append(row)
+        rows = tuple(
+            (split, setting, str(len(found)), str(sum(bool(row.foreign_object) for row in found)))
+            for (split, setting), found in groups.items()
+        )
+        closed = "" if self._file else ", closed"
+        return Table(
+            title=f"Dataset {self.path}: {len(self)} image pairs of {self.shape[0]} x {self.shape[1]} pixels{closed}",
+            header=("split", "setting", "pairs", "with a foreign object"),
+            rows=rows,
+        )
+
     def close(self) -> None:
         """Close the file; nothing can be read afterwards."""
         self._file.close()
@@ -110,6 +133,7 @@ class Dataset:
     @property
     def has_counts(self) -> bool:
         """Whether the file holds the images in DN too."""
+        check_open(self._file, where=self.path)
         return "counts" in self._file
 
     def images(self, selection: Selection) -> NDArray[np.float32]:
@@ -190,6 +214,7 @@ class Dataset:
         return np.asarray(numbers % max(1, len(self)), dtype=np.intp)
 
     def _take(self, name: str, selection: Selection) -> NDArray[Any]:
+        check_open(self._file, where=self.path)
         dataset = self._file[name]
         with reading(f"{self.path}, {name}"):
             if isinstance(selection, slice) and (selection.step or 1) > 0:

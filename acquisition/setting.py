@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from ..errors import InputError
+from ..errors import InputError, check_number
 
 LARGEST_BINNING = 64
 
@@ -107,6 +107,8 @@ class Setting:
             ("belt_speed_mm_s", "mm/s"),
         ):
             value = getattr(self, name)
+            if value is not None:
+                check_number(name, value, unit=unit)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
         if self.averaged < 1 or self.averaged != int(self.averaged):

@@ -19,6 +19,7 @@ from ..acquisition.import_any import draft_sidecar, import_folder, layout_of
 from ..acquisition.pairs import object_pairs
 from ..acquisition.setting import text_from_filters
 from ..errors import FileFormatError, InputError
+from ..files import given_path
 from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
 from ..generator.twins.twin_io import FORMAT as TWIN_FORMAT
 from ..generator.twins.twin_io import read_any_twin
@@ -159,7 +160,7 @@ def check_acquisition(path: str | os.PathLike[str], *, progress: Progress | None
         >>> check_acquisition("session.h5").counts  # doctest: +SKIP
         {'error': 0, 'warning': 1, 'note': 2}
     """
-    place = Path(path)
+    place = given_path(path, expected="an acquisition file, a folder of measurements or a twin")
     if not place.exists():
         raise InputError(
             str(path),
@@ -338,6 +339,7 @@ def _ordered(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def check_series(acquisition: AcquisitionFile, *, progress: Progress | None = None) -> CheckResult:
     """Check the series of an open acquisition; see `check_acquisition`."""
+    acquisition.check_open()
     findings: list[Finding] = []
     scans: dict[str, _Kept] = {}
     patterns: dict[str, list[_Pattern]] = {}

@@ -198,6 +198,11 @@ class Validation(Result):
             if error["sd"] is not None:
                 line += f"; noise: {error['sd']:.2f} %, {100 * share['sd']:.0f} %"
             notes.insert(0, line)
+            seen = sum(row.used_in_calibration for row in self.rows)
+            if seen:
+                notes.insert(
+                    1, f"{seen} of {len(self.rows)} series calibrated this twin: their errors say how well it fits"
+                )
         return Table(
             title=title,
             header=("series", "setting", "level, %", "noise, %", "inside"),

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, RaytwinError
+from ..files import only_one
 from ._children import THREAD_VARIABLES, ChildError, Children
 from ._leash import line_from_parent
 
@@ -110,7 +111,7 @@ def train_together(
             progress(number, len(history), len(history), history[-1])
 
     children = Children()
-    with ThreadPoolExecutor(max_workers=max(1, len(hands))) as pool:
+    with only_one(runs.path, "a training"), ThreadPoolExecutor(max_workers=max(1, len(hands))) as pool:
         running: list[Future[None]] = [
             pool.submit(children.run, "ensemble", given=json.dumps({**task, "only": numbers}), environment=environment)
             for numbers in hands
@@ -130,7 +131,7 @@ def train_together(
                     " and the same call goes on"
                 ) from None
             raise
-    return train_networks(dataset, folder, **words, warn=None)
+        return train_networks(dataset, folder, **words, only=range(networks))
 
 
 def main() -> int:

@@ -264,9 +264,11 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
     keep_best_of = words.choice("keep_best_of", "throughput", KEEP_OF)
     words.done(_TABLES)
     content_words = {word.lower() for word in content}
-    requirement, size_of_requirement = None, SIZES[0]
+    # a contrast is another one at every setting where products are described; a length is not
+    described = references.suffix.lower() == ".toml"
+    requirement, usual_size = None, "size_mm" if described else "contrast"
     if "requirement" in content_words:
-        requirement, size_of_requirement = _requirement(tables["requirement"])
+        requirement, usual_size = _requirement(tables["requirement"])
     campaign = Campaign(
         path=file,
         twin=twin,
@@ -285,12 +287,12 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
         screening=_screening(tables["screening"], file.parent) if "screening" in content_words else None,
         training=_training(tables["training"]),
         trying=_trying(tables["detection"]),
-        curve=_curve(tables["pod"], usual=size_of_requirement),
+        curve=_curve(tables["pod"], usual=usual_size),
         slabs=_slabs(tables["contrast"]),
         keep_best=keep_best,
         keep_best_of=keep_best_of,
     )
-    _check_together(campaign, size_of_requirement)
+    _check_together(campaign, usual_size)
     return campaign
 
 
@@ -346,11 +348,19 @@ def _check_together(campaign: Campaign, size_of_requirement: str) -> None:
             received=f"the description {campaign.test_references.name} beside reference images",
             expected="reference images as well",
         )
-    if campaign.described != (campaign.training.start is not None) and campaign.training.start_steps:
+    if campaign.described and campaign.training.start is None and campaign.training.start_steps:
+        low, high = (replace(one, averaged=50, belt_speed_mm_s=None) for one in campaign.settings[0])
         raise InputError(
             f"{name}, [training], start_low and start_high",
-            received="nothing" if campaign.described else "settings, with reference images",
-            expected="low-noise settings to learn from first, with a description; none with references: they are that",
+            received="neither, with products from a description",
+            expected="two low-noise settings to learn from first",
+            remedy=f'for example start_low = "{low}" and start_high = "{high}"; start_steps = 0 does without',
+        )
+    if not campaign.described and campaign.training.start is not None and campaign.training.start_steps:
+        raise InputError(
+            f"{name}, [training], start_low and start_high",
+            received="settings, with reference images",
+            expected="none: networks learn from the references first",
         )
     if campaign.described and campaign.curve.size == "contrast":
         raise InputError(

@@ -320,6 +320,12 @@ def _interval(low: float | None, high: float | None) -> str:
     return f"{_number(low)} to {_number(high)}"
 
 
+def _percent(share: float) -> str:
+    """A share in per cent: two figures, and no more than two behind the point."""
+    percent = 100.0 * share
+    return f"{percent:.2g}" if 0.01 <= percent < 99.5 else f"{percent:.0f}"
+
+
 def _ratio(ratio: Mapping[str, Any] | None) -> str:
     if not ratio or ratio["value"] is None:
         return _DASH
@@ -356,7 +362,7 @@ def _trained_table(
             f"{row['n_hits']}/{row['n']}",
             _DASH
             if alarms is None
-            else f"{100 * alarms['value']:.3g} % ({100 * alarms['low']:.2g} to {100 * alarms['high']:.2g})",
+            else f"{_percent(alarms['value'])} % ({_percent(alarms['low'])} to {_percent(alarms['high'])})",
             _number(row["throughput_per_s"]),
         ]
         cells += [_number(row["motion_px"])] if columns["motion_px"] else []

@@ -19,7 +19,7 @@ Done = Callable[[Task, str], None]  # the task, and why it failed (empty: it did
 
 TRIES = 2
 _ERROR_LETTERS = 400
-INSTALL_COMMAND = "pip install '.[cluster]'"
+INSTALL_COMMAND = "pip install 'raytwin[cluster]'"
 
 
 class Runner(Protocol):
@@ -214,7 +214,7 @@ def _distributed() -> Any:
         import distributed
     except ImportError as error:
         raise MissingDependencyError(
-            f"--scheduler needs dask.distributed, which cannot be imported ({error}); install it with `{INSTALL_COMMAND}` in"
-            " raytwin's checkout"
+            f"--scheduler needs dask.distributed, which cannot be imported ({error}); install it with"
+            f" `{INSTALL_COMMAND}`"
         ) from None
     return distributed

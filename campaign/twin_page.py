@@ -11,7 +11,7 @@ from ..generator.line.twin import Estimate, Level, Twin
 from ..generator.predictions.tube_twin import TubeTwin
 from ..generator.twins.twin_answer import calibration_answer
 from ..reports import Chart, Figure, KeyFigure, Line, Picture, Points, ResultPage, Rule, Section, SortedTable, Step
-from ..reports.chart import AFTER, BEFORE, MEASURED, QUIET, SERIES_COLOURS, SHAPES, Shape, wrapped
+from ..reports.chart import AFTER, BEFORE, MEASURED, QUIET, SERIES_COLOURS, SHAPES, Shape, rows_px
 
 _KINDS: dict[str, tuple[str, Shape]] = {
     "not seen": (AFTER, "circle"),
@@ -367,7 +367,7 @@ def error_chart(what: str, rows: Sequence[tuple[str, float, Estimate, str]]) -> 
         y_ticks={float(place): row[0] for place, row in enumerate(rows)},
         y_ends=(-0.7, len(rows) - 0.3),
         downwards=True,
-        height_px=min(120 + sum(max(20, 15 * len(wrapped(row[0]).split("\n"))) for row in rows), 1400),
+        height_px=min(120 + rows_px([row[0] for row in rows]), 1400),
     )
 
 

@@ -170,6 +170,8 @@ def material_from_name(text: str, *, library: Library | None = None) -> Material
     Raises:
         InputError: nobody is called so; the nearest names are suggested.
     """
+    if not isinstance(text, str):
+        raise InputError("material", received=repr(text), expected="a name; for example water, Al or Gd2O2S@7.32")
     return _material_from_name(text.strip(), library_from_files() if library is None else library)
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FitError, InputError
+from ..errors import FitError, InputError, check_number
 from .crossed import usable_factors
 from .few_groups import ONE_SIDED, TWO_SIDED, student_quantile
 from .hit_miss import PodFit
@@ -121,8 +121,11 @@ def compare_pod(
     Raises:
         InputError: a margin that is no positive number.
     """
+    check_number("margin", margin)
     if not (math.isfinite(margin) and margin > 0):
         raise InputError("margin", received=margin, expected="a positive share of a90, for example 0.1")
+    if size_margin is not None:
+        check_number("size margin", size_margin)
     if size_margin is not None and not (math.isfinite(size_margin) and size_margin > 0):
         raise InputError("size margin", received=size_margin, expected="a positive size, in the unit of the tables")
     fits = tuple(

@@ -113,7 +113,7 @@ def read_pod_table(
     if where:
         rows, lines = _filtered(header, rows, lines, where)
     notes: list[str] = []
-    size_name = _chosen(size, header, "--size") if size else _default(header, SIZE_NAMES, "size")
+    size_name = _chosen(size, header, "size") if size else _default(header, SIZE_NAMES, "size")
     at_size = header.index(size_name)
     named: dict[str, str | None] = {}
     for role, name, usual in (
@@ -121,16 +121,16 @@ def read_pod_table(
         ("image", image, ("image",)),
         ("site", site, SITE_NAMES),
     ):
-        named[role] = _chosen(name, header, f"--{role}") if name else _present(header, usual)
-    trials_name = _chosen(trials, header, "--trials") if trials else None
-    response_name = _chosen(response, header, "--response") if response else None
+        named[role] = _chosen(name, header, role) if name else _present(header, usual)
+    trials_name = _chosen(trials, header, "trials") if trials else None
+    response_name = _chosen(response, header, "response") if response else None
     hit_names: list[str] = []
     if response_name is None:
         hit_names = _hit_columns(hit, header, rows, at_size, [n for n in (*named.values(), trials_name) if n])
         if len(hit_names) > 1:
             if trials_name:
                 raise InputError(
-                    "--trials", received=f"with {len(hit_names)} columns of hits", expected="one column of hits"
+                    "trials", received=f"with {len(hit_names)} columns of hits", expected="one column of hits"
                 )
             rows, lines, header = _melted(header, rows, lines, hit_names)
             if named["image"] is None:
@@ -212,7 +212,9 @@ def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
         )
     names = list(source) if isinstance(source, Mapping) else list(source.columns)
     columns = [[_cell_text(value) for value in source[name]] for name in names]
-    if not columns or len({len(column) for column in columns}) != 1 or not columns[0]:
+    if not columns:
+        raise InputError("table", received="a table without columns", expected="columns of sizes and hits")
+    if len({len(column) for column in columns}) != 1 or not columns[0]:
         raise InputError(
             "table", received=f"columns of {[len(column) for column in columns]} rows", expected="columns of one length"
         )
@@ -290,11 +292,11 @@ def _filtered(
 ) -> tuple[list[list[str]], list[int]]:
     kept = list(range(len(rows)))
     for name, value in where.items():
-        at = header.index(_chosen(name, header, "--where"))
+        at = header.index(_chosen(name, header, "where"))
         known = sorted({rows[i][at].strip() for i in kept})
         kept = [i for i in kept if rows[i][at].strip() == value]
         if not kept:
-            raise InputError("--where", received=f"{name}={value}", expected=f"one of {', '.join(known[:12])}")
+            raise InputError("where", received=f"{name}={value}", expected=f"one of {', '.join(known[:12])}")
     return [rows[i] for i in kept], [lines[i] for i in kept]
 
 
@@ -326,7 +328,7 @@ def _default(header: list[str], names: Sequence[str], option: str) -> str:
             option,
             received="columns " + ", ".join(header),
             expected="one of " + ", ".join(names),
-            remedy=f"name the column with --{option}",
+            remedy=f"name the column: {option}=... (--{option})",
         )
     return found
 
@@ -337,7 +339,7 @@ def _hit_columns(
     if hit is not None:
         asked = [hit] if isinstance(hit, str) else list(hit)
         names = [part.strip() for name in asked for part in (name.split(",") if name not in header else [name])]
-        return [_chosen(name, header, "--hit") for name in names]
+        return [_chosen(name, header, "hit") for name in names]
     found = _present(header, HIT_NAMES)
     if found is not None:
         return [found]

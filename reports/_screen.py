@@ -146,6 +146,8 @@ def _chart(chart: Chart) -> Any:
                 (int(place) if place.is_integer() else place): wrapped(text)
                 for place, text in zip(places, ticks.values(), strict=True)
             }
+        elif short := chart.ticks_of_short_log(name):  # type: ignore[arg-type]
+            axis.ticker = FixedTicker(ticks=list(short), minor_ticks=[])
     for name, box, ends in (("x", plot.x_range, chart.x_ends), ("y", plot.y_range, chart.y_ends)):
         if ends is not None:
             box.start, box.end = (float(value) for value in chart.place(ends, name))  # type: ignore[arg-type]

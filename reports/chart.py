@@ -136,6 +136,21 @@ class Chart:
             return numbers
         return np.asarray(np.arcsinh(numbers / self.linear_within))
 
+    def ticks_of_short_log(self, axis: Literal["x", "y"]) -> tuple[float, ...]:
+        """1, 2 and 5 times powers of ten, for a logarithmic axis whose values span one to two decades; else empty.
+
+        Between one and two decades equal steps crowd at the upper end and powers of ten are too few.
+        """
+        scale, ends, ticks = (getattr(self, f"{axis}_{word}") for word in ("scale", "ends", "ticks"))
+        if scale != "log" or ticks is not None:
+            return ()
+        values = _numbers(ends) if ends is not None else np.concatenate([_along(mark, axis) for mark in self.marks])
+        values = values[np.isfinite(values) & (values > 0.0)]
+        if not values.size or not 10.0 <= values.max() / values.min() <= 100.0:
+            return ()
+        first, last = (int(np.floor(np.log10(value))) for value in (values.min(), values.max()))
+        return tuple(float(f"{step}e{power}") for power in range(first - 1, last + 2) for step in (1, 2, 5))
+
     def numbers_csv(self) -> str:
         """The numbers that the chart shows, a row a point: mark, name, and the columns that the marks have."""
         rows = [row for number, mark in enumerate(self.marks) for row in _rows(mark, number)]
@@ -185,6 +200,18 @@ class Picture:
 Figure: TypeAlias = Chart | Picture
 
 _MOST_POINTS = 160  # along a side: what a screen shows of one picture of several
+
+
+def _along(mark: Mark, axis: Literal["x", "y"]) -> Array:
+    """All numbers of a mark that lie along an axis."""
+    if isinstance(mark, Rule):
+        return _numbers(mark.at if mark.along == axis else [])
+    if isinstance(mark, Bars):
+        return _numbers(mark.length if axis == "x" else mark.y)
+    if isinstance(mark, Band) and axis == "y":
+        return np.concatenate([_numbers(mark.low), _numbers(mark.high)])
+    ends = getattr(mark, f"{axis}_ends", None)
+    return np.concatenate([_numbers(getattr(mark, axis)), *(map(_numbers, ends) if ends is not None else ())])
 
 
 def mean_of_squares(values: Array, side: int) -> Array:
@@ -237,6 +264,12 @@ def _plain(value: float) -> str:
 def wrapped(text: str) -> str:
     """The text of a tick in lines of at most some 24 letters: a phone has no room for more beside a figure."""
     return "\n".join(textwrap.wrap(text, 24, break_long_words=True)) or text
+
+
+def rows_px(names: Sequence[str]) -> int:
+    """Height (px) of rows that are named at an axis: all as high as the name of most lines, so that none runs into the next."""
+    lines = max((wrapped(name).count("\n") + 1 for name in names), default=1)
+    return len(names) * (8 + 14 * lines)
 
 
 def asinh_ticks(largest: float, *, linear_within: float) -> dict[float, str]:

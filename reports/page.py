@@ -155,6 +155,7 @@ def write_page(
         loader=jinja2.FileSystemLoader([template.parent, Path(__file__).parent]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=_as_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -169,6 +170,11 @@ def write_page(
     with whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
+
+
+def _as_shown(value: Any) -> Any:
+    """Texts are kept in ASCII for terminals; a page has the sign."""
+    return value.replace("+-", "\u00b1") if type(value) is str and not value.startswith("data:") else value
 
 
 def _data(content: bytes, kind: str) -> str:

@@ -6,7 +6,7 @@ from types import ModuleType
 
 from ..errors import MissingDependencyError
 
-INSTALL_COMMAND = "pip install '.[segmentation]'"
+INSTALL_COMMAND = "pip install 'raytwin[segmentation]'"
 
 
 def load_torch() -> ModuleType:
@@ -28,5 +28,5 @@ def _load(name: str) -> ModuleType:
     except ImportError as error:
         raise MissingDependencyError(
             f"segmentation networks need {name}, which cannot be imported ({error}); install it with"
-            f" `{INSTALL_COMMAND}` in raytwin's checkout"
+            f" `{INSTALL_COMMAND}`"
         ) from None

@@ -1,13 +1,14 @@
 """Networks on a dataset file: train a folder of them, and try every one of them on every image."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
-from ..files import sha256_of_file
+from ..files import only_one, sha256_of_file
 from ._torch import load_torch
 from .detection import MARK_THRESHOLD, Detection, detect_on_row
 from .examples import examples_from_dataset
@@ -120,7 +121,7 @@ def train_networks(
         Records of networks 0 .. networks - 1, or of those in `only`.
 
     Raises:
-        InputError: a folder of another configuration, unusable data or weights.
+        InputError: a folder of another configuration, or one that another training works in; unusable data or weights.
     """
     if networks < 1:
         raise InputError("networks", received=networks, expected="a whole number, 1 or more")
@@ -148,47 +149,49 @@ def train_networks(
     if all(train_examples[number][1][-1].any() for number in range(len(train_examples))):
         say("no training image is without a foreign object: expect false alarms on clean products")
     runs = create_or_resume_runs(runs_path, configuration)
-    done = set(finished_networks(runs))
-    results = []
-    for number in range(networks) if only is None else only:
-        if number in done:
-            result = read_result(runs, number)
-            if progress is not None:
-                progress(number, len(result.history), len(result.history), None)
-            results.append(result)
-            continue
-        resume = _state_or_none(runs, number, say)
-        if resume is not None and progress is not None:
-            progress(number, resume.epochs_done, resume.epochs_wanted, None)
-        state = resume
-        for state in iterate_training(
-            train_examples,
-            validation_examples,
-            recipe=recipe,
-            seed=seed,
-            network_number=number,
-            device=device,
-            start_from=starts.get(number, starts.get(-1)),
-            resume=resume,
-            network=network,
-        ):
-            write_state(runs, number, state)
-            if progress is not None:
-                progress(number, state.epochs_done, state.epochs_wanted, state.history[-1])
-        if state is None or not state.best_weights:
-            raise InputError(
-                "validation images",
-                received="a validation loss that is never finite",
-                expected="images on which the network can be judged",
-            )
-        notes = {
-            "device": device,
-            "torch": str(torch.__version__),
-            "threads": torch.get_num_threads(),
-            "n_train": len(train),
-            "n_validation": len(validation),
-        }
-        results.append(write_finished(runs, number, state, notes=notes))
+    # processes that share a folder on purpose say which networks are theirs; whoever started them holds the lock
+    with nullcontext() if only is not None else only_one(runs.path, "a training"):
+        done = set(finished_networks(runs))
+        results = []
+        for number in range(networks) if only is None else only:
+            if number in done:
+                result = read_result(runs, number)
+                if progress is not None:
+                    progress(number, len(result.history), len(result.history), None)
+                results.append(result)
+                continue
+            resume = _state_or_none(runs, number, say)
+            if resume is not None and progress is not None:
+                progress(number, resume.epochs_done, resume.epochs_wanted, None)
+            state = resume
+            for state in iterate_training(
+                train_examples,
+                validation_examples,
+                recipe=recipe,
+                seed=seed,
+                network_number=number,
+                device=device,
+                start_from=starts.get(number, starts.get(-1)),
+                resume=resume,
+                network=network,
+            ):
+                write_state(runs, number, state)
+                if progress is not None:
+                    progress(number, state.epochs_done, state.epochs_wanted, state.history[-1])
+            if state is None or not state.best_weights:
+                raise InputError(
+                    "validation images",
+                    received="a validation loss that is never finite",
+                    expected="images on which the network can be judged",
+                )
+            notes = {
+                "device": device,
+                "torch": str(torch.__version__),
+                "threads": torch.get_num_threads(),
+                "n_train": len(train),
+                "n_validation": len(validation),
+            }
+            results.append(write_finished(runs, number, state, notes=notes))
     return results
 
 

@@ -111,7 +111,7 @@ def segmenter_from_onnx(
         import onnxruntime
     except ImportError:
         raise MissingDependencyError(
-            "ONNX files need onnxruntime, which is not installed; install it with `pip install '.[onnx]'` in raytwin's checkout"
+            "ONNX files need onnxruntime, which is not installed; install it with `pip install 'raytwin[onnx]'`"
         ) from None
     try:
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])

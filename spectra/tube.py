@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..acquisition.setting import Filter
-from ..errors import InputError
+from ..errors import InputError, check_number
 from ..materials import Library
 from ._cache import keep, read_kept
 from ._packaged import packaged_fluence, packaged_lines, packaged_version
@@ -381,6 +381,7 @@ def checked_kV(kV: float, *, anode: str) -> float:
     if anode not in MAXIMUM_KV_OF_ANODE:
         raise InputError("anode", received=repr(anode), expected=f"one of {', '.join(MAXIMUM_KV_OF_ANODE)}")
     highest = MAXIMUM_KV_OF_ANODE[anode]
+    check_number("kV", kV, unit="kV")
     if not MINIMUM_KV <= kV <= highest:
         raise InputError(
             "kV",

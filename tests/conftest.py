@@ -302,3 +302,64 @@ products = 8
         return folder
 
     return make
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium, driven by Playwright; tests that ask for it are marked `browser` and run with `make test-page`."""
+    import shutil
+
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def open_page(browser):
+    """Called with a page's path, a width and a height: the page opened from its file; `asked` and `wrong` hold what it requests
+    and the errors of its scripts."""
+
+    def opened(path, width=1200, height=900):
+        context = browser.new_context(viewport={"width": width, "height": height})
+        page = context.new_page()
+        page.asked, page.wrong = [], []
+        context.on("request", lambda request: page.asked.append(request.url))
+        page.on("pageerror", lambda error: page.wrong.append(str(error)))
+        page.on("console", lambda text: page.wrong.append(text.text) if text.type == "error" else None)
+        page.goto(path.as_uri())
+        page.wait_for_timeout(1500)
+        return page
+
+    return opened
+
+
+@pytest.fixture(scope="module")
+def check_page(open_page):
+    """Called with a page's path: at 1200 and 400 px, folds open, it asks for nothing but itself, has no error, is no wider than
+    the window, and every figure is drawn."""
+
+    def check(path, *, static=False):
+        for width, height in ((1200, 900), (400, 800)):
+            page = open_page(path, width, height)
+            page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
+            page.wait_for_timeout(1000)
+            assert [url for url in page.asked if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+            assert page.wrong == []
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            sizes = page.evaluate("Array.from(document.images).map((one) => one.naturalWidth)")
+            assert min(sizes, default=1) > 0
+            figures = page.locator(".drawn").count()
+            assert (figures == 0 and sizes) if static else figures > 0
+            if figures:
+                page.locator(".drawn canvas").last.wait_for(timeout=60_000)
+                boxes = [canvas.bounding_box() for canvas in page.locator(".drawn canvas").all()]
+                wide = [box for box in boxes if box is not None and box["width"] > 0.5 * min(width, 340)]
+                assert len(wide) >= figures  # an axis has a canvas of its own
+            page.context.close()
+
+    return check

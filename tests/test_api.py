@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 import raytwin as rt
 from raytwin.cli import main
 from raytwin.generator.line.twin import Twin
+from raytwin.materials import material_from_name, mu_per_mm
 from raytwin.results import LINES, same_value
 
 ROOT = Path(__file__).parents[1]
@@ -323,6 +324,24 @@ def test_seeds_may_be_generators_and_progress_a_function(inside, capsys):
         rt.calibrate("session.h5", seed="now")
 
 
+def test_open_files_are_a_short_table_and_open_again_from_a_pickle(inside):
+    with rt.open_acquisition("session.h5") as session, rt.read_dataset("references.h5") as dataset:
+        for opened in (session, dataset):
+            lines = repr(opened).splitlines()
+            assert len(lines) <= LINES and opened.path in lines[0] and "closed" not in lines[0]
+            assert "<table>" in opened._repr_html_()
+            with pickle.loads(pickle.dumps(opened)) as again:
+                assert repr(again) == repr(opened)
+        assert all(item.name in repr(session) for item in session.series)
+    assert "closed" in repr(session).splitlines()[0] and "closed" in repr(dataset).splitlines()[0]
+
+
+def test_a_mistyped_name_has_its_neighbour_suggested():
+    code = "import raytwin as rt\nrt.calibrat"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.splitlines()[-1].endswith("Did you mean: 'calibrate'?")
+
+
 def test_pairs_in_memory_are_saved_trained_on_and_equal_the_file(inside, capsys):
     pairs = made("pairs in memory", capsys)
     pairs.save("saved.h5")
@@ -350,6 +369,11 @@ def test_paths_open_files_lists_and_frames_are_taken_alike(inside, capsys):
     assert twin.predict(setting) == twin.predict(words) == rt.predict("twin.h5", words)
 
 
+def closed():
+    with rt.open_acquisition("session.h5") as session:
+        return session
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -365,6 +389,30 @@ def test_paths_open_files_lists_and_frames_are_taken_alike(inside, capsys):
         (lambda: rt.lab_session("x.h5", protocol="calibration", sizes=3), "sizes"),
         (lambda: rt.diagnose("session.h5", task={"measured": "x"}), "an output folder"),
         (lambda: rt.export("twin.h5", "x", to="geant4"), "one of csv, gvxr"),
+        (lambda: rt.calibrate(3), "acquisition: got int"),
+        (lambda: rt.calibrate([3]), "got 3 (int); expected the path of an acquisition file"),
+        (
+            lambda: rt.calibrate("."),
+            "a folder; expected an acquisition file; folders of frames are read by `raytwin import`",
+        ),
+        (lambda: rt.calibrate("session.h5", progress=3), "progress: got 3"),
+        (lambda: rt.validate("session_twin.h5", None), "acquisition: got NoneType"),
+        (lambda: rt.check(3), "got 3 (int)"),
+        (lambda: rt.check(closed()), "session.h5: got a closed file"),
+        (lambda: rt.calibrate(closed()), "session.h5: got a closed file"),
+        (lambda: closed().series[0].read_frames(0, 1), "got a closed file"),
+        (lambda: next(closed().series[0].iter_frames()), "got a closed file"),
+        (lambda: rt.open_acquisition(None), "expected the path of an acquisition file"),
+        (lambda: rt.read_dataset(3), "expected the path of a dataset file"),
+        (lambda: rt.read_twin("twin.h5").save(3), "expected the path of a file to write"),
+        (lambda: rt.read_twin("virtual_lb"), "did you mean virtual_lab?"),
+        (lambda: rt.predict("twin.h5", kV=60, power_W=1, exposure_ms=1, filter=3), "filter: got 3"),
+        (lambda: rt.generate("twin.h5", "references.h5", low=3, high=HIGH, n=1, seed=1), "setting: got 3"),
+        (lambda: rt.Setting(kV="sixty", exposure_ms=1), "kV: got 'sixty'; expected a number, in kV"),
+        (lambda: rt.spectrum(kV="sixty"), "kV: got 'sixty'; expected a number, in kV"),
+        (lambda: rt.mu(3, kV=60), "material: got 3; expected a name"),
+        (lambda: rt.compare("hits.csv", "other_hits.csv", margin="x"), "margin: got 'x'; expected a number"),
+        (lambda: rt.fit_pod({}), "table: got a table without columns"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_error_and_leaves_nothing(inside, call, message):
@@ -372,6 +420,39 @@ def test_what_cannot_be_used_is_one_clear_error_and_leaves_nothing(inside, call,
     with pytest.raises(rt.InputError, match=re.escape(message)):
         call()
     assert sorted(os.listdir()) == before
+
+
+def test_an_export_for_gvxr_gives_the_level_by_gvxrs_own_rule(make_model_twin, tmp_path):
+    """Photons a cm2 at 1 m, a pixel of (pitch)^2 at the detector's distance, the table of responses in keV; images are in MeV."""
+    twin = make_model_twin((16, 24))
+    rt.export(twin, tmp_path, to="gvxr", settings=[HIGH])
+    page = json.loads((tmp_path / "gvxr_0.json").read_text())
+    assert page["WindowSize"] == page["Detector"]["NumberOfPixels"] == [24, 16]
+    energies, photons = np.array([(one["Energy"], one["PhotonCount"]) for one in page["Source"]["Beam"]]).T
+    response_keV = np.interp(energies, *np.array(page["Detector"]["Energy response"]["LUT"]).T)
+    distance_m = -page["Source"]["Position"][1] / 1000.0
+    pixel_cm2 = math.prod(page["Detector"]["Spacing"][:2]) / 100.0
+    image_MeV = photons @ response_keV * pixel_cm2 / distance_m**2 / 1000.0
+    DN_per_keV = json.loads((tmp_path / "noise.json").read_text())["DN_per_keV"]
+    assert image_MeV * 1000.0 * DN_per_keV == pytest.approx(rt.predict(twin, HIGH).mean_DN.value, rel=1e-5)
+
+
+def test_an_export_for_gecatsim_says_by_how_much_its_slab_departs(make_model_twin, tmp_path):
+    """gecatsim's Detection_EI, written out: E (1 - exp(-mu depth)), the depth and gain of the file, all cross sections together."""
+    twin = make_model_twin((16, 16))
+    (said,) = rt.export(twin, tmp_path, to="xcist", settings=[HIGH]).warnings
+    scanner = dict(line.split(" = ") for line in (tmp_path / "scanner.cfg").read_text().splitlines())
+    lines = (tmp_path / "spectrum_0.dat").read_text().splitlines()[1:]
+    energies, photons = np.array([[float(cell) for cell in line.split(",")] for line in lines]).T
+    depth_mm, gain = float(scanner["scanner.detectorDepth"]), float(scanner["scanner.detectionGain"].split()[0])
+    material = scanner["scanner.detectorMaterial"].strip('"')
+    stopped = 1.0 - np.exp(-depth_mm * mu_per_mm(material_from_name(material), energies))
+    setting = rt.predict(twin, HIGH).setting
+    pixel_mm, distance_mm = float(scanner["scanner.detectorColSize"]), float(scanner["scanner.sdd"])
+    slab_DN = photons @ (energies * stopped) * gain * setting.tube_load_mAs * (pixel_mm * 1000.0 / distance_mm) ** 2
+    share = slab_DN / rt.predict(twin, HIGH).mean_DN.value - 1.0
+    stated_percent = float(re.search(r"level ([+-][0-9.]+) %", said)[1])
+    assert stated_percent == pytest.approx(100.0 * share, abs=0.06) and stated_percent > 2.0
 
 
 def test_open_signal_follows_from_the_exported_spectrum_and_response(make_model_twin, tmp_path):

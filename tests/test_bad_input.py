@@ -306,7 +306,6 @@ def test_a_failure_leaves_an_existing_output_as_it_was(files, tmp_path, capsys):
         ["calibrate"],
         ["predict", "twin.h5"],
         ["predict", "twin.h5", "--kv", "sixty", "--power-w", "1", "--exposure-ms", "1"],
-        ["calibrate", "a.h5", "-o", "b.h5", "--unknown"],
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
@@ -317,6 +316,35 @@ def test_wrong_usage_is_one_line_and_exit_2(capsys, words):
     assert captured.out == ""
     assert len(captured.err.splitlines()) == 1
     assert captured.err.startswith("raytwin")
+
+
+@pytest.mark.parametrize(
+    ("word", "remedy"),
+    [("--unknown", ""), ("--seeds", "did you mean --seed?"), ("--reprt=x.html", "did you mean --report?")],
+)
+def test_an_unknown_option_is_one_line_with_its_neighbour_and_exit_2(capsys, word, remedy):
+    assert main(["calibrate", "a.h5", "-o", "b.h5", word]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith(f"raytwin calibrate: error: {word}: got") and captured.err.strip().endswith(
+        remedy or "--help`"
+    )
+
+
+@pytest.mark.parametrize(
+    "refusal", [PermissionError(13, "Permission denied", "a.h5"), OSError(28, "No space left on device")]
+)
+def test_what_the_system_refuses_is_one_line_and_exit_2(files, capsys, monkeypatch, refusal):
+    def refuse(*_, **__):
+        raise refusal
+
+    monkeypatch.setattr("raytwin.calibration.check.check_acquisition", refuse)
+    assert main(["check", str(files["session"])]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert refusal.strerror in captured.err
 
 
 def test_an_unknown_command_is_one_line_and_exit_2(capsys):

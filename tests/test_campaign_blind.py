@@ -736,3 +736,9 @@ def test_three_small_sessions_end_to_end(tmp_path, capsys):
     assert len(scores["code_versions"]) == 1
     assert scores["statistics_errors"] == []
     assert "data:image/png;base64," in (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.browser
+def test_the_page_fits_asks_nobody_and_draws_its_figures(many, tmp_path, check_page):
+    check, result = many
+    check_page(write_report(result, case_rows(check, result.outcomes), tmp_path / "report.html", version="0"))

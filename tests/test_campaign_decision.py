@@ -193,14 +193,14 @@ def test_where_nothing_meets_it_the_closest_is_named_with_what_is_missing():
     assert "None was tried" in decide(rows, ASKED, judged, recommended=None, unit="mm", changes_by="")["sentence"]
 
 
-def page_of(answer, folder):
+def page_of(answer, folder, *, interactive=False):
     """The decision's part of a sweep's page, alone on one."""
     part = Path(raytwin.campaign.__path__[0]) / "decision_report.html"
     template = folder / "page.html"
     template.write_text('{% extends "base.html" %}{% block body %}' + part.read_text() + "{% endblock %}")
     values, figures = decision_part(answer)
     return write_page(
-        folder / "out.html", template, version="0", figures=figures, interactive=False, **values
+        folder / "out.html", template, version="0", figures=figures, interactive=interactive, **values
     ).read_text()
 
 
@@ -230,3 +230,9 @@ def test_python_and_the_page_show_the_decision(answer, tmp_path):
     assert "&lt;b&gt;bold" in page and "<b>bold" not in page
     assert "60 a minute" in page and "would help most" in page and page.count("data:image/png") == 2
     assert Sweep(path=tmp_path, answer=answer | {"decision": None}).decision is None
+
+
+@pytest.mark.browser
+def test_the_page_fits_asks_nobody_and_draws_its_figures(answer, tmp_path, check_page):
+    page_of(answer, tmp_path, interactive=True)
+    check_page(tmp_path / "out.html")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import threading
 import time
@@ -351,10 +352,24 @@ def test_the_report_shows_every_setting(line, whole):
     assert "400 W" in page and "data:image/png" in page
 
 
+def test_with_a_description_objects_count_by_length_and_the_remedy_for_a_missing_start_can_be_copied(line):
+    text = CAMPAIGN.replace('references = "references.h5"', 'references = "products.toml"')
+    with pytest.raises(InputError, match="two low-noise settings to learn from first") as error:
+        campaign_of(line, name="described.toml", text=text)
+    low, high = re.findall(r'start_(?:low|high) = "[^"]+"', str(error.value))
+    campaign = campaign_of(
+        line, name="described.toml", text=text.replace("start_steps = 2", f"start_steps = 2\n{low}\n{high}")
+    )
+    assert campaign.curve.size == "size_mm"
+    assert campaign.training.start is not None and all("averaged=50" in one for one in campaign.training.start)
+    # where references are measured, a contrast is known for every setting
+    assert campaign_of(line, text=CAMPAIGN).curve.size == "contrast"
+
+
 def test_a_description_serves_as_references(line, tmp_path):
     text = CAMPAIGN.replace('references = "references.h5"', 'references = "products.toml"')
     text = text.replace("exposure_ms = [20, 50]", "exposure_ms = 50").replace("start_steps = 2", "start_steps = 0")
-    text += '[detection]\nimages = 10\n[pod]\nsize = "size_mm"\n'
+    text += "[detection]\nimages = 10\n"
     campaign = campaign_of(line, name="described.toml", text=text)
     answer = sweep(campaign, tmp_path / "described", Here())
     assert answer["unit"] == "mm"
@@ -818,3 +833,13 @@ def test_the_shipped_twin_goes_by_its_name(line):
 def test_outlooks_without_contrast_to_noise_are_all_kept():
     pair = LONG
     assert keep_best([Outlook(pair=pair)], keep=1, of="all")[0].kept
+
+
+@pytest.mark.browser
+def test_the_page_fits_asks_nobody_and_draws_its_figures(line, whole, check_page):
+    folder, answer = whole
+    campaign = read_campaign(line / "campaign.toml")
+    for name, interactive in (("alive", True), ("static", False)):
+        page = folder / f"{name}.html"
+        write_report(answer, page, campaign=campaign, seconds={}, version="1", interactive=interactive)
+        check_page(page, static=not interactive)

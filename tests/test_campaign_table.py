@@ -353,3 +353,8 @@ def test_a_second_run_in_a_folder_is_refused_and_leaves_it_as_it_was(what, start
     with only_one(tmp_path, what), pytest.raises(InputError, match=f"where {what} is running"):
         start(tmp_path)
     assert sorted({path.name for path in tmp_path.iterdir()} - {".lock"}) == before
+
+
+@pytest.mark.browser
+def test_the_page_fits_asks_nobody_and_draws_its_figures(made, tmp_path, check_page):
+    check_page(write_result_page(tmp_path / "page.html", table_page(made[0]), version="1", interactive=True))

@@ -4,7 +4,6 @@ import base64
 import csv
 import io
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +26,27 @@ from raytwin.reports import (
     Step,
     write_result_page,
 )
-from raytwin.reports.chart import mean_of_squares
+from raytwin.reports.chart import mean_of_squares, rows_px, wrapped
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-WIDTHS = ((1200, 900), (400, 800))
+DEMO = Path(__file__).parents[1] / "demo" / "report.html"
 POD_TABLE = Path(__file__).parent / "pod_examples" / "hdbk_ex3.csv"
+PRODUCTS = """
+[[product]]
+shape = "fillet"
+material = "chicken_breast"
+length_mm = [12, 16]
+width_mm = [10, 14]
+height_mm = [5, 8]
+[[foreign_object]]
+name = "rib"
+shape = "rod"
+material = "rib_bone"
+length_mm = [2, 4]
+diameter_mm = [1, 3]
+[images]
+with_foreign_object = 0.7
+products = 4
+"""
 
 
 def example_page() -> ResultPage:
@@ -118,6 +133,34 @@ def test_a_page_holds_its_numbers_escapes_its_texts_and_names_no_address(tmp_pat
     assert again.read_bytes() == path.read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("values", "ticks"),
+    [
+        ((50.0, 3000.0), (50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)),
+        ((1.0, 10.0), (1.0, 2.0, 5.0, 10.0)),
+        ((1.0, 9.0), ()),  # equal steps are better
+        ((1.0, 101.0), ()),  # powers of ten are enough
+        ((0.0, np.nan), ()),
+    ],
+)
+def test_a_logarithmic_axis_of_one_to_two_decades_has_ticks_at_1_2_and_5(values, ticks) -> None:  # type: ignore[no-untyped-def]
+    for mark in (Points(x=values, y=[1.0, 1.0]), Band(x=[0.0, 1.0], low=[values[0]] * 2, high=[values[1]] * 2)):
+        axis = "x" if isinstance(mark, Points) else "y"
+        chart = Chart(name="a", alt="a", marks=[mark], **{f"{axis}_scale": "log"})
+        inside = tuple(tick for tick in chart.ticks_of_short_log(axis) if values[0] <= tick <= values[1])
+        assert inside == ticks
+        assert Chart(name="a", alt="a", marks=[mark]).ticks_of_short_log(axis) == ()
+    ended = Chart(name="a", alt="a", marks=[Points(x=[5.0], y=[1.0])], x_scale="log", x_ends=(1.0, 20.0))
+    assert ended.ticks_of_short_log("x")
+
+
+def test_rows_are_as_high_as_the_name_of_most_lines() -> None:
+    long = "radiation scattered by the object + noise common to rows or columns"
+    assert rows_px(["a", "b"]) == 2 * rows_px(["a"])
+    assert rows_px(["a", long]) == 2 * rows_px([long]) > 2 * rows_px(["a"])
+    assert rows_px([long]) >= 12 * (wrapped(long).count("\n") + 1)  # letters of 11 px
+
+
 def test_a_mark_with_columns_of_two_lengths_is_refused() -> None:
     with pytest.raises(InputError, match="columns of one length"):
         Chart(name="c", alt="", marks=[Line(x=[1, 2], y=[1, 2, 3])])
@@ -170,62 +213,34 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "validation": rt.report(rt.validate(found.twin, session), folder / "validation.html"),
         "pod": rt.report(rt.fit_pod(POD_TABLE, link="logit"), folder / "pod.html"),
     }
+    described = folder / "products.toml"
+    described.write_text(PRODUCTS)
+    low, high = (f"kv={kV},power_w=40,exposure_ms=20,filter=Cu:0.05" for kV in (40, 90))
+    pairs = rt.generate("virtual_lab", described, low=low, high=high, n=4, seed=1, output=folder / "pairs.h5")
+    made["dataset"] = rt.report(pairs, folder / "dataset.html")
     made["static"] = rt.report(found, folder / "static.html", interactive=False)
     return made
 
 
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
 @pytest.mark.browser
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
 class TestInChromium:
-    def opened(self, browser, path: Path, width: int = 1200, height: int = 900):  # type: ignore[no-untyped-def]
-        context = browser.new_context(viewport={"width": width, "height": height})
-        page = context.new_page()
-        page.asked, page.wrong = [], []
-        context.on("request", lambda request: page.asked.append(request.url))
-        page.on("pageerror", lambda error: page.wrong.append(str(error)))
-        page.on("console", lambda text: page.wrong.append(text.text) if text.type == "error" else None)
-        page.goto(path.as_uri())
-        page.wait_for_timeout(1500)
-        return page
+    @pytest.mark.parametrize("name", ["marks", "diagnosis", "twin", "validation", "pod", "dataset", "static"])
+    def test_a_page_fits_asks_nobody_and_draws_its_figures(self, check_page, pages, name: str) -> None:  # type: ignore[no-untyped-def]
+        check_page(pages[name], static=name == "static")
 
-    @pytest.mark.parametrize("name", ["marks", "diagnosis", "twin", "validation", "pod", "static"])
-    @pytest.mark.parametrize(("width", "height"), WIDTHS)
-    def test_a_page_fits_asks_nobody_and_draws_its_figures(self, browser, pages, name, width, height) -> None:  # type: ignore[no-untyped-def]
-        page = self.opened(browser, pages[name], width, height)
-        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
-        page.wait_for_timeout(1000)
-        assert [url for url in page.asked if not url.startswith(("data:", "blob:"))] == [pages[name].as_uri()]
-        assert page.wrong == []
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        if name == "static" or not page.locator(".drawn").count():
-            sizes = page.evaluate("Array.from(document.images).map((one) => one.naturalWidth)")
-            assert sizes and min(sizes) > 0
-        else:
-            page.locator(".drawn canvas").last.wait_for(timeout=60_000)
-            figures = page.locator(".drawn").count()
-            boxes = [canvas.bounding_box() for canvas in page.locator(".drawn canvas").all()]
-            wide = [box for box in boxes if box is not None and box["width"] > 0.5 * min(width, 340)]
-            assert len(wide) >= figures > 0  # an axis has a canvas of its own
-        page.context.close()
+    @pytest.mark.skipif(not DEMO.exists(), reason="make demo")
+    def test_the_page_of_a_demo_that_was_made_fits_too(self, check_page) -> None:  # type: ignore[no-untyped-def]
+        check_page(DEMO)
 
-    def test_the_first_screen_of_a_diagnosis_has_answer_proof_and_next_step(self, browser, pages) -> None:  # type: ignore[no-untyped-def]
-        page = self.opened(browser, pages["diagnosis"])
+    def test_the_first_screen_of_a_diagnosis_has_answer_proof_and_next_step(self, open_page, pages) -> None:  # type: ignore[no-untyped-def]
+        page = open_page(pages["diagnosis"])
         for part in ("h1", ".answer", "figure >> nth=0", ".next h2"):
             assert page.locator(part).first.bounding_box()["y"] < 900, part
         assert not page.locator("details").first.evaluate("one => one.open")
         page.context.close()
 
-    def test_a_click_sorts_a_table_and_a_click_on_a_point_opens_its_row(self, browser, pages) -> None:  # type: ignore[no-untyped-def]
-        page = self.opened(browser, pages["marks"])
+    def test_a_click_sorts_a_table_and_a_click_on_a_point_opens_its_row(self, open_page, pages) -> None:  # type: ignore[no-untyped-def]
+        page = open_page(pages["marks"])
         page.evaluate("document.querySelector('details').open = true")
         cells = "Array.from(document.querySelectorAll('table.sorted tbody tr')).map((row) => row.cells[0].innerText)"
         page.locator("th", has_text="value").click()

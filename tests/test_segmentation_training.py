@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import json
 import math
 
@@ -445,6 +446,24 @@ def test_a_killed_run_goes_on_from_its_last_epoch_and_ends_as_if_nothing_had_hap
     assert again == trained[1]
     assert sorted(found.name for found in (tmp_path / "r" / "network_001").iterdir()) == ["network.json", "weights.pt"]
     _assert_same(_weights(tmp_path / "r", 1), _weights(trained[0], 1))
+
+
+def test_a_folder_that_another_training_works_in_is_refused_and_left_as_it_is(dataset_file, tmp_path):
+    refused = []
+
+    def start_another(network, done, wanted, result):
+        with read_dataset(dataset_file) as second:
+            for start in (train_networks, functools.partial(train_together, workers=2)):
+                with pytest.raises(InputError, match=r"where a training is running"):
+                    start(second, tmp_path / "r", recipe=QUICK, networks=2, seed=5)
+                refused.append(network)
+
+    with read_dataset(dataset_file) as dataset:
+        train_networks(dataset, tmp_path / "r", recipe=QUICK, networks=1, seed=5, progress=start_another)
+        assert refused and set(refused) == {0}, "the second network was not begun"
+        assert finished_networks(open_runs(tmp_path / "r")) == [0]
+        # when the first is done, the folder is free
+        assert len(train_networks(dataset, tmp_path / "r", recipe=QUICK, networks=1, seed=5)) == 1
 
 
 def test_a_state_that_cannot_be_read_costs_its_network_only_and_is_said(dataset_file, tmp_path):

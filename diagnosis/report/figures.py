@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
 from ...reports import AFTER, BEFORE, MEASURED, Band, Bars, Chart, Line, Picture, Points, Rule
-from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks
+from ...reports.chart import SERIES_COLOURS, SHAPES, Shape, asinh_ticks, rows_px
 from ..inference.inference import UNKNOWN
 from ..judgement.answer import Diagnosis
 from ..problem.problem import SeriesView
@@ -20,7 +20,7 @@ from .explanation import axis_text
 _DEPTH_TICKS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
 _EVEN_DEPTH, _EVEN_Z = 2.0, 5.0
 _WIDEST_LINEAR = 20.0  # times noise: beyond it bars are drawn on a logarithm
-_MOST_HYPOTHESES, _LEAST_PROBABILITY = 10, 1e-4
+_MOST_HYPOTHESES, _LEAST_PROBABILITY = 6, 1e-4
 
 
 def _smoothed_z(view: SeriesView, residual: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -277,7 +277,7 @@ def hypotheses_chart(diagnosis: Diagnosis) -> Chart:
         y_ticks=dict(zip(map(float, y), names, strict=True)),
         y_ends=(-0.6, max(len(shown), 2) - 0.4),
         downwards=True,
-        height_px=90 + 34 * max(len(shown), 2),
+        height_px=90 + max(rows_px(names), 68),
     )
 
 

@@ -1,6 +1,6 @@
 """Predictions for people: settings as objects, texts or words, one or many."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,10 @@ def as_filters(value: str | Filter | Sequence[str | Filter]) -> tuple[Filter, ..
         layers = filters_from_text(value)
     elif isinstance(value, Filter):
         layers = (value,)
+    elif not isinstance(value, Iterable):
+        raise InputError(
+            "filter", received=repr(value), expected='a text such as "Cu:0.1+Al:1", a Filter, or a list of these'
+        )
     else:
         layers = tuple(layer for item in value for layer in as_filters(item))
     for layer in layers:
@@ -44,6 +48,13 @@ def as_setting(value: Setting | str | Mapping[str, Any]) -> Setting:
         return value
     if isinstance(value, str):
         return as_setting(setting_from_text(value))
+    if not isinstance(value, Mapping):
+        raise InputError(
+            "setting",
+            received=repr(value),
+            expected="a Setting, its text or its words",
+            remedy='for example "kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1"',
+        )
     unknown = [name for name in value if name not in WORDS]
     if unknown:
         raise InputError("setting", received=unknown[0], expected="words among " + ", ".join(WORDS))

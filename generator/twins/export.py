@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...acquisition.setting import Setting, text_from_filters
 from ...errors import InputError
 from ...files import whole_file
+from ...materials import material_from_name, mu_per_mm
 from ...results import plain
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import BAD_PIXEL_MAP, SpectralPosterior, Twin
@@ -235,7 +236,7 @@ def _to_gvxr(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]
     detector = _detector_of(line)
     distance, pixel = detector["source_detector_mm"] or 1000.0, detector["pixel_mm"] or 1.0
     files = {
-        "noise.json": "detector, dark, electronic noise; an image of gVirtualXray times DN_per_keV is in DN above dark"
+        "noise.json": "detector, dark, electronic noise; an image of gVirtualXray (MeV) times 1000 DN_per_keV is in DN above dark"
     }
     response = np.stack((line.energies_keV, line.signal_DN / line.DN_per_keV), axis=1)
     for number, setting in enumerate(line.settings):
@@ -243,6 +244,7 @@ def _to_gvxr(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...]
         counts = 100.0 * line.photons[number] * line.load_mAs(number)  # mm2 to cm2
         seen = counts > 1e-9 * counts.max()
         page = {
+            "WindowSize": [detector["columns"], detector["rows"]],  # `initGVXR` asks for it, with a window or without
             "Source": {
                 "Position": [0.0, -distance, 0.0, "mm"],
                 "Shape": "PointSource",
@@ -324,12 +326,14 @@ def _to_xcist(line: _Line, folder: Path) -> tuple[dict[str, str], tuple[str, ...
     _write_lines(folder / "scanner.cfg", lines)
     files["scanner.cfg"] = "detector"
     _write_json(folder / "noise.json", {**detector, "line_spread": line.kernel})
+    # gecatsim's Detection_EI: a photon that interacts at all leaves all of its energy
+    stopped = 1.0 - np.exp(-depth_mm * mu_per_mm(material_from_name(layer.material), line.energies_keV))
     told = []
     for number, setting in enumerate(line.settings):
         weights = line.photons[number]
-        slab = weights @ (line.energies_keV * line.absorbed) * line.DN_per_keV
+        slab = weights @ (line.energies_keV * stopped) * line.DN_per_keV
         share = float(slab / (weights @ line.signal_DN) - 1.0)
-        told.append(f"gecatsim keeps all energy of an absorbed photon: level {100 * share:+.1f} % at {setting}")
+        told.append(f"gecatsim keeps all energy of a photon that interacts: level {100 * share:+.1f} % at {setting}")
     return files, tuple(told)
 
 

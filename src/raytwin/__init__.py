@@ -8,6 +8,7 @@ Every command of `raytwin` has its function here; docs/python.md lists them. Nam
 The packages (`raytwin.materials`, `raytwin.spectra`, ...) hold the functions on arrays; see ARCHITECTURE.md for the map.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -112,7 +113,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(import_module(f".{_HOME[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # with name and object, Python's message asks `Did you mean`
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:

@@ -1,11 +1,12 @@
 """`raytwin`, the one command. Each subcommand is a module of `raytwin.commands`, imported only when it is asked for."""
 
 import argparse
+import errno
 import importlib
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 
 from . import __version__
@@ -48,10 +49,12 @@ _WAY = """raytwin: a calibrated digital twin of an X-ray inspection line.
   raytwin demo                          the main job end to end on the virtual lab, in minutes
 
 With measurements of your own:
+  raytwin check FOLDER                            what they allow, what looks wrong, what is missing
   raytwin import images FOLDER -o session.h5      your files -> an acquisition file
   raytwin calibrate session.h5 -o twin.h5         darks and flats -> the twin
   raytwin info twin.h5                            the twin in a table
   raytwin predict twin.h5 --kv 60 --power-w 30 --exposure-ms 20
+  raytwin explore twin.h5                         all of it on a page in the browser
   raytwin diagnose session.h5 -o diagnosis        where and why measured and simulated differ
 
 Before any measurement:
@@ -80,6 +83,16 @@ READING = frozenset(
         "report",
     }
 )
+
+
+# what the system may refuse, and what to do about it
+_REMEDY_OF_SYSTEM = {
+    errno.EACCES: "expected a file or folder that you may read and write; change its permissions or give another",
+    errno.EPERM: "expected a file or folder that you may read and write; change its permissions or give another",
+    errno.EROFS: "expected a place that can be written; give another",
+    errno.ENOSPC: "expected room on the disk; delete something or give another place",
+    errno.EDQUOT: "expected room within your quota; delete something or give another place",
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -114,10 +127,16 @@ def _parser(*selected: str) -> argparse.ArgumentParser:
                 formatter_class=argparse.RawDescriptionHelpFormatter,
             )
             module.add_arguments(command)
-            command.set_defaults(run=module.run, option_of_argument=_options(command))
+            command.set_defaults(run=module.run, option_of_argument=_options(command), actions=tuple(command._actions))
         else:
             commands.add_parser(name, help=line, add_help=False)
     return parser
+
+
+def _near(word: str, options: Collection[str]) -> str:
+    """Which option a misspelt one may mean, as a question; empty where none is near."""
+    near = get_close_matches(word.partition("=")[0], options, n=1, cutoff=0.75) if word.startswith("--") else []
+    return f"did you mean {near[0]}?" if near else ""
 
 
 def _options(command: argparse.ArgumentParser) -> dict[str, str]:
@@ -167,7 +186,15 @@ def _main(words: list[str]) -> int:
         return 2
     options: dict[str, str] = {}
     try:
-        parsed = _parser(*([selected] if selected is not None else [])).parse_args(words)
+        parsed, unknown = _parser(*([selected] if selected is not None else [])).parse_known_args(words)
+        if unknown:
+            taken = {option for action in parsed.actions for option in action.option_strings}
+            raise InputError(
+                unknown[0],
+                received="an option or a word that this command does not take",
+                expected=f"the options of `raytwin {selected} --help`",
+                remedy=_near(unknown[0], taken),
+            )
         options = parsed.option_of_argument
         code: int = parsed.run(parsed)
         sys.stdout.flush()
@@ -184,10 +211,21 @@ def _main(words: list[str]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write(f"raytwin {selected}: interrupted\n")
         return 1
+    except OSError as error:
+        remedy = _REMEDY_OF_SYSTEM.get(error.errno or 0)
+        if remedy is None:
+            return _failed(selected, error)
+        place = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"raytwin {selected}: error: {place}got {error.strerror!r} from the system; {remedy}\n")
+        return 2
     except Exception as error:
-        traceback.print_exc()
-        sys.stderr.write(f"raytwin {selected}: internal failure: {type(error).__name__}: {error}\n")
-        return 1
+        return _failed(selected, error)
+
+
+def _failed(selected: str | None, error: Exception) -> int:
+    traceback.print_exc()
+    sys.stderr.write(f"raytwin {selected}: internal failure: {type(error).__name__}: {error}\n")
+    return 1
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The errors of raytwin: one small family. A message says what was given, what was expected and what to do."""
 
+import numbers
+
 
 class RaytwinError(Exception):
     """Base of every error that raytwin raises on purpose."""
@@ -29,6 +31,16 @@ class InputError(RaytwinError, ValueError):
             given = given[:157] + "..."
         text = f"{argument or self.argument}: got {given}; expected {self.expected}"
         return f"{text}; {self.remedy}" if self.remedy else text
+
+
+def check_number(argument: str, value: object, *, unit: str = "") -> None:
+    """Refuse what is no real number.
+
+    Raises:
+        InputError: a text, None, an array or another object.
+    """
+    if not isinstance(value, numbers.Real):
+        raise InputError(argument, received=repr(value), expected=f"a number, in {unit}" if unit else "a number")
 
 
 class FileFormatError(InputError):

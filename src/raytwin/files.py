@@ -11,13 +11,29 @@ from pathlib import Path
 from .errors import InputError
 
 
+def given_path(value: object, *, expected: str, argument: str = "path") -> Path:
+    """What a user gave as a path.
+
+    Args:
+        value: a text or a path.
+        expected: what the path should lead to, for the message.
+        argument: name of the argument, for the message.
+
+    Raises:
+        InputError: neither a text nor a path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(argument, received=f"{value!r} ({type(value).__name__})", expected=f"the path of {expected}")
+    return Path(value)
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Refuse a file that could not be written, before the work that makes it; nothing is made.
 
     Raises:
         InputError: `path` is a folder, or lies where nothing can be written.
     """
-    final = Path(path).absolute()
+    final = given_path(path, expected="a file to write").absolute()
     if final.is_dir():
         raise InputError(str(path), received="a folder", expected="the name of a file to write")
     place = next(folder for folder in final.parents if folder.exists())
@@ -35,7 +51,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         InputError: `path` is a folder, or lies where nothing can be written.
     """
-    final = Path(path)
+    final = given_path(path, expected="a file to write")
     if final.is_dir():
         raise InputError(str(path), received="a folder", expected="the name of a file to write")
     try:
@@ -72,7 +88,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         InputError: `path` is a file or a folder with something in it, or lies where nothing can be written.
     """
-    final = Path(path)
+    final = given_path(path, expected="a folder to write")
     if final.exists() and (not final.is_dir() or any(final.iterdir())):
         raise InputError(
             str(path), received="a file or a folder with something in it", expected="a new or empty folder"

@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,14 +25,25 @@ def twin_path(text: PathLike) -> Path:
     """The file that a name of a twin means; a file of that name goes before a shipped calibration.
 
     Raises:
-        InputError: the name of a shipped description that has no twin.
+        InputError: the name of a shipped description that has no twin, or nearly the name of a shipped calibration.
     """
     path = Path(text)
     if path.suffix or len(path.parts) != 1 or path.exists():
         return path
     from ..generator.twins.shipped import shipped_calibration, shipped_calibrations
 
-    return shipped_calibration(str(text)) if str(text) in shipped_calibrations() else path
+    known = shipped_calibrations()
+    if str(text) in known:
+        return shipped_calibration(str(text))
+    near = get_close_matches(str(text), known, n=1, cutoff=0.7)
+    if near:
+        raise InputError(
+            "twin",
+            received=str(text),
+            expected="an existing file that `raytwin calibrate` wrote, or a shipped calibration",
+            remedy=f"did you mean {near[0]}?",
+        )
+    return path
 
 
 def as_twin(twin: "Twin | PathLike") -> "Twin":
@@ -87,7 +99,13 @@ def listed(
     """One acquisition, or several, as a list."""
     from ..acquisition.acquisition_io import AcquisitionFile
 
-    return [given] if isinstance(given, str | os.PathLike | AcquisitionFile) else list(given)
+    if isinstance(given, str | os.PathLike | AcquisitionFile):
+        return [given]
+    if not isinstance(given, Sequence):
+        raise InputError(
+            "acquisition", received=type(given).__name__, expected="a path, an open acquisition, or a list"
+        )
+    return list(given)
 
 
 @contextmanager
@@ -104,6 +122,9 @@ def opened(
     items = listed(given)
     if not items:
         raise InputError("acquisition", received="none", expected="at least one")
+    for item in items:
+        if isinstance(item, AcquisitionFile):
+            item.check_open()
     with ExitStack() as stack:
         yield [
             item if isinstance(item, AcquisitionFile) else stack.enter_context(open_acquisition(item)) for item in items

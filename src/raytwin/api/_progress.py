@@ -5,6 +5,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
+from ..errors import InputError
+
 # called with what is being done, how many steps of it are done, and of how many (None: not known)
 Progress = Callable[[str, int, int | None], None]
 
@@ -70,6 +72,10 @@ class Telling:
     """`progress=` as the work uses it: a `with` block around stages and counted steps; None tells nobody."""
 
     def __init__(self, progress: Progress | bool | None, *, unit: str = "step") -> None:
+        if not (progress is None or isinstance(progress, bool) or callable(progress)):
+            raise InputError(
+                "progress", received=repr(progress), expected="True for a bar, or a function of (stage, done, total)"
+            )
         self._own = Bar(unit=unit) if progress is True else None
         self._tell: Progress | None = self._own or (progress if callable(progress) else None)
         self._stage, self._done, self._total = "", 0, 0

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from ..generator.predictions.tube_twin import TubeTwin
 
 _EXTRAS = {
+    "explore": ("bokeh",),
     "segmentation": ("torch", "segmentation_models_pytorch"),
+    "onnx": ("onnxruntime",),
     "cluster": ("dask", "distributed"),
     "fits": ("astropy",),
     "dicom": ("pydicom",),

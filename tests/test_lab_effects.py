@@ -490,6 +490,17 @@ def test_quantisation_gives_multiples_of_its_step():
     assert np.array_equal(values, np.rint(np.rint(values / 2.5) * 2.5))
 
 
+def test_off_focal_radiation_lights_the_shadow_and_leaves_the_open_field():
+    line = line_with("off_focal=10", "coarse")
+    setting = setting_of(line, 90.0)
+    spread = edge_profile(line, setting, direction="x")
+    middle = spread.argmax()
+    near = spread[middle - 2 : middle + 3].sum()
+    assert near == pytest.approx(0.9, abs=0.03)
+    flat = expected_keV(line, setting)
+    assert flat.std() < 1e-6 * flat.mean()
+
+
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
     line = line_with("dropped_frames=20", seed=3)
     shown = []
@@ -506,17 +517,6 @@ def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
 
 
 # --- what no catalogue holds ------------------------------------------------------------------------------------------
-
-
-def test_off_focal_radiation_lights_the_shadow_and_leaves_the_open_field():
-    line = line_with("unknown:off_focal=10", "coarse")
-    setting = setting_of(line, 90.0)
-    spread = edge_profile(line, setting, direction="x")
-    middle = spread.argmax()
-    near = spread[middle - 2 : middle + 3].sum()
-    assert near == pytest.approx(0.9, abs=0.03)
-    flat = expected_keV(line, setting)
-    assert flat.std() < 1e-6 * flat.mean()
 
 
 def test_tiles_differ_by_their_strength_and_seams_are_dark():

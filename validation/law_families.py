@@ -46,10 +46,12 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "line_flicker": ("sine of any phase", "columns", "bands of rows"),
     "grey_absorber": ("copper from a slanted border on", "strip", "corner"),
     "dropped_frames": ("every few frames", "some in a row"),
+    "off_focal": ("ring", "towards one side"),
 }
 # what the plain simulator has no law of: a middling strength (unit of the catalogue)
-ADDED = {"crosstalk": 10.0, "line_flicker": 0.2, "grey_absorber": 4.0, "dropped_frames": 5.0}
+ADDED = {"crosstalk": 10.0, "line_flicker": 0.2, "grey_absorber": 4.0, "dropped_frames": 5.0, "off_focal": 7.0}
 ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber"}
+_SOURCE_POINTS = 24
 
 
 def correlated(rng: np.random.Generator, shape: tuple[int, int], px: float) -> np.ndarray:
@@ -199,6 +201,8 @@ class FamilyLine(plain.Line):
                 return gaussian_filter(along, (0.42 * width_px, 0.15 * width_px))
 
             signal, variance = spot(signal), spot(variance)
+        if "off_focal" in on:
+            signal, variance = (self._beside(one, far, on["off_focal"] / 100.0) for one in (signal, variance))
         if "crosstalk" in on:
             signal, variance = (self._hopped(one, on["crosstalk"] / 100.0) for one in (signal, variance))
         if "motion_blur" in on:
@@ -207,6 +211,20 @@ class FamilyLine(plain.Line):
             places = course * on["motion_blur"] * exposure_ms / 50.0
             signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         return signal, variance
+
+    def _beside(self, image: np.ndarray, far: bool, share: float) -> np.ndarray:
+        """A picture with the shadows that points beside the focal spot throw."""
+        magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
+        reach_px = (3.0 + 5.0 * self.u["a"]) * magnified / self.of.pixel_mm
+        steps = (np.arange(_SOURCE_POINTS) + 0.5) / _SOURCE_POINTS
+        if self._is("off_focal", "ring"):
+            turns = 2.0 * math.pi * steps
+            places = reach_px * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        else:
+            # the anode goes on to one side: ever fewer electrons strike it
+            places = np.stack([-reach_px * np.log(steps), np.zeros(_SOURCE_POINTS)], axis=1)
+        wide = np.mean([shift(image, place, order=1, mode="nearest") for place in places], axis=0)
+        return (1.0 - share) * image + share * wide
 
     def _hopped(self, image: np.ndarray, share: float) -> np.ndarray:
         """A picture of which each pixel's neighbours count a share."""

@@ -45,6 +45,7 @@ from .motion_blur import MOTION_BLUR
 from .mtf_tail import MTF_TAIL
 from .nonlinearity import NONLINEARITY
 from .object_scatter import OBJECT_SCATTER
+from .off_focal import OFF_FOCAL
 from .output_drift import OUTPUT_DRIFT
 from .quantisation import QUANTISATION
 from .row_noise import ROW_NOISE
@@ -78,6 +79,7 @@ OURS: dict[str, Effect] = {
         LINE_FLICKER,
         GREY_ABSORBER,
         DROPPED_FRAMES,
+        OFF_FOCAL,
     )
 }
 EFFECTS = Catalogue(OURS)

@@ -424,6 +424,8 @@ BEAM_LAWS: tuple[EffectLaw, ...] = (
 # further ones come last in the registry: the random numbers of those before stay theirs
 COVER_LAWS: tuple[EffectLaw, ...] = (
     _law("grey_absorber", "something in a part of the beam", "%", (0.5, 60.0), _grey_absorber, since="calibration"),
+)
+SOURCE_LAWS: tuple[EffectLaw, ...] = (
     _law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal),
 )
-BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *COVER_LAWS)}
+BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *SOURCE_LAWS, *COVER_LAWS)}

@@ -47,30 +47,6 @@ def _tile_seams(request: Asked, site: Site) -> Planted:
     )
 
 
-def _rts_pixels(request: Asked, site: Site) -> Planted:
-    rng, shape = site.rng, (site.system.rows, site.system.columns)
-    count = max(1, round(request.strength / 100.0 * shape[0] * shape[1]))
-    places = rng.choice(shape[0] * shape[1], size=count, replace=False)
-    height_DN = (rng.uniform(3.0, 10.0, size=count) * site.system.read_noise_DN).astype(np.float32)
-    switches = 1.0 / rng.uniform(3.0, 15.0, size=count)
-
-    def jump(level_DN: Map, context: FrameContext) -> Map:
-        state = context.memory.get("rts_pixels")
-        drawn = frame_rng(context, 14).random(count)
-        state = (drawn < 0.5) if state is None else state ^ (drawn < switches)
-        context.memory["rts_pixels"] = state
-        out = level_DN.copy()
-        out.ravel()[places] += np.where(state, height_DN, np.float32(0.0))
-        return out
-
-    return _told(
-        request,
-        "pixels whose dark level jumps between two values and stays for some frames",
-        {"pixels": count},
-        stages=(("readout", Stage(name="rts_pixels", apply=jump, additive=False)),),
-    )
-
-
 def _digitised(level: NDArray[Any], context: FrameContext) -> NDArray[np.uint16]:
     numbers: NDArray[np.uint16] = np.clip(np.rint(level), 0, context.system.saturation_DN).astype(np.uint16)
     return numbers
@@ -131,7 +107,6 @@ def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Bu
 
 UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
     _law("tile_seams", "tiles and their seams", "%", (0.2, 3.0), _tile_seams, "calibration"),
-    _law("rts_pixels", "random-telegraph pixels", "%", (0.3, 10.0), _rts_pixels, "calibration"),
     _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
     _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
 )

@@ -64,6 +64,7 @@ CATALOGUE = {
     "grey_absorber": ("%", 0.5, 60),
     "dropped_frames": ("%", 0.5, 30),
     "off_focal": ("%", 2, 20),
+    "random_telegraph": ("%", 0.1, 10),
 }
 CACHE = ModelCache()
 
@@ -144,6 +145,11 @@ def numbers(found):
                 found.repeated_share,
             ]
         ),
+        np.zeros(3)
+        if found.telegraph is None
+        else found.telegraph.share
+        * 100
+        * np.array([1.0, found.telegraph.amplitude_reads, found.telegraph.stay_exposures]),
         np.zeros(3)
         if found.flicker is None
         else found.flicker.rms * 1000 * np.array([1.0, found.flicker.column_share, found.flicker.correlation(1)]),
@@ -242,6 +248,18 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         good = np.abs(residual.mean(axis=0)) < 6 * np.sqrt(variance / count)
         share = 1 - good.mean()
         assert abs(share - expected.bad_pixel_share) < 4 * math.sqrt(8 * expected.bad_pixel_share / good.size)
+    if name == "random_telegraph":
+        electronic = series_line.maps.read_variance_DN2 - 1.0 / 12.0
+        height = expected.telegraph.amplitude_reads * np.sqrt(electronic)
+        good = np.abs(residual.mean(axis=0)) < 0.25 * height
+        share = 1 - good.mean()
+        assert abs(share - expected.telegraph.share) < 4 * math.sqrt(expected.telegraph.share / good.size)
+        # half of the time they are up; a stay of m exposures correlates them over m / 2, and 1 / m of the steps are jumps
+        stay = expected.telegraph.stay_exposures
+        up = (residual / height)[:, ~good]
+        jumps = 0.5 * (np.diff(up, axis=0) ** 2).mean() - (variance / height**2)[~good].mean()
+        assert abs(up.mean() - 0.5) < 4 * 0.5 / math.sqrt(up.size / stay)
+        assert abs(jumps - 0.5 / stay) < 4 * 0.5 / stay / math.sqrt(up.size / stay) + 0.02
     if name == "gain_map_error":
         pattern = residual.mean(axis=0) / expected.signal_DN
         assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)

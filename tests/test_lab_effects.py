@@ -530,7 +530,7 @@ def test_tiles_differ_by_their_strength_and_seams_are_dark():
 
 def test_random_telegraph_pixels_jump_and_stay():
     system = system_on("coarse")
-    line = line_with("unknown:rts_pixels=3", system=system)
+    line = line_with("random_telegraph=3", system=system)
     darks = np.array([frame for frame, _ in line.dark(10.0, frames=100)], dtype=float)
     spread = darks.std(axis=0, ddof=1)
     jumping = spread > 1.5 * system.read_noise_DN

@@ -47,10 +47,18 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "grey_absorber": ("copper from a slanted border on", "strip", "corner"),
     "dropped_frames": ("every few frames", "some in a row"),
     "off_focal": ("ring", "towards one side"),
+    "random_telegraph": ("three levels", "heights that fall exponentially"),
 }
 # what the plain simulator has no law of: a middling strength (unit of the catalogue)
-ADDED = {"crosstalk": 10.0, "line_flicker": 0.2, "grey_absorber": 4.0, "dropped_frames": 5.0, "off_focal": 7.0}
-ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber"}
+ADDED = {
+    "crosstalk": 10.0,
+    "line_flicker": 0.2,
+    "grey_absorber": 4.0,
+    "dropped_frames": 5.0,
+    "off_focal": 7.0,
+    "random_telegraph": 1.5,
+}
+ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber", "random_telegraph"}
 _SOURCE_POINTS = 24
 
 
@@ -82,6 +90,7 @@ class FamilyLine(plain.Line):
             self.changed_gain = 1.0 + self.effects["gain_map_error"] / 100.0 * self._pattern()
         if "bad_pixels" in self.effects:
             self.changed_gain = self._dead()
+        self.jumpy = self.law.random(self.of.shape) if "random_telegraph" in self.effects else np.ones(self.of.shape)
         self.walk = 0.0
         self.taken = 0
 
@@ -266,6 +275,8 @@ class FamilyLine(plain.Line):
 
     def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
         shown = self._exposed(count, kind, exposure_ms, after, lit)
+        if "random_telegraph" in self.on(after):
+            shown = self._jumped(shown, self.on(after)["random_telegraph"] / 100.0)
         share = self.on(after).get("dropped_frames", 0.0) / 100.0
         if share and self._is("dropped_frames", "some in a row"):
             for number in np.flatnonzero(self.law.random(count - 1) < share / 3.0) + 1:
@@ -275,6 +286,19 @@ class FamilyLine(plain.Line):
             for number in range(int(self.law.integers(1, every + 1)), count, every):
                 shown[number] = shown[number - 1]
         return shown
+
+    def _jumped(self, shown: np.ndarray, share: float) -> np.ndarray:
+        """Frames of which the same pixels jump between levels, some frames in each."""
+        pixels = np.flatnonzero(self.jumpy < share)
+        three = self._is("random_telegraph", "three levels")
+        heights = 7.0 if three else 2.0 + 6.0 * -np.log(np.maximum(self.jumpy.flat[pixels] / share, 1e-6))
+        level = self.law.integers(0, 3 if three else 2, len(pixels)).astype(float)
+        out = shown.astype(float)
+        for frame in out:
+            frame.flat[pixels] += np.round(self.of.read_DN * heights * level)
+            moves = self.law.random(len(pixels)) < 1.0 / (4.0 + 8.0 * self.u["a"])
+            level = np.where(moves, self.law.integers(0, 3, len(pixels)) if three else 1.0 - level, level)
+        return np.clip(out, 0, self.of.highest_DN).astype(np.uint16)
 
     def _exposed(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
         on = self.on(after)

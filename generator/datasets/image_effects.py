@@ -18,7 +18,7 @@ from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
 from ..frames._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
-from ..frames.defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from ..frames.defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
 from ..frames.flat_change import has_always_bent, is_in_noise
 from ..kernels.projection import project_polychromatic
 from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
@@ -383,8 +383,12 @@ class ImageEffects:
             value = np.where(bad.dead, 0.0, value)
         value = value + self.dark_DN + electronic
         value = value + sample_offsets(state, shape, rng) / math.sqrt(averaged)
+        read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
+        if state.telegraph is not None:
+            jumping = Jumping(state.telegraph, shape, rng)
+            for _ in range(averaged):
+                value = jumping.added_to(value, read_DN / averaged, rng)
         if bad is not None:
-            read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
             value = np.where(bad.hot, value + _HOT_SIGMAS * (read_DN + 1.0), value)
         if state.step_DN > 0:
             step = state.step_DN / averaged

@@ -48,6 +48,7 @@ from .object_scatter import OBJECT_SCATTER
 from .off_focal import OFF_FOCAL
 from .output_drift import OUTPUT_DRIFT
 from .quantisation import QUANTISATION
+from .random_telegraph import RANDOM_TELEGRAPH
 from .row_noise import ROW_NOISE
 from .veiling_glare import VEILING_GLARE
 
@@ -80,6 +81,7 @@ OURS: dict[str, Effect] = {
         GREY_ABSORBER,
         DROPPED_FRAMES,
         OFF_FOCAL,
+        RANDOM_TELEGRAPH,
     )
 }
 EFFECTS = Catalogue(OURS)

@@ -19,14 +19,23 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..effects import AppliedEffect, Effect, effect_of, in_order
-from ..line.line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineFlicker, LineState, TilePattern
+from ..line.line_state import (
+    FixedPattern,
+    FloatArray,
+    LagLaw,
+    LineContext,
+    LineFlicker,
+    LineState,
+    TelegraphPixels,
+    TilePattern,
+)
 from ..line.rounding import rounded_variance
 from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import mean_signal_energy_keV
 from ..line.twin import Twin
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
-from .defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from .defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
 
 __all__ = [
     "ExpectedSeries",
@@ -155,6 +164,7 @@ class ExpectedSeries:
         temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
         quantisation_step_DN: of the stored numbers, before averaging; 0: none.
         bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
+        telegraph: pixels that jump, whose mean and variance are not in the maps; None: none.
         gain_pattern: of the pixels' gains, that no map knows; None: none.
         tile_pattern: the same of tiles; None: there is none.
         repeated_share: chance of a frame to be a copy of the one before; its mean and noise are those of any other.
@@ -179,6 +189,7 @@ class ExpectedSeries:
     quantisation_step_DN: float
     bad_pixel_share: float
     hot_pixel_share: float
+    telegraph: TelegraphPixels | None
     gain_pattern: FixedPattern | None
     tile_pattern: TilePattern | None
     repeated_share: float
@@ -781,6 +792,7 @@ def expected_series(
         quantisation_step_DN=state.step_DN,
         bad_pixel_share=state.bad_share,
         hot_pixel_share=state.bad_share * state.bad_hot_share,
+        telegraph=state.telegraph,
         gain_pattern=state.gain_pattern if request.beam_on else None,
         tile_pattern=state.tile_pattern if request.beam_on else None,
         repeated_share=state.repeated_share,
@@ -842,6 +854,7 @@ def sample_series(
     if state.tile_pattern is not None and request.beam_on:
         gain = (1.0 if gain is None else gain) * tile_gain(state.tile_pattern, shape)
     bad = new_bad_pixels(state, shape)
+    jumping = None if state.telegraph is None else Jumping(state.telegraph, shape, rng)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
     electronic = np.sqrt(_read_variance(twin, state, cache))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
@@ -888,6 +901,8 @@ def sample_series(
             for height, profile in state.offsets:
                 value += height * float(profile(np.array(now)))
             value += sample_offsets(state, shape, rng)
+            if jumping is not None:
+                value = jumping.added_to(value, electronic, rng)
             if bad is not None:
                 value = np.where(bad.hot, value + _HOT_SIGMAS * (electronic + 1.0), value)
             if state.step_DN > 0:

@@ -123,6 +123,19 @@ class LineFlicker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TelegraphPixels:
+    """A share of the pixels, drawn from `seed`, whose level jumps up by `amplitude_reads` read noises and down again.
+
+    stay_exposures: mean stay in a level.
+    """
+
+    share: float
+    amplitude_reads: float
+    stay_exposures: float
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FinePicture:
     """A picture with sharp borders: cells finer than pixels, see `_fine_picture`.
 
@@ -166,6 +179,7 @@ class LineState:
         step_DN: of the ADC; 0: none.
         bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
             rest being dead; bad_seed draws them.
+        telegraph: pixels that jump, or None.
         repeated_share: chance of a stored frame to be a copy of the one before it in its series.
     """
 
@@ -199,6 +213,7 @@ class LineState:
     bad_share: float = 0.0
     bad_hot_share: float = 0.5
     bad_seed: int = 0
+    telegraph: TelegraphPixels | None = None
     repeated_share: float = 0.0
 
 

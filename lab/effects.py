@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 from .effect import FORM, SINCE, Asked, EffectLaw, Site
 from .effects_beam import BEAM_LAWS, COVER_LAWS, SOURCE_LAWS
-from .effects_detector import DETECTOR_LAWS
+from .effects_detector import DETECTOR_LAWS, MEMORY_LAWS
 from .effects_frames import FRAME_LAWS
 from .effects_pixels import JUMP_LAWS, PIXEL_LAWS
 from .effects_unknown import UNKNOWN_LAWS
@@ -31,6 +31,7 @@ EFFECTS: Mapping[str, EffectLaw] = {
         *PIXEL_LAWS,
         *COVER_LAWS,
         *FRAME_LAWS,
+        *MEMORY_LAWS,
     )
 }
 

@@ -65,6 +65,7 @@ CATALOGUE = {
     "dropped_frames": ("%", 0.5, 30),
     "off_focal": ("%", 2, 20),
     "random_telegraph": ("%", 0.1, 10),
+    "burn_in": ("%", 0.05, 5),
 }
 CACHE = ModelCache()
 
@@ -1214,6 +1215,37 @@ def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise
     np.testing.assert_array_equal(
         numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
     )
+
+
+def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps(series_line):
+    """Traps are filled and emptied step by step, a hundred steps an exposure."""
+    strength, fade_s, fills = 4.0, 12.0, 30.0
+    shadow, flat = request(**BEHIND, frames=40), request(frames=20, start_s=4.0)
+    asked = request(frames=12, start_s=9.0, previous=(shadow, flat))
+    effect = applied("burn_in", strength, fade_s=fade_s, fills_after_exposures=fills)
+    found, plain = expect(series_line, asked, effect), expect(series_line, asked)
+    step_s = asked.interval_s(series_line.instrument.readout_ms)
+    highest = 2.0**series_line.instrument.bits - 1 - series_line.dark_DN.value
+    most = strength / 100.0 / (1.0 - math.exp(-100.0 / fills))
+    full, clock_s, gain = np.zeros(SHAPE), 0.0, []
+    for series in (shadow, flat, asked):
+        light = expect(series_line, replace(series, frames=1, previous=())).signal_DN / (fills * highest)
+        full = full * math.exp(-(series.start_s - clock_s) / fade_s)
+        gain = []
+        for _ in range(series.frames):
+            gain.append(1.0 + most * full)
+            for _ in range(100):
+                full = full + (light * (1.0 - full) - full * step_s / fade_s) / 100.0
+        clock_s = series.start_s + series.frames * step_s
+    gain = np.array(gain)
+    rise = gain[-1] - gain[0]
+    known = found.signal_DN / plain.signal_DN
+    np.testing.assert_allclose(known - 1.0, gain.mean(axis=0) - 1.0, rtol=2e-3)
+    course = sum(image * profile[:, None, None] for image, profile in found.trend_DN) / plain.signal_DN
+    assert np.abs(course - (gain - gain.mean(axis=0))).max() < 0.02 * np.abs(rise).max()
+    np.testing.assert_allclose(found.quantum_variance_DN2, known**2 * plain.quantum_variance_DN2, rtol=1e-9)
+    # where the object stood the later flat is darker
+    assert known[20, 20] < known[1, 1] - 1e-4
 
 
 @pytest.mark.parametrize("peaked", [0.0, 1.0])

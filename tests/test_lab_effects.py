@@ -501,6 +501,23 @@ def test_off_focal_radiation_lights_the_shadow_and_leaves_the_open_field():
     assert flat.std() < 1e-6 * flat.mean()
 
 
+def test_a_screen_brightens_by_its_strength_after_a_hundred_exposures_at_full_scale():
+    system = system_on("coarse")
+    brighten = stage_of(planted("burn_in=2", system=system))
+    full_keV = (system.saturation_DN - system.dark_DN) / system.DN_per_electron / system.electrons_per_keV
+    light = np.full((SIZE, SIZE), full_keV, np.float32)
+    light[:, : SIZE // 2] = 0.0
+    memory = {}
+    for number in range(100):
+        brighten(light, context_of(system, began_s=0.001 * number, memory=memory))
+    even = np.ones((SIZE, SIZE), np.float32)
+    seen = brighten(even, context_of(system, began_s=0.1, memory=memory))
+    assert seen[:, -1] == pytest.approx(1.02, abs=2e-4) and seen[:, 0] == pytest.approx(1.0, abs=1e-6)
+    # it fades
+    later = brighten(even, context_of(system, began_s=10_000.0, memory=memory))
+    assert 1.002 < later[0, -1] < 1.01
+
+
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
     line = line_with("dropped_frames=20", seed=3)
     shown = []

@@ -11,6 +11,7 @@ from ...errors import InputError
 from ..line.applied_effect import AppliedEffect
 from ..line.line_state import STAGES
 from .bad_pixels import BAD_PIXELS
+from .burn_in import BURN_IN
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
 from .crosstalk import CROSSTALK
@@ -82,6 +83,7 @@ OURS: dict[str, Effect] = {
         DROPPED_FRAMES,
         OFF_FOCAL,
         RANDOM_TELEGRAPH,
+        BURN_IN,
     )
 }
 EFFECTS = Catalogue(OURS)

@@ -22,6 +22,7 @@ from ..effects import AppliedEffect, Effect, effect_of, in_order
 from ..line.line_state import (
     FixedPattern,
     FloatArray,
+    GainMemory,
     LagLaw,
     LineContext,
     LineFlicker,
@@ -627,6 +628,50 @@ def _with_trapped(
     return signal, trend
 
 
+def _filled_before(
+    twin: Twin, request: SeriesRequest, law: GainMemory, choice: _Choice, cache: ModelCache
+) -> FloatArray:
+    """Share of the traps (row, column) or (1, 1) that earlier exposures have left full at the begin of the series."""
+    filled: FloatArray = np.zeros((1, 1))
+    clock_s = 0.0
+    for earlier in request.previous:
+        if earlier.beam_on:
+            state, charge = choice.line(twin, earlier, cache)
+            if state.gain_memory is not None:  # else it had not set in
+                interval = earlier.interval_s(twin.instrument.readout_ms)
+                exposures = earlier.frames * earlier.exposures_per_frame
+                filled = filled * math.exp(-max(earlier.start_s - clock_s, 0.0) / law.fade_s)
+                steady, pace = _filling(law, charge.mean, interval)
+                filled = steady + (filled - steady) * np.exp(-exposures * pace)
+                clock_s = earlier.start_s + exposures * interval
+    return filled * math.exp(-max(request.start_s - clock_s, 0.0) / law.fade_s)
+
+
+def _filling(law: GainMemory, light_DN: FloatArray, interval_s: float) -> tuple[FloatArray, FloatArray]:
+    """Share of the traps that are full in the end under exposures of this light, and 1 over the exposures that it takes."""
+    filling = law.filled_per_DN * np.maximum(light_DN, 0.0)
+    pace = filling + interval_s / law.fade_s
+    return filling / pace, pace
+
+
+def _gain_course(
+    law: GainMemory, before: FloatArray, light_DN: FloatArray, interval_s: float, exposures: int, averaged: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean factor on the signal over a series, and its change: (map, profile over the stored frames of mean 0).
+
+    The mean is exact; all pixels change in the course of the one in the middle, as far as each does.
+    """
+    steady, pace = _filling(law, light_DN, interval_s)
+    away = before - steady
+    left = -np.expm1(-exposures * pace)
+    mean = steady + away * left / (exposures * -np.expm1(-pace))
+    course = np.exp(-float(np.median(pace)) * np.arange(exposures))
+    course = _frame_means(
+        (course - course.mean()) / max(1.0 - math.exp(-float(np.median(pace)) * exposures), 1e-300), averaged
+    )
+    return 1.0 + law.most * mean, law.most * away * left, course
+
+
 def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
     """Covariance of stored frames (1 + lags,) over the variance of one exposure without lag."""
     if law is None or decay is None:
@@ -731,6 +776,14 @@ def expected_series(
         before = _trapped_before(twin, request, law, choice, cache)
         signal, trend = _with_trapped(law, decay, before, charge.mean, exposures, averaged)
     covariance = _temporal_covariance(state.lag, decay, averaged)
+    gained: FloatArray | float = 1.0
+    if state.gain_memory is not None:
+        before_it = _filled_before(twin, request, state.gain_memory, choice, cache)
+        gained, gains, profile_of_gain = _gain_course(
+            state.gain_memory, before_it, charge.mean, interval, exposures, averaged
+        )
+        trend = [*((gained * amount, course) for amount, course in trend), (gains * signal, profile_of_gain)]
+        signal = gained * signal
     bend = state.bend_per_DN
     slope: FloatArray | float = 1.0
     if bend != 0.0:
@@ -738,9 +791,9 @@ def expected_series(
         signal = signal * (1.0 - bend * signal)
         trend = [(slope * amount, course) for amount, course in trend]
     quantum, white = charge.correlated, charge.white
-    if covariance[0] != 1.0 or bend != 0.0:
+    if covariance[0] != 1.0 or bend != 0.0 or state.gain_memory is not None:
         # secondary quanta are drawn before the traps as the others are
-        quantum, white = (covariance[0] * slope**2 * variance for variance in (quantum, white))
+        quantum, white = (covariance[0] * (gained * slope) ** 2 * variance for variance in (quantum, white))
     dark = cache.pixels(twin.maps, ("dark", request.exposure_ms), lambda: twin.maps.dark_at(request.exposure_ms))
     for height, profile in state.offsets:
         times = request.start_s + interval * np.arange(exposures, dtype=np.float64)
@@ -853,6 +906,10 @@ def sample_series(
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
     if state.tile_pattern is not None and request.beam_on:
         gain = (1.0 if gain is None else gain) * tile_gain(state.tile_pattern, shape)
+    filled = steady = pace = np.zeros((1, 1))
+    if state.gain_memory is not None:
+        filled = _filled_before(twin, request, state.gain_memory, choice, cache)
+        steady, pace = _filling(state.gain_memory, charge.mean, interval)
     bad = new_bad_pixels(state, shape)
     jumping = None if state.telegraph is None else Jumping(state.telegraph, shape, rng)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
@@ -894,6 +951,9 @@ def sample_series(
                     value = value + found
             if gain is not None:
                 value = value * gain
+            if state.gain_memory is not None:
+                value = value * (1.0 + state.gain_memory.most * filled)
+                filled = steady + (filled - steady) * np.exp(-pace)
             value = value * (1.0 - state.bend_per_DN * value)
             if bad is not None:
                 value = np.where(bad.dead, 0.0, value)

@@ -63,6 +63,18 @@ class LagLaw:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GainMemory:
+    """A gain that is larger by the share `most` where all traps q are full: each DN of light fills `filled_per_DN` of the empty ones.
+
+    They empty with `fade_s`: dq = filled_per_DN (1 - q) dx - q dt / fade_s.
+    """
+
+    most: float
+    filled_per_DN: float
+    fade_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixedPattern:
     """A fixed relative pattern over the pixels, normal, drawn from `seed`.
 
@@ -170,6 +182,7 @@ class LineState:
             time, and the share of its variance that is new in every exposure.
         flicker: factors of the lines of an exposure, or None.
         lag: traps, or None.
+        gain_memory: of the light before, or None.
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
         gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
@@ -201,6 +214,7 @@ class LineState:
     output_jitter_share: float = 0.0
     flicker: LineFlicker | None = None
     lag: LagLaw | None = None
+    gain_memory: GainMemory | None = None
     bend_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
     tile_pattern: TilePattern | None = None

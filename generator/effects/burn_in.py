@@ -72,6 +72,7 @@ BURN_IN = Effect(
     change=_remember_light,
     isolated_by="a flat before and after objects, in one place",
     shows=Shows(series=EVERY_SERIES, axis="time"),
+    either_onset=True,
     absorbed="nothing",
     grid=Grid(shares=(0.8,), variants=({"fade_s": 300.0}, {"fade_s": 10000.0})),
     images=InImages(left_out="what was exposed before an image is not known"),

@@ -82,7 +82,7 @@ def draw_case(
     """
     if label is None:
         label = str(rng.choice(list(LABELS), p=list(LABELS.values())))
-    known = [name for name, law in EFFECTS.items() if law.known and (names is None or name in names)]
+    known = [name for name, law in EFFECTS.items() if law.known and law.drawn and (names is None or name in names)]
     unknown = [name for name, law in EFFECTS.items() if not law.known]
     chosen: list[str] = []
     if label == "unknown":

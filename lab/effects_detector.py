@@ -311,6 +311,27 @@ def _burn_in(request: Asked, site: Site) -> Planted:
     )
 
 
+_COUNTED_KEV = 45.0  # that one photon leaves, as a beam of 90 kV leaves on average
+
+
+def _pile_up(request: Asked, site: Site) -> Planted:
+    """Pulses that a pixel cannot tell apart: each photon prolongs the dead time, counted or not."""
+    dead_ms, quantum = 1e-6 * request.strength, _COUNTED_KEV * site.system.electrons_per_keV
+
+    def miss(electrons: Map, context: FrameContext) -> Map:
+        busy = electrons * np.float32(dead_ms / (quantum * context.exposure_ms * context.summed))
+        # beyond one photon a dead time fewer are counted the more come
+        out: Map = electrons * np.exp(-busy)
+        return out
+
+    return _told(
+        request,
+        "a counter whose dead time each photon prolongs: y = x exp(-x tau / t)",
+        {"electrons_a_count": quantum},
+        stages=(("electrons", Stage(name="pile_up", apply=miss, additive=False)),),
+    )
+
+
 # --- drift ------------------------------------------------------------------------------------------------------------
 
 
@@ -496,5 +517,6 @@ DETECTOR_LAWS: tuple[EffectLaw, ...] = (
 # further ones come last in the registry: the random numbers of those before stay theirs
 MEMORY_LAWS: tuple[EffectLaw, ...] = (
     _law("burn_in", "a screen that light makes brighter", "%", (0.05, 5.0), _burn_in),
+    _law("pile_up", "pulses that pile up", "ns", (10.0, 1000.0), _pile_up, drawn=False),
 )
 DETECTOR_UNITS = {law.id: law.unit for law in (*DETECTOR_LAWS, *MEMORY_LAWS)}

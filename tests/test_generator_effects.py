@@ -66,6 +66,7 @@ CATALOGUE = {
     "off_focal": ("%", 2, 20),
     "random_telegraph": ("%", 0.1, 10),
     "burn_in": ("%", 0.05, 5),
+    "pile_up": ("ns", 10, 1000),
 }
 CACHE = ModelCache()
 
@@ -108,8 +109,20 @@ def applied(name, strength=None, since=None, options=None, **parameters):
     )
 
 
+COUNTERS = {}
+
+
+def line_for(line, effects):
+    """The line, as a counter where only counters can have an effect."""
+    if not any(item.id == "pile_up" for item in effects):
+        return line
+    if id(line) not in COUNTERS:
+        COUNTERS[id(line)] = line, replace(line, instrument=replace(line.instrument, counting=True))
+    return COUNTERS[id(line)][1]
+
+
 def expect(line, asked, effects=(), cache=CACHE):
-    return expected_series(line, asked, effects=effects, cache=cache)
+    return expected_series(line_for(line, effects), asked, effects=effects, cache=cache)
 
 
 # ------------------------------------------------------------------------------------------------ the catalogue
@@ -223,7 +236,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     expected = expect(series_line, asked, effects)
     rng = np.random.default_rng(7)
     frames = np.stack(
-        list(sample_series(series_line, asked, rng=rng, effects=effects, cache=CACHE, memory=None))
+        list(sample_series(line_for(series_line, effects), asked, rng=rng, effects=effects, cache=CACHE, memory=None))
     ).astype(np.float64)
     residual = frames - expected.mean_DN
     for image, course in expected.trend_DN or ():
@@ -1246,6 +1259,29 @@ def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps
     np.testing.assert_allclose(found.quantum_variance_DN2, known**2 * plain.quantum_variance_DN2, rtol=1e-9)
     # where the object stood the later flat is darker
     assert known[20, 20] < known[1, 1] - 1e-4
+
+
+@pytest.mark.parametrize("dead_ns", [5_000.0, 40_000.0])
+def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series_line, dead_ns):
+    """Photons are drawn with their times; those within the dead time of the count before are lost."""
+    effect = applied("pile_up", dead_ns)
+    found, plain = expect(series_line, request(), effect), expect(series_line, request())
+    light = float(plain.signal_DN.mean())
+    photons, exposure_s = light / 10.0, 0.02  # 10 DN a count: the gain that this line states at 90 kV
+    rng = np.random.default_rng(6)
+    gaps = rng.exponential(exposure_s / photons, (4000, int(photons + 12 * math.sqrt(photons))))
+    gaps[:, 1:] += 1e-9 * dead_ns
+    counts = (np.cumsum(gaps, axis=1) < exposure_s).sum(axis=1)
+    shares = found.signal_DN.mean() / light
+    assert abs(shares - counts.mean() / photons) < 4 * counts.std() / photons / math.sqrt(4000) + 2e-4
+    of_variance = float(found.quantum_variance_DN2.mean() / plain.quantum_variance_DN2.mean())
+    assert abs(of_variance - counts.var() / photons) < 5 * math.sqrt(2 / 4000) * of_variance
+    assert shares < 0.99
+
+
+def test_only_counters_lose_counts(series_line):
+    with pytest.raises(InputError, match="only counters have a dead time"):
+        expected_series(series_line, request(), effects=applied("pile_up"))
 
 
 @pytest.mark.parametrize("peaked", [0.0, 1.0])

@@ -518,6 +518,16 @@ def test_a_screen_brightens_by_its_strength_after_a_hundred_exposures_at_full_sc
     assert 1.002 < later[0, -1] < 1.01
 
 
+def test_piled_up_pulses_are_lost_as_by_a_dead_time_that_each_prolongs():
+    system = system_on("coarse")
+    miss = stage_of(planted("pile_up=1000", system=system))
+    electrons = np.full((SIZE, SIZE), 45.0 * system.electrons_per_keV * 20_000, np.float32)
+    electrons[0] /= 1000.0
+    seen = miss(electrons, context_of(system, exposure_ms=100.0)) / electrons
+    # 20,000 photons in 0.1 s, blind for 1 us after each
+    assert seen[1] == pytest.approx(math.exp(-0.2), rel=1e-5) and seen[0] == pytest.approx(1.0 - 2e-4, rel=1e-5)
+
+
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
     line = line_with("dropped_frames=20", seed=3)
     shown = []

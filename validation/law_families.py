@@ -48,6 +48,8 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "dropped_frames": ("every few frames", "some in a row"),
     "off_focal": ("ring", "towards one side"),
     "random_telegraph": ("three levels", "heights that fall exponentially"),
+    "burn_in": ("two kinds of traps", "fades as a power of time"),
+    "pile_up": ("prolonged by each photon", "pixels of unlike dead times"),
 }
 # what the plain simulator has no law of: a middling strength (unit of the catalogue)
 ADDED = {
@@ -57,6 +59,8 @@ ADDED = {
     "dropped_frames": 5.0,
     "off_focal": 7.0,
     "random_telegraph": 1.5,
+    "burn_in": 2.0,
+    "pile_up": 400.0,
 }
 ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber", "random_telegraph"}
 _SOURCE_POINTS = 24
@@ -91,6 +95,10 @@ class FamilyLine(plain.Line):
         if "bad_pixels" in self.effects:
             self.changed_gain = self._dead()
         self.jumpy = self.law.random(self.of.shape) if "random_telegraph" in self.effects else np.ones(self.of.shape)
+        self.slow_pixels = np.ones(self.of.shape)
+        if self._is("pile_up", "pixels of unlike dead times"):
+            self.slow_pixels = np.exp(0.2 * self.law.standard_normal(self.of.shape))
+        self.seen: list[np.ndarray] = []
         self.walk = 0.0
         self.taken = 0
 
@@ -274,6 +282,7 @@ class FamilyLine(plain.Line):
         return signal, variance, remote
 
     def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
+        self.exposed_ms = exposure_ms
         shown = self._exposed(count, kind, exposure_ms, after, lit)
         if "random_telegraph" in self.on(after):
             shown = self._jumped(shown, self.on(after)["random_telegraph"] / 100.0)
@@ -372,6 +381,12 @@ class FamilyLine(plain.Line):
         if "nonlinearity" in on:
             level = self._bent(level, on["nonlinearity"] / 100.0)
         level = level * gain
+        if "burn_in" in on:
+            level = self._burnt(level, on["burn_in"] / 100.0)
+        if "pile_up" in on:
+            level = self._piled(
+                level, signal * gain, signal * self.slow_pixels * on["pile_up"] * 1e-6 / self.exposed_ms
+            )
         if "output_drift" in on:
             size = on["output_drift"] / 100.0
             if self._is("output_drift", "random walk"):
@@ -395,6 +410,25 @@ class FamilyLine(plain.Line):
         phase = self.law.uniform(0.0, 2.0 * math.pi)
         return math.sqrt(2.0) * np.sin(2.0 * math.pi * cycles_a_line * np.arange(rows) + phase)[:, None]
 
+    def _piled(self, level: np.ndarray, mean: np.ndarray, photons: np.ndarray) -> np.ndarray:
+        """Counts (row, column) of which each photon prolongs the dead time, `photons` of which come in one.
+
+        Of n photons n exp(-photons) are counted, with the variance n exp(-photons) (1 - 2 photons exp(-photons)).
+        """
+        left = np.exp(-photons)
+        return left * mean + np.sqrt(left * np.maximum(1.0 - 2.0 * photons * left, 0.0)) * (level - mean)
+
+    def _burnt(self, level: np.ndarray, share: float) -> np.ndarray:
+        """A frame (row, column) of a screen that the light before has made brighter, by `share` after 100 full frames."""
+        age_s = 0.1 * (len(self.seen) - np.arange(len(self.seen)))
+        if self._is("burn_in", "fades as a power of time"):
+            left = (1.0 + age_s / 30.0) ** -0.4
+        else:
+            left = 0.4 * np.exp(-age_s / 60.0) + 0.6
+        before = np.tensordot(left, np.array(self.seen), axes=1) if self.seen else np.zeros_like(level)
+        self.seen.append(level / self.of.highest_DN)
+        return level * (1.0 + share * before / 100.0)
+
     def _bent(self, level: np.ndarray, departure: float) -> np.ndarray:
         """`departure` from a line at half of the highest level."""
         at = level / (0.5 * self.of.highest_DN)
@@ -408,7 +442,9 @@ class FamilyLine(plain.Line):
 
 def effects_of(line: str) -> list[str]:
     """Effects of which a line can have a law of a drawn family."""
-    return [one for one in plain.cases_of(plain.LINES[line]) if one in FAMILIES and one not in ADDED] + list(ADDED)
+    counting = plain.LINES[line].counting
+    added = [one for one in ADDED if one not in (("random_telegraph", "burn_in") if counting else ("pile_up",))]
+    return [one for one in plain.cases_of(plain.LINES[line]) if one in FAMILIES and one not in ADDED] + added
 
 
 STRONGER = {

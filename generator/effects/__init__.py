@@ -48,6 +48,7 @@ from .nonlinearity import NONLINEARITY
 from .object_scatter import OBJECT_SCATTER
 from .off_focal import OFF_FOCAL
 from .output_drift import OUTPUT_DRIFT
+from .pile_up import PILE_UP
 from .quantisation import QUANTISATION
 from .random_telegraph import RANDOM_TELEGRAPH
 from .row_noise import ROW_NOISE
@@ -84,6 +85,7 @@ OURS: dict[str, Effect] = {
         OFF_FOCAL,
         RANDOM_TELEGRAPH,
         BURN_IN,
+        PILE_UP,
     )
 }
 EFFECTS = Catalogue(OURS)

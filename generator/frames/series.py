@@ -37,6 +37,7 @@ from ..line.twin import Twin
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
 from .defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from .response import counting_noise, responded, responds, slope
 
 __all__ = [
     "ExpectedSeries",
@@ -784,16 +785,16 @@ def expected_series(
         )
         trend = [*((gained * amount, course) for amount, course in trend), (gains * signal, profile_of_gain)]
         signal = gained * signal
-    bend = state.bend_per_DN
-    slope: FloatArray | float = 1.0
-    if bend != 0.0:
-        slope = 1.0 - 2.0 * bend * signal
-        signal = signal * (1.0 - bend * signal)
-        trend = [(slope * amount, course) for amount, course in trend]
+    response: FloatArray | float = 1.0
+    if responds(state):
+        steepness = slope(state, signal)
+        response = steepness**2 * counting_noise(state, signal)
+        signal = responded(state, signal)
+        trend = [(steepness * amount, course) for amount, course in trend]
     quantum, white = charge.correlated, charge.white
-    if covariance[0] != 1.0 or bend != 0.0 or state.gain_memory is not None:
+    if covariance[0] != 1.0 or responds(state) or state.gain_memory is not None:
         # secondary quanta are drawn before the traps as the others are
-        quantum, white = (covariance[0] * (gained * slope) ** 2 * variance for variance in (quantum, white))
+        quantum, white = (covariance[0] * gained**2 * response * variance for variance in (quantum, white))
     dark = cache.pixels(twin.maps, ("dark", request.exposure_ms), lambda: twin.maps.dark_at(request.exposure_ms))
     for height, profile in state.offsets:
         times = request.start_s + interval * np.arange(exposures, dtype=np.float64)
@@ -916,8 +917,9 @@ def sample_series(
     electronic = np.sqrt(_read_variance(twin, state, cache))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
     lowest = 0.0 if twin.noise.quantised else -math.inf
-    scale = np.sqrt(charge.shape * charge.relative)
-    white = np.sqrt(charge.white)
+    by_chance = counting_noise(state, charge.mean)
+    scale = np.sqrt(charge.shape * charge.relative * by_chance)
+    white = np.sqrt(charge.white * by_chance)
     before, variance = blurred_object(_quanta(state))
     # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
     quantum = variance / np.maximum(before, 1e-300)
@@ -954,7 +956,7 @@ def sample_series(
             if state.gain_memory is not None:
                 value = value * (1.0 + state.gain_memory.most * filled)
                 filled = steady + (filled - steady) * np.exp(-pace)
-            value = value * (1.0 - state.bend_per_DN * value)
+            value = responded(state, value)
             if bad is not None:
                 value = np.where(bad.dead, 0.0, value)
             value = value + dark + electronic * rng.standard_normal(shape)

@@ -182,6 +182,7 @@ class LineState:
             time, and the share of its variance that is new in every exposure.
         flicker: factors of the lines of an exposure, or None.
         lag: traps, or None.
+        blind_per_DN: pile-up k of z = x / (1 + k x), x above dark, before the nonlinearity.
         gain_memory: of the light before, or None.
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
         gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
@@ -216,6 +217,7 @@ class LineState:
     lag: LagLaw | None = None
     gain_memory: GainMemory | None = None
     bend_per_DN: float = 0.0
+    blind_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
     tile_pattern: TilePattern | None = None
     offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()

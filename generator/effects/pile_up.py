@@ -50,6 +50,7 @@ PILE_UP = Effect(
     reference="counter of constant dead time: Knoll, Radiation Detection and Measurement, chapter 4; variance: renewal theory (Cox)",
     after_calibration=False,
     change=_lose_counts,
+    needs=("counting",),
     isolated_by="flats at several currents and one exposure time, and at several times and one current",
     shows=Shows(series=LIT_SERIES, axis="level"),
     either_onset=True,

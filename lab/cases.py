@@ -17,7 +17,7 @@ from .effects import EFFECTS, EffectRequest
 LABELS = {"none": 0.30, "single": 0.40, "pair": 0.15, "unknown": 0.15}
 # What only fine pixels, or only a wide field, can show.
 FINE = ("focal_spot", "mtf_tail", "k_fluorescence", "motion_blur", "misregistration", "unknown:sharpening")
-COARSE = ("object_scatter", "veiling_glare", "heel", "unknown:off_focal")
+COARSE = ("object_scatter", "veiling_glare", "heel", "off_focal")
 # There all the time as a rule, but now and then they come later; what calibration would take in never comes before.
 MAY_COME_LATER = ("veiling_glare", "image_lag", "nonlinearity", "row_noise", "quantisation")
 # effects that the wrong data cannot tell apart: confusions are pooled by these
@@ -82,7 +82,7 @@ def draw_case(
     """
     if label is None:
         label = str(rng.choice(list(LABELS), p=list(LABELS.values())))
-    known = [name for name, law in EFFECTS.items() if law.known and (names is None or name in names)]
+    known = [name for name, law in EFFECTS.items() if law.known and law.drawn and (names is None or name in names)]
     unknown = [name for name, law in EFFECTS.items() if not law.known]
     chosen: list[str] = []
     if label == "unknown":

@@ -47,7 +47,8 @@ class EffectLaw:
     """One kind of effect.
 
     Fields: id; title; unit, low and high of the strength's plausible range; since (what is usual); signed (the strength
-    may be negative); build; known (in the catalogue that a diagnosis may name).
+    may be negative); build; known (in the catalogue that a diagnosis may name); drawn (False: planted where asked for alone, as the
+    lab's detector adds up energies and this is an effect of others).
     """
 
     id: str
@@ -59,3 +60,4 @@ class EffectLaw:
     build: Build
     signed: bool = False
     known: bool = True
+    drawn: bool = True

@@ -13,15 +13,26 @@ import numpy as np
 
 from ..errors import InputError
 from .effect import FORM, SINCE, Asked, EffectLaw, Site
-from .effects_beam import BEAM_LAWS, COVER_LAWS
-from .effects_detector import DETECTOR_LAWS
+from .effects_beam import BEAM_LAWS, COVER_LAWS, SOURCE_LAWS
+from .effects_detector import DETECTOR_LAWS, MEMORY_LAWS
 from .effects_frames import FRAME_LAWS
-from .effects_pixels import PIXEL_LAWS
+from .effects_pixels import JUMP_LAWS, PIXEL_LAWS
 from .effects_unknown import UNKNOWN_LAWS
 from .line import Planted
 
 EFFECTS: Mapping[str, EffectLaw] = {
-    law.id: law for law in (*BEAM_LAWS, *DETECTOR_LAWS, *UNKNOWN_LAWS, *PIXEL_LAWS, *COVER_LAWS, *FRAME_LAWS)
+    law.id: law
+    for law in (
+        *BEAM_LAWS,
+        *DETECTOR_LAWS,
+        *SOURCE_LAWS,
+        *UNKNOWN_LAWS,
+        *JUMP_LAWS,
+        *PIXEL_LAWS,
+        *COVER_LAWS,
+        *FRAME_LAWS,
+        *MEMORY_LAWS,
+    )
 }
 
 

@@ -12,7 +12,7 @@ from ..acquisition.setting import Filter
 from .attenuation import mu_per_mm
 from .chain import SUBPIXELS, margin_px
 from .effect import Asked, EffectLaw, Site
-from .effects_detector import planted
+from .effects_detector import mixed_gaussians, planted
 from .line import MINERAL, Exposure, FineMap, FineRates, Planted, rates_of_map
 from .objects import PRODUCT_MATERIAL, fine_shape
 from .phantoms import Posed
@@ -228,6 +228,32 @@ def _focal_spot(request: Asked, site: Site) -> Planted:
     return _told(request, "source points of triangular brightness in both directions", {}, rates=blur)
 
 
+def _off_focal(request: Asked, site: Site) -> Planted:
+    share, radius_mm = request.strength / 100.0, float(site.rng.uniform(5.0, 12.0))
+
+    def second_source(rates: FineRates, exposure: Exposure) -> FineRates:
+        if not exposure.scene:
+            return rates
+        system = exposure.system
+        wide_px = radius_mm * (system.magnification - 1.0) / system.pixel_mm
+        spelled = rates.spelled_out()
+        out = np.empty_like(spelled)
+        for number in range(spelled.shape[2]):
+            plane = np.ascontiguousarray(spelled[:, :, number])
+            blocks = plane.reshape(plane.shape[0] // SUBPIXELS, SUBPIXELS, plane.shape[1] // SUBPIXELS, SUBPIXELS)
+            wide = mixed_gaussians(blocks.mean(axis=(1, 3)), ((0.5, 0.35 * wide_px), (0.5, 0.8 * wide_px)))
+            smooth = np.repeat(np.repeat(wide, SUBPIXELS, axis=0), SUBPIXELS, axis=1)
+            out[:, :, number] = np.float32(1.0 - share) * plane + np.float32(share) * smooth
+        return rates_of_map(out, rates)
+
+    return _told(
+        request,
+        "a share of the photons comes from a wide spot around the focus",
+        {"radius_mm": radius_mm},
+        rates=second_source,
+    )
+
+
 def _motion_blur(request: Asked, site: Site) -> Planted:
     nominal = site.system.magnification
     ripple, phase = 0.15, float(site.rng.uniform(0.0, 2.0 * math.pi))
@@ -399,4 +425,7 @@ BEAM_LAWS: tuple[EffectLaw, ...] = (
 COVER_LAWS: tuple[EffectLaw, ...] = (
     _law("grey_absorber", "something in a part of the beam", "%", (0.5, 60.0), _grey_absorber, since="calibration"),
 )
-BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *COVER_LAWS)}
+SOURCE_LAWS: tuple[EffectLaw, ...] = (
+    _law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal),
+)
+BEAM_UNITS = {law.id: law.unit for law in (*BEAM_LAWS, *SOURCE_LAWS, *COVER_LAWS)}

@@ -286,6 +286,52 @@ def _nonlinearity(request: Asked, site: Site) -> Planted:
     )
 
 
+def _burn_in(request: Asked, site: Site) -> Planted:
+    """Traps of the screen, of two depths: light fills each only once, and they empty."""
+    system = site.system
+    full_electrons = (system.saturation_DN - system.dark_DN) / system.DN_per_electron
+    fills_after = float(site.rng.uniform(150.0, 600.0))  # exposures at full scale, by which all but 1/e are full
+    most = request.strength / 100.0 / -math.expm1(-100.0 / fills_after)
+    empty_s = float(math.exp(site.rng.uniform(math.log(200.0), math.log(1000.0)))), 20_000.0
+
+    def brighten(light: Map, context: FrameContext) -> Map:
+        full, when_s = context.memory.get("burn_in", (np.zeros((2, *light.shape), np.float32), context.began_s))
+        waited_s = max(context.began_s - when_s, 0.0)
+        full = full * np.exp(-waited_s / np.array(empty_s, np.float32))[:, None, None]
+        out: Map = light * (1.0 + np.float32(most) * full.mean(axis=0))
+        reached = -np.expm1(-light * np.float32(system.electrons_per_keV / (fills_after * full_electrons)))
+        context.memory["burn_in"] = full + (1.0 - full) * reached, context.began_s
+        return out
+
+    return _told(
+        request,
+        "traps of the screen, half quick and half slow, that light fills only once",
+        {"fills_after_exposures": fills_after, "empty_s": list(empty_s)},
+        stages=(("spread", Stage(name="burn_in", apply=brighten, additive=False)),),
+    )
+
+
+_COUNTED_KEV = 45.0  # that one photon leaves, as a beam of 90 kV leaves on average
+
+
+def _pile_up(request: Asked, site: Site) -> Planted:
+    """Pulses that a pixel cannot tell apart: each photon prolongs the dead time, counted or not."""
+    dead_ms, quantum = 1e-6 * request.strength, _COUNTED_KEV * site.system.electrons_per_keV
+
+    def miss(electrons: Map, context: FrameContext) -> Map:
+        busy = electrons * np.float32(dead_ms / (quantum * context.exposure_ms * context.summed))
+        # beyond one photon a dead time fewer are counted the more come
+        out: Map = electrons * np.exp(-busy)
+        return out
+
+    return _told(
+        request,
+        "a counter whose dead time each photon prolongs: y = x exp(-x tau / t)",
+        {"electrons_a_count": quantum},
+        stages=(("electrons", Stage(name="pile_up", apply=miss, additive=False)),),
+    )
+
+
 # --- drift ------------------------------------------------------------------------------------------------------------
 
 
@@ -468,4 +514,9 @@ DETECTOR_LAWS: tuple[EffectLaw, ...] = (
     _law("row_noise", "offsets of lines, new in every frame", "sigma", (0.05, 2.0), _row_noise),
     _law("quantisation", "lost bits", "DN", (2.0, 64.0), _quantisation),
 )
-DETECTOR_UNITS = {law.id: law.unit for law in DETECTOR_LAWS}
+# further ones come last in the registry: the random numbers of those before stay theirs
+MEMORY_LAWS: tuple[EffectLaw, ...] = (
+    _law("burn_in", "a screen that light makes brighter", "%", (0.05, 5.0), _burn_in),
+    _law("pile_up", "pulses that pile up", "ns", (10.0, 1000.0), _pile_up, drawn=False),
+)
+DETECTOR_UNITS = {law.id: law.unit for law in (*DETECTOR_LAWS, *MEMORY_LAWS)}

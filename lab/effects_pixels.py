@@ -133,6 +133,33 @@ def _line_flicker(request: Asked, site: Site) -> Planted:
     )
 
 
+# --- pixels that jump ---------------------------------------------------------------------------------------------------
+
+
+def _random_telegraph(request: Asked, site: Site) -> Planted:
+    rng, shape = site.rng, (site.system.rows, site.system.columns)
+    count = max(1, round(request.strength / 100.0 * shape[0] * shape[1]))
+    places = rng.choice(shape[0] * shape[1], size=count, replace=False)
+    height_DN = (rng.uniform(3.0, 10.0, size=count) * site.system.read_noise_DN).astype(np.float32)
+    switches = 1.0 / rng.uniform(3.0, 15.0, size=count)
+
+    def jump(level_DN: Map, context: FrameContext) -> Map:
+        state = context.memory.get("random_telegraph")
+        drawn = frame_rng(context, 14).random(count)
+        state = (drawn < 0.5) if state is None else state ^ (drawn < switches)
+        context.memory["random_telegraph"] = state
+        out = level_DN.copy()
+        out.ravel()[places] += np.where(state, height_DN, np.float32(0.0))
+        return out
+
+    return _told(
+        request,
+        "pixels whose dark level jumps between two values and stays for some frames",
+        {"pixels": count},
+        stages=(("readout", Stage(name="random_telegraph", apply=jump, additive=False)),),
+    )
+
+
 def _told(request: Asked, law: str, parameters: dict[str, Any], **hooks: Any) -> Planted:
     return planted(request, PIXEL_UNITS[request.id], law, parameters, **hooks)
 
@@ -167,4 +194,15 @@ PIXEL_LAWS: tuple[EffectLaw, ...] = (
         build=_line_flicker,
     ),
 )
-PIXEL_UNITS = {law.id: law.unit for law in PIXEL_LAWS}
+JUMP_LAWS: tuple[EffectLaw, ...] = (
+    EffectLaw(
+        id="random_telegraph",
+        title="random-telegraph pixels",
+        unit="%",
+        low=0.3,
+        high=10.0,
+        since="calibration",
+        build=_random_telegraph,
+    ),
+)
+PIXEL_UNITS = {law.id: law.unit for law in (*PIXEL_LAWS, *JUMP_LAWS)}

@@ -8,37 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chain import SUBPIXELS, FrameContext, Stage
+from .chain import FrameContext, Stage
 from .effect import Asked, EffectLaw, Site
 from .effects_detector import Map, frame_rng, mixed_gaussians, planted
-from .line import Exposure, FineRates, Planted, rates_of_map
+from .line import Planted
 from .system import DetectorMaps
-
-
-def _off_focal(request: Asked, site: Site) -> Planted:
-    share, radius_mm = request.strength / 100.0, float(site.rng.uniform(5.0, 12.0))
-
-    def second_source(rates: FineRates, exposure: Exposure) -> FineRates:
-        if not exposure.scene:
-            return rates
-        system = exposure.system
-        wide_px = radius_mm * (system.magnification - 1.0) / system.pixel_mm
-        spelled = rates.spelled_out()
-        out = np.empty_like(spelled)
-        for number in range(spelled.shape[2]):
-            plane = np.ascontiguousarray(spelled[:, :, number])
-            blocks = plane.reshape(plane.shape[0] // SUBPIXELS, SUBPIXELS, plane.shape[1] // SUBPIXELS, SUBPIXELS)
-            wide = mixed_gaussians(blocks.mean(axis=(1, 3)), ((0.5, 0.35 * wide_px), (0.5, 0.8 * wide_px)))
-            smooth = np.repeat(np.repeat(wide, SUBPIXELS, axis=0), SUBPIXELS, axis=1)
-            out[:, :, number] = np.float32(1.0 - share) * plane + np.float32(share) * smooth
-        return rates_of_map(out, rates)
-
-    return _told(
-        request,
-        "a share of the photons comes from a wide spot around the focus",
-        {"radius_mm": radius_mm},
-        rates=second_source,
-    )
 
 
 def _tile_seams(request: Asked, site: Site) -> Planted:
@@ -70,30 +44,6 @@ def _tile_seams(request: Asked, site: Site) -> Planted:
         {"tile_px": tile},
         maps=change,
         stages=(("readout", Stage(name="tile_seams", apply=wander)),),
-    )
-
-
-def _rts_pixels(request: Asked, site: Site) -> Planted:
-    rng, shape = site.rng, (site.system.rows, site.system.columns)
-    count = max(1, round(request.strength / 100.0 * shape[0] * shape[1]))
-    places = rng.choice(shape[0] * shape[1], size=count, replace=False)
-    height_DN = (rng.uniform(3.0, 10.0, size=count) * site.system.read_noise_DN).astype(np.float32)
-    switches = 1.0 / rng.uniform(3.0, 15.0, size=count)
-
-    def jump(level_DN: Map, context: FrameContext) -> Map:
-        state = context.memory.get("rts_pixels")
-        drawn = frame_rng(context, 14).random(count)
-        state = (drawn < 0.5) if state is None else state ^ (drawn < switches)
-        context.memory["rts_pixels"] = state
-        out = level_DN.copy()
-        out.ravel()[places] += np.where(state, height_DN, np.float32(0.0))
-        return out
-
-    return _told(
-        request,
-        "pixels whose dark level jumps between two values and stays for some frames",
-        {"pixels": count},
-        stages=(("readout", Stage(name="rts_pixels", apply=jump, additive=False)),),
     )
 
 
@@ -156,9 +106,7 @@ def _law(name: str, title: str, unit: str, span: tuple[float, float], build: _Bu
 
 
 UNKNOWN_LAWS: tuple[EffectLaw, ...] = (
-    _law("off_focal", "radiation from beside the focus", "%", (2.0, 20.0), _off_focal, "always"),
     _law("tile_seams", "tiles and their seams", "%", (0.2, 3.0), _tile_seams, "calibration"),
-    _law("rts_pixels", "random-telegraph pixels", "%", (0.3, 10.0), _rts_pixels, "calibration"),
     _law("sharpening", "sharpening in the firmware", "%", (3.0, 80.0), _sharpening, "calibration"),
     _law("compression", "lossy compression", "DN", (8.0, 200.0), _compression, "calibration"),
 )

@@ -282,6 +282,7 @@ def test_what_flats_or_darks_show_and_calibration_takes_in_only_in_part_is_tried
         "gain_map_error",
         "excess_noise",
         "bad_pixels",
+        "random_telegraph",
         "mtf_tail",
         "grey_absorber",
     }

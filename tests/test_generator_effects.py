@@ -63,6 +63,10 @@ CATALOGUE = {
     "line_flicker": ("%", 0.03, 1),
     "grey_absorber": ("%", 0.5, 60),
     "dropped_frames": ("%", 0.5, 30),
+    "off_focal": ("%", 2, 20),
+    "random_telegraph": ("%", 0.1, 10),
+    "burn_in": ("%", 0.05, 5),
+    "pile_up": ("ns", 10, 1000),
 }
 CACHE = ModelCache()
 
@@ -105,8 +109,20 @@ def applied(name, strength=None, since=None, options=None, **parameters):
     )
 
 
+COUNTERS = {}
+
+
+def line_for(line, effects):
+    """The line, as a counter where only counters can have an effect."""
+    if not any(item.id == "pile_up" for item in effects):
+        return line
+    if id(line) not in COUNTERS:
+        COUNTERS[id(line)] = line, replace(line, instrument=replace(line.instrument, counting=True))
+    return COUNTERS[id(line)][1]
+
+
 def expect(line, asked, effects=(), cache=CACHE):
-    return expected_series(line, asked, effects=effects, cache=cache)
+    return expected_series(line_for(line, effects), asked, effects=effects, cache=cache)
 
 
 # ------------------------------------------------------------------------------------------------ the catalogue
@@ -143,6 +159,11 @@ def numbers(found):
                 found.repeated_share,
             ]
         ),
+        np.zeros(3)
+        if found.telegraph is None
+        else found.telegraph.share
+        * 100
+        * np.array([1.0, found.telegraph.amplitude_reads, found.telegraph.stay_exposures]),
         np.zeros(3)
         if found.flicker is None
         else found.flicker.rms * 1000 * np.array([1.0, found.flicker.column_share, found.flicker.correlation(1)]),
@@ -215,7 +236,7 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     expected = expect(series_line, asked, effects)
     rng = np.random.default_rng(7)
     frames = np.stack(
-        list(sample_series(series_line, asked, rng=rng, effects=effects, cache=CACHE, memory=None))
+        list(sample_series(line_for(series_line, effects), asked, rng=rng, effects=effects, cache=CACHE, memory=None))
     ).astype(np.float64)
     residual = frames - expected.mean_DN
     for image, course in expected.trend_DN or ():
@@ -241,6 +262,18 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
         good = np.abs(residual.mean(axis=0)) < 6 * np.sqrt(variance / count)
         share = 1 - good.mean()
         assert abs(share - expected.bad_pixel_share) < 4 * math.sqrt(8 * expected.bad_pixel_share / good.size)
+    if name == "random_telegraph":
+        electronic = series_line.maps.read_variance_DN2 - 1.0 / 12.0
+        height = expected.telegraph.amplitude_reads * np.sqrt(electronic)
+        good = np.abs(residual.mean(axis=0)) < 0.25 * height
+        share = 1 - good.mean()
+        assert abs(share - expected.telegraph.share) < 4 * math.sqrt(expected.telegraph.share / good.size)
+        # half of the time they are up; a stay of m exposures correlates them over m / 2, and 1 / m of the steps are jumps
+        stay = expected.telegraph.stay_exposures
+        up = (residual / height)[:, ~good]
+        jumps = 0.5 * (np.diff(up, axis=0) ** 2).mean() - (variance / height**2)[~good].mean()
+        assert abs(up.mean() - 0.5) < 4 * 0.5 / math.sqrt(up.size / stay)
+        assert abs(jumps - 0.5 / stay) < 4 * 0.5 / stay / math.sqrt(up.size / stay) + 0.02
     if name == "gain_map_error":
         pattern = residual.mean(axis=0) / expected.signal_DN
         assert pattern.std() == pytest.approx(expected.gain_pattern.rms, rel=4 / math.sqrt(2 * good.size) + 0.02)
@@ -1191,6 +1224,94 @@ def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise
     away = [(counts - full * image / plain.max()) / np.sqrt(full * image / plain.max()) for image in (known, plain)]
     assert np.abs(away[0]).max() < 4.5 and np.abs(away[1]).max() > 15.0
     # moved quanta are counts as the others: their noise is as correlated as before, and flats do not change
+    np.testing.assert_array_equal(found.noise_autocovariance, sharp.noise_autocovariance)
+    np.testing.assert_array_equal(
+        numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
+    )
+
+
+def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps(series_line):
+    """Traps are filled and emptied step by step, a hundred steps an exposure."""
+    strength, fade_s, fills = 4.0, 12.0, 30.0
+    shadow, flat = request(**BEHIND, frames=40), request(frames=20, start_s=4.0)
+    asked = request(frames=12, start_s=9.0, previous=(shadow, flat))
+    effect = applied("burn_in", strength, fade_s=fade_s, fills_after_exposures=fills)
+    found, plain = expect(series_line, asked, effect), expect(series_line, asked)
+    step_s = asked.interval_s(series_line.instrument.readout_ms)
+    highest = 2.0**series_line.instrument.bits - 1 - series_line.dark_DN.value
+    most = strength / 100.0 / (1.0 - math.exp(-100.0 / fills))
+    full, clock_s, gain = np.zeros(SHAPE), 0.0, []
+    for series in (shadow, flat, asked):
+        light = expect(series_line, replace(series, frames=1, previous=())).signal_DN / (fills * highest)
+        full = full * math.exp(-(series.start_s - clock_s) / fade_s)
+        gain = []
+        for _ in range(series.frames):
+            gain.append(1.0 + most * full)
+            for _ in range(100):
+                full = full + (light * (1.0 - full) - full * step_s / fade_s) / 100.0
+        clock_s = series.start_s + series.frames * step_s
+    gain = np.array(gain)
+    rise = gain[-1] - gain[0]
+    known = found.signal_DN / plain.signal_DN
+    np.testing.assert_allclose(known - 1.0, gain.mean(axis=0) - 1.0, rtol=2e-3)
+    course = sum(image * profile[:, None, None] for image, profile in found.trend_DN) / plain.signal_DN
+    assert np.abs(course - (gain - gain.mean(axis=0))).max() < 0.02 * np.abs(rise).max()
+    np.testing.assert_allclose(found.quantum_variance_DN2, known**2 * plain.quantum_variance_DN2, rtol=1e-9)
+    # where the object stood the later flat is darker
+    assert known[20, 20] < known[1, 1] - 1e-4
+
+
+@pytest.mark.parametrize("dead_ns", [5_000.0, 40_000.0])
+def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series_line, dead_ns):
+    """Photons are drawn with their times; those within the dead time of the count before are lost."""
+    effect = applied("pile_up", dead_ns)
+    found, plain = expect(series_line, request(), effect), expect(series_line, request())
+    light = float(plain.signal_DN.mean())
+    photons, exposure_s = light / 10.0, 0.02  # 10 DN a count: the gain that this line states at 90 kV
+    rng = np.random.default_rng(6)
+    gaps = rng.exponential(exposure_s / photons, (4000, int(photons + 12 * math.sqrt(photons))))
+    gaps[:, 1:] += 1e-9 * dead_ns
+    counts = (np.cumsum(gaps, axis=1) < exposure_s).sum(axis=1)
+    shares = found.signal_DN.mean() / light
+    assert abs(shares - counts.mean() / photons) < 4 * counts.std() / photons / math.sqrt(4000) + 2e-4
+    of_variance = float(found.quantum_variance_DN2.mean() / plain.quantum_variance_DN2.mean())
+    assert abs(of_variance - counts.var() / photons) < 5 * math.sqrt(2 / 4000) * of_variance
+    assert shares < 0.99
+
+
+def test_only_counters_lose_counts(series_line):
+    with pytest.raises(InputError, match="only counters have a dead time"):
+        expected_series(series_line, request(), effects=applied("pile_up"))
+
+
+@pytest.mark.parametrize("peaked", [0.0, 1.0])
+@pytest.mark.parametrize("source_object_mm", [990.0, 850.0])
+def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_line, peaked, source_object_mm):
+    """Points are drawn on the source and shadows thrown one by one; no transfer function is used."""
+    strength, width_mm, count = 15.0, 3.0, 4_000_000
+    effect = applied("off_focal", strength, width_mm=width_mm, peaked_share=peaked)
+    plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
+    asked = request("object", thickness_mm=plate, source_object_mm=source_object_mm)
+    found, sharp = expect(series_line, asked, effect), expect(series_line, asked)
+    even = series_line.level_nearest(asked.setting).flat_shape
+    known, plain = ((one.signal_DN / even).mean(axis=0) for one in (found, sharp))
+    rng = np.random.default_rng(4)
+    # a Gaussian of exponentially distributed variance falls from a peak with a long tail
+    size = np.sqrt(rng.exponential(1.0, count)) if peaked else 1.0
+    place_mm = width_mm * size * rng.standard_normal(count) * (rng.random(count) < strength / 100.0)
+    border = 20.0 - (1059.0 / source_object_mm - 1.0) / series_line.instrument.pixel_mm * place_mm
+    column, luck = rng.uniform(0.0, 40.0, count), rng.random(count)
+    landed = column + series_line.noise.spread.value.sigma_px * rng.standard_normal(count)
+    passed, before = (luck < np.where(column < side, plain.min() / plain.max(), 1.0) for side in (border, 20.0))
+    # the same quanta with a point for a source: how the model draws a sharp edge is not asked here
+    more, fewer = (
+        np.histogram(landed[one & ~other], bins=np.arange(8, 33))[0]
+        for one, other in ((passed, before), (before, passed))
+    )
+    wanted = count / 40.0 * (known - plain)[8:32] / plain.max()
+    sd = np.sqrt(more + fewer + 1.0)
+    assert np.abs((more - fewer - wanted) / sd).max() < 4.5 and np.abs(wanted / sd).max() > 30.0
+    # noise is that of the quanta which arrive, and flats do not change
     np.testing.assert_array_equal(found.noise_autocovariance, sharp.noise_autocovariance)
     np.testing.assert_array_equal(
         numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))

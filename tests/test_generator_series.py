@@ -535,6 +535,7 @@ def test_detectors_of_any_shape_take_any_effect(series_line, shape):
         series_line,
         maps=replace(maps, **{name: crop(getattr(maps, name)) for name in names}),
         levels=tuple(replace(level, flat_shape=crop(level.flat_shape)) for level in series_line.levels),
+        instrument=replace(series_line.instrument, counting=True),
     )
     plate = np.where(np.indices(shape)[1] > shape[1] // 2, 2.0, 0.0)
     asked = request(

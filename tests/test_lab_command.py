@@ -130,12 +130,12 @@ def test_the_command_prints_the_truth_as_json(tmp_path, capsys):
 def test_the_command_plants_effects_and_names_them_in_the_truth(tmp_path, capsys):
     words = ["lab", "-o", str(tmp_path / "s.h5"), "--protocol", "short", "--seed", "4", "--size", "48", "--frames", "4"]
     words += ["--products", "1", "--geometry", "coarse", "--leave-out", "high_kV", "--family", "none", "--json"]
-    assert main([*words, "--effect", "row_noise=0.4@calibration", "--effect", "unknown:rts_pixels=2"]) == 0
+    assert main([*words, "--effect", "row_noise=0.4@calibration", "--effect", "random_telegraph=2"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["geometry"] == "coarse"
     assert {name: (one["strength"], one["since"]) for name, one in told["effects"].items()} == {
         "row_noise": (0.4, "calibration"),
-        "unknown:rts_pixels": (2.0, "calibration"),
+        "random_telegraph": (2.0, "calibration"),
     }
     assert not any("90kV" in name for name in told["series"])
     assert main([*words, "--only", "product"]) == 0

@@ -490,6 +490,44 @@ def test_quantisation_gives_multiples_of_its_step():
     assert np.array_equal(values, np.rint(np.rint(values / 2.5) * 2.5))
 
 
+def test_off_focal_radiation_lights_the_shadow_and_leaves_the_open_field():
+    line = line_with("off_focal=10", "coarse")
+    setting = setting_of(line, 90.0)
+    spread = edge_profile(line, setting, direction="x")
+    middle = spread.argmax()
+    near = spread[middle - 2 : middle + 3].sum()
+    assert near == pytest.approx(0.9, abs=0.03)
+    flat = expected_keV(line, setting)
+    assert flat.std() < 1e-6 * flat.mean()
+
+
+def test_a_screen_brightens_by_its_strength_after_a_hundred_exposures_at_full_scale():
+    system = system_on("coarse")
+    brighten = stage_of(planted("burn_in=2", system=system))
+    full_keV = (system.saturation_DN - system.dark_DN) / system.DN_per_electron / system.electrons_per_keV
+    light = np.full((SIZE, SIZE), full_keV, np.float32)
+    light[:, : SIZE // 2] = 0.0
+    memory = {}
+    for number in range(100):
+        brighten(light, context_of(system, began_s=0.001 * number, memory=memory))
+    even = np.ones((SIZE, SIZE), np.float32)
+    seen = brighten(even, context_of(system, began_s=0.1, memory=memory))
+    assert seen[:, -1] == pytest.approx(1.02, abs=2e-4) and seen[:, 0] == pytest.approx(1.0, abs=1e-6)
+    # it fades
+    later = brighten(even, context_of(system, began_s=10_000.0, memory=memory))
+    assert 1.002 < later[0, -1] < 1.01
+
+
+def test_piled_up_pulses_are_lost_as_by_a_dead_time_that_each_prolongs():
+    system = system_on("coarse")
+    miss = stage_of(planted("pile_up=1000", system=system))
+    electrons = np.full((SIZE, SIZE), 45.0 * system.electrons_per_keV * 20_000, np.float32)
+    electrons[0] /= 1000.0
+    seen = miss(electrons, context_of(system, exposure_ms=100.0)) / electrons
+    # 20,000 photons in 0.1 s, blind for 1 us after each
+    assert seen[1] == pytest.approx(math.exp(-0.2), rel=1e-5) and seen[0] == pytest.approx(1.0 - 2e-4, rel=1e-5)
+
+
 def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
     line = line_with("dropped_frames=20", seed=3)
     shown = []
@@ -508,17 +546,6 @@ def test_lost_frames_are_copies_of_the_last_good_one_of_their_series():
 # --- what no catalogue holds ------------------------------------------------------------------------------------------
 
 
-def test_off_focal_radiation_lights_the_shadow_and_leaves_the_open_field():
-    line = line_with("unknown:off_focal=10", "coarse")
-    setting = setting_of(line, 90.0)
-    spread = edge_profile(line, setting, direction="x")
-    middle = spread.argmax()
-    near = spread[middle - 2 : middle + 3].sum()
-    assert near == pytest.approx(0.9, abs=0.03)
-    flat = expected_keV(line, setting)
-    assert flat.std() < 1e-6 * flat.mean()
-
-
 def test_tiles_differ_by_their_strength_and_seams_are_dark():
     line = line_with("unknown:tile_seams=1", system=system_on("coarse", size=128))
     gain = line.maps.DN_per_electron / line.base_maps.DN_per_electron
@@ -530,7 +557,7 @@ def test_tiles_differ_by_their_strength_and_seams_are_dark():
 
 def test_random_telegraph_pixels_jump_and_stay():
     system = system_on("coarse")
-    line = line_with("unknown:rts_pixels=3", system=system)
+    line = line_with("random_telegraph=3", system=system)
     darks = np.array([frame for frame, _ in line.dark(10.0, frames=100)], dtype=float)
     spread = darks.std(axis=0, ddof=1)
     jumping = spread > 1.5 * system.read_noise_DN

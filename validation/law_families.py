@@ -46,10 +46,24 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "line_flicker": ("sine of any phase", "columns", "bands of rows"),
     "grey_absorber": ("copper from a slanted border on", "strip", "corner"),
     "dropped_frames": ("every few frames", "some in a row"),
+    "off_focal": ("ring", "towards one side"),
+    "random_telegraph": ("three levels", "heights that fall exponentially"),
+    "burn_in": ("two kinds of traps", "fades as a power of time"),
+    "pile_up": ("prolonged by each photon", "pixels of unlike dead times"),
 }
 # what the plain simulator has no law of: a middling strength (unit of the catalogue)
-ADDED = {"crosstalk": 10.0, "line_flicker": 0.2, "grey_absorber": 4.0, "dropped_frames": 5.0}
-ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber"}
+ADDED = {
+    "crosstalk": 10.0,
+    "line_flicker": 0.2,
+    "grey_absorber": 4.0,
+    "dropped_frames": 5.0,
+    "off_focal": 7.0,
+    "random_telegraph": 1.5,
+    "burn_in": 2.0,
+    "pile_up": 400.0,
+}
+ADDED_ALWAYS = frozenset(ADDED) - {"grey_absorber", "random_telegraph"}
+_SOURCE_POINTS = 24
 
 
 def correlated(rng: np.random.Generator, shape: tuple[int, int], px: float) -> np.ndarray:
@@ -80,6 +94,11 @@ class FamilyLine(plain.Line):
             self.changed_gain = 1.0 + self.effects["gain_map_error"] / 100.0 * self._pattern()
         if "bad_pixels" in self.effects:
             self.changed_gain = self._dead()
+        self.jumpy = self.law.random(self.of.shape) if "random_telegraph" in self.effects else np.ones(self.of.shape)
+        self.slow_pixels = np.ones(self.of.shape)
+        if self._is("pile_up", "pixels of unlike dead times"):
+            self.slow_pixels = np.exp(0.2 * self.law.standard_normal(self.of.shape))
+        self.seen: list[np.ndarray] = []
         self.walk = 0.0
         self.taken = 0
 
@@ -199,6 +218,8 @@ class FamilyLine(plain.Line):
                 return gaussian_filter(along, (0.42 * width_px, 0.15 * width_px))
 
             signal, variance = spot(signal), spot(variance)
+        if "off_focal" in on:
+            signal, variance = (self._beside(one, far, on["off_focal"] / 100.0) for one in (signal, variance))
         if "crosstalk" in on:
             signal, variance = (self._hopped(one, on["crosstalk"] / 100.0) for one in (signal, variance))
         if "motion_blur" in on:
@@ -207,6 +228,20 @@ class FamilyLine(plain.Line):
             places = course * on["motion_blur"] * exposure_ms / 50.0
             signal = np.mean([shift(signal, (place, 0.0), order=1, mode="nearest") for place in places], axis=0)
         return signal, variance
+
+    def _beside(self, image: np.ndarray, far: bool, share: float) -> np.ndarray:
+        """A picture with the shadows that points beside the focal spot throw."""
+        magnified = self.of.detector_mm / (self.of.far_mm if far else self.of.near_mm) - 1.0
+        reach_px = (3.0 + 5.0 * self.u["a"]) * magnified / self.of.pixel_mm
+        steps = (np.arange(_SOURCE_POINTS) + 0.5) / _SOURCE_POINTS
+        if self._is("off_focal", "ring"):
+            turns = 2.0 * math.pi * steps
+            places = reach_px * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        else:
+            # the anode goes on to one side: ever fewer electrons strike it
+            places = np.stack([-reach_px * np.log(steps), np.zeros(_SOURCE_POINTS)], axis=1)
+        wide = np.mean([shift(image, place, order=1, mode="nearest") for place in places], axis=0)
+        return (1.0 - share) * image + share * wide
 
     def _hopped(self, image: np.ndarray, share: float) -> np.ndarray:
         """A picture of which each pixel's neighbours count a share."""
@@ -247,7 +282,10 @@ class FamilyLine(plain.Line):
         return signal, variance, remote
 
     def frames(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
+        self.exposed_ms = exposure_ms
         shown = self._exposed(count, kind, exposure_ms, after, lit)
+        if "random_telegraph" in self.on(after):
+            shown = self._jumped(shown, self.on(after)["random_telegraph"] / 100.0)
         share = self.on(after).get("dropped_frames", 0.0) / 100.0
         if share and self._is("dropped_frames", "some in a row"):
             for number in np.flatnonzero(self.law.random(count - 1) < share / 3.0) + 1:
@@ -257,6 +295,19 @@ class FamilyLine(plain.Line):
             for number in range(int(self.law.integers(1, every + 1)), count, every):
                 shown[number] = shown[number - 1]
         return shown
+
+    def _jumped(self, shown: np.ndarray, share: float) -> np.ndarray:
+        """Frames of which the same pixels jump between levels, some frames in each."""
+        pixels = np.flatnonzero(self.jumpy < share)
+        three = self._is("random_telegraph", "three levels")
+        heights = 7.0 if three else 2.0 + 6.0 * -np.log(np.maximum(self.jumpy.flat[pixels] / share, 1e-6))
+        level = self.law.integers(0, 3 if three else 2, len(pixels)).astype(float)
+        out = shown.astype(float)
+        for frame in out:
+            frame.flat[pixels] += np.round(self.of.read_DN * heights * level)
+            moves = self.law.random(len(pixels)) < 1.0 / (4.0 + 8.0 * self.u["a"])
+            level = np.where(moves, self.law.integers(0, 3, len(pixels)) if three else 1.0 - level, level)
+        return np.clip(out, 0, self.of.highest_DN).astype(np.uint16)
 
     def _exposed(self, count: int, kind: str, exposure_ms: float, after: bool, lit: tuple | None) -> np.ndarray:
         on = self.on(after)
@@ -330,6 +381,12 @@ class FamilyLine(plain.Line):
         if "nonlinearity" in on:
             level = self._bent(level, on["nonlinearity"] / 100.0)
         level = level * gain
+        if "burn_in" in on:
+            level = self._burnt(level, on["burn_in"] / 100.0)
+        if "pile_up" in on:
+            level = self._piled(
+                level, signal * gain, signal * self.slow_pixels * on["pile_up"] * 1e-6 / self.exposed_ms
+            )
         if "output_drift" in on:
             size = on["output_drift"] / 100.0
             if self._is("output_drift", "random walk"):
@@ -353,6 +410,25 @@ class FamilyLine(plain.Line):
         phase = self.law.uniform(0.0, 2.0 * math.pi)
         return math.sqrt(2.0) * np.sin(2.0 * math.pi * cycles_a_line * np.arange(rows) + phase)[:, None]
 
+    def _piled(self, level: np.ndarray, mean: np.ndarray, photons: np.ndarray) -> np.ndarray:
+        """Counts (row, column) of which each photon prolongs the dead time, `photons` of which come in one.
+
+        Of n photons n exp(-photons) are counted, with the variance n exp(-photons) (1 - 2 photons exp(-photons)).
+        """
+        left = np.exp(-photons)
+        return left * mean + np.sqrt(left * np.maximum(1.0 - 2.0 * photons * left, 0.0)) * (level - mean)
+
+    def _burnt(self, level: np.ndarray, share: float) -> np.ndarray:
+        """A frame (row, column) of a screen that the light before has made brighter, by `share` after 100 full frames."""
+        age_s = 0.1 * (len(self.seen) - np.arange(len(self.seen)))
+        if self._is("burn_in", "fades as a power of time"):
+            left = (1.0 + age_s / 30.0) ** -0.4
+        else:
+            left = 0.4 * np.exp(-age_s / 60.0) + 0.6
+        before = np.tensordot(left, np.array(self.seen), axes=1) if self.seen else np.zeros_like(level)
+        self.seen.append(level / self.of.highest_DN)
+        return level * (1.0 + share * before / 100.0)
+
     def _bent(self, level: np.ndarray, departure: float) -> np.ndarray:
         """`departure` from a line at half of the highest level."""
         at = level / (0.5 * self.of.highest_DN)
@@ -366,7 +442,9 @@ class FamilyLine(plain.Line):
 
 def effects_of(line: str) -> list[str]:
     """Effects of which a line can have a law of a drawn family."""
-    return [one for one in plain.cases_of(plain.LINES[line]) if one in FAMILIES and one not in ADDED] + list(ADDED)
+    counting = plain.LINES[line].counting
+    added = [one for one in ADDED if one not in (("random_telegraph", "burn_in") if counting else ("pile_up",))]
+    return [one for one in plain.cases_of(plain.LINES[line]) if one in FAMILIES and one not in ADDED] + added
 
 
 STRONGER = {

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
+from ..probes.lasting import lasting_pixels
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, FirstLook
@@ -120,6 +121,20 @@ def _largest_ratio(frames: int) -> float:
     freedom = 2.0 * (frames - 1.0) / 3.0  # successive differences share frames
     # upper end of chi squared
     return float(2.0 * gammainccinv(0.5 * freedom, 1e-7) / freedom)
+
+
+def lasting_anywhere(
+    kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook], good: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Good pixels (row, column) whose level lasts for some frames in any later dark."""
+    found = np.zeros(good.shape, dtype=bool)
+    for item in kept:
+        if item.series.kind == "dark" and not item.calibrates:
+            look = looks[item.name]
+            found |= lasting_pixels(
+                look.stack_variance_DN2, look.pair_variance_DN2, look.frames, good, least_DN2=LEAST_NOISE_DN2
+            )
+    return found
 
 
 def memory_of(look: FirstLook, outlying: NDArray[np.bool_]) -> tuple[float, int] | None:

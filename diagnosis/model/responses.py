@@ -234,6 +234,7 @@ def session_model(
     signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
     lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
     counting, copies = counting_series(placed.kept), counted_copies(placed.kept, seen.looks)
+    darks = [item for item in placed.kept if item.series.kind == "dark" and not item.calibrates]
     series = []
     before: float | None = None
     for item in placed.kept:
@@ -249,6 +250,12 @@ def session_model(
             code_range=summaries[item.name].code_range,
             counts_all=item.name == counting,
             repeatable=copies[item.name][1] if item.name in copies else 0,
+            later_darks=tuple(
+                (other.series.n_frames, other.request.exposures_per_frame)
+                for other in sorted(darks, key=lambda other: other.name != item.name)
+            )
+            if item.name == counting or item.name in {dark.name for dark in darks}
+            else (),
         )
         alone = expected_scalars(expected, context)
         tells = item.name in placed.telling
@@ -281,8 +288,10 @@ def _context(
     code_range: int,
     counts_all: bool,
     repeatable: int,
+    later_darks: tuple[tuple[int, int], ...],
 ) -> ScalarContext:
-    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; repeatable: see there."""
+    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; repeatable,
+    later_darks: see there."""
     in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
     lit_DN = np.asarray(signal_DN if lit else 0.0)
@@ -306,6 +315,7 @@ def _context(
         dark_DN=mean_over(expected.dark_DN, clean),
         counts_all_outliers=counts_all,
         repeatable=repeatable,
+        later_darks=later_darks,
         gain=maps.gain if lit and "gain" not in item.series.corrected else None,
         averaged=item.request.exposures_per_frame,
         whole_lines=int(clean.sum()) > _WHOLE_LINES * in_use,

@@ -10,6 +10,7 @@ Files:
     scalar_context      pixels, times and numbers that both refer to
     line_scalars        what noise of rows and columns adds to them
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
+    lasting             pixels whose level lasts from frame to frame
     registration        displacement of a scene against its thickness maps
     moving_picture      noise that a fading picture seems to add
     noise_correlation   correlation of neighbouring pixels' noise, summed

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from ...generator.frames.series import ExpectedSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
 from .fixed_pattern import Pattern
-from .probes import FIXED_COLUMNS, FIXED_ROWS, FLOORS, OUTLIERS, OUTLIERS_ANYWHERE, REPEATED_FRAMES, Scalar
+from .lasting import LEAST_FRAMES
+from .probes import FIXED_COLUMNS, FIXED_ROWS, FLOORS, LASTING, OUTLIERS, OUTLIERS_ANYWHERE, REPEATED_FRAMES, Scalar
 from .scalar_context import ScalarContext, afterglow_bins, time_templates
 
 _LEAST_FREEDOM = 5.0  # of a variance whose logarithm is still near enough a Gaussian number
@@ -29,6 +30,7 @@ def measured_scalars(
     all_outliers: int,
     memory: tuple[float, int] | None,
     copies: int = 0,
+    lasting: int = 0,
 ) -> list[Scalar]:
     """The scalar probes of measured frames with their standard deviations (sampling and floor together).
 
@@ -41,6 +43,7 @@ def measured_scalars(
         outliers, all_outliers: pixels that stand out in this series, and in any.
         memory: share of such pixels' variance that lasts from frame to frame, and how many they are.
         copies: frames of all series that this one stands for, which are copies of earlier ones of their series.
+        lasting: pixels whose level lasts in a later dark.
     """
     found = _Found(summary=summary, base=base, context=context)
     if summary.frames > 2 and found.noisy:
@@ -61,6 +64,8 @@ def measured_scalars(
         # a line without fault repeats none: counts of variance 1/4, as if it might now and then
         found.add("time", REPEATED_FRAMES, "sqrt(frames)", math.sqrt(copies + 0.375), 0.5, "repeated frames")
     if context.counts_all_outliers:
+        if any(frames >= LEAST_FRAMES for frames, _ in context.later_darks):
+            found.add("tails", LASTING, "sqrt(pixels)", math.sqrt(lasting + 0.375), 0.5, "lasting pixels")
         counted = math.sqrt(all_outliers + 0.375)
         found.add("tails", OUTLIERS_ANYWHERE, "sqrt(pixels)", counted, 0.5, "outliers")
     return found.scalars

@@ -10,11 +10,20 @@ from ...generator.frames.series import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .fixed_pattern import NO_PATTERN, shares_of_pixels, shares_of_tiles
+from .lasting import BY_CHANCE, chances
 from .line_scalars import LineNoise, bent_share
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
-from .probes import FIXED_COLUMNS, FIXED_ROWS, OUTLIERS, OUTLIERS_ANYWHERE, PATTERN_PIXEL_SHARE, REPEATED_FRAMES
+from .probes import (
+    FIXED_COLUMNS,
+    FIXED_ROWS,
+    LASTING,
+    OUTLIERS,
+    OUTLIERS_ANYWHERE,
+    PATTERN_PIXEL_SHARE,
+    REPEATED_FRAMES,
+)
 from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
 
 
@@ -48,7 +57,9 @@ def expected_scalars(
     if context.repeatable:
         values[REPEATED_FRAMES] = math.sqrt(expected.repeated_share * context.repeatable + 0.375)
     if context.counts_all_outliers:
-        values[OUTLIERS_ANYWHERE] = math.sqrt(expected.bad_pixel_share * areas.order.size + 0.375)
+        lasting, _, out = _jumping(expected, context)
+        values[LASTING] = math.sqrt((lasting + BY_CHANCE) * areas.order.size + 0.375)
+        values[OUTLIERS_ANYWHERE] = math.sqrt((expected.bad_pixel_share + out) * areas.order.size + 0.375)
     return values
 
 
@@ -151,11 +162,20 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
             values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
-    seen = hot if context.kind == "dark" else bad - 0.5 * hot
+    seen = hot + _jumping(expected, context)[1] if context.kind == "dark" else bad - 0.5 * hot
     values[OUTLIERS] = math.sqrt(seen * context.areas.order.size + 0.375)
     # what bad pixels add is new in every frame
     values["memory of outliers"] = 0.0
     return values
+
+
+def _jumping(expected: ExpectedSeries, context: ScalarContext) -> tuple[float, float, float]:
+    """Shares of the pixels that jump and last in a later dark, that stand out of this one, and of any, without lasting."""
+    law = expected.telegraph
+    if law is None or not context.later_darks:
+        return 0.0, 0.0, 0.0
+    lasting, here, anywhere = chances(law, context.later_darks)
+    return law.share * lasting, law.share * here[0], law.share * anywhere
 
 
 @lru_cache(maxsize=64)

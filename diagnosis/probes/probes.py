@@ -13,6 +13,7 @@ from dataclasses import dataclass
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
 REPEATED_FRAMES = "repeated frames"
+LASTING = "lasting pixels"
 ALONG_ROWS, ALONG_COLUMNS = "displacement along rows", "displacement along columns"  # of a scene
 PATTERN_PIXEL_SHARE = 0.9  # of a fixed pattern's variance that neighbours differ by
 # what repeats of the same measurement show beyond counting noise; standard deviations of the probe's own unit
@@ -34,6 +35,7 @@ FLOORS: Mapping[str, float] = {
     "fixed_pattern lines": 0.1,
     "outliers": 0.3,
     "memory of outliers": 0.02,
+    "lasting pixels": 0.3,
     "repeated frames": 0.0,
 }
 

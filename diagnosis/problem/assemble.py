@@ -29,7 +29,7 @@ from ..model.changes import (
     with_pauses,
 )
 from ..model.curves import LEAST_RESPONSE, Curve
-from ..model.defects import memory_of, new_outliers
+from ..model.defects import lasting_anywhere, memory_of, new_outliers
 from ..model.forward_model import Change, ForwardModel, draft_cache, strength_rows
 from ..model.placing import place_scenes
 from ..model.responses import Asked, Moved, SeriesModel, SessionModel, session_model
@@ -156,7 +156,8 @@ class _Measured:
 
     Fields: expected; pictures (row, column): corrected mean frames, DN, by name of series; summaries of the frames' noise, by name;
     memory: of outlying pixels in darks, see `memory_of`, by name; copies: of frames, by name of the series that counts them; clean:
-    pixels in use that do not stand out (row, column); outliers: how many stand out in any series; skipped: what could not be used
+    pixels in use that do not stand out (row, column); lasting (row, column): pixels whose level lasts in a later dark; outliers: how
+    many others stand out in any series; skipped: what could not be used
     and why.
     """
 
@@ -166,6 +167,7 @@ class _Measured:
     memory: Mapping[str, tuple[float, int] | None]
     copies: Mapping[str, int]
     clean: NDArray[np.bool_]
+    lasting: NDArray[np.bool_]
     outliers: int
     skipped: tuple[str, ...]
 
@@ -188,8 +190,9 @@ def _measured(
     seen = _seen_series(session, acquisition, model, good=known_good, side=side, tell=tell)
     maps = calibrated_maps(seen.kept, seen.expected, seen.looks, twin=twin, good=known_good)
     standing_out = new_outliers(seen.kept, seen.expected, seen.looks, maps)
-    outlying = standing_out.bad
-    clean = maps.good & ~standing_out.any
+    lasting = lasting_anywhere(seen.kept, seen.looks, maps.good)
+    outlying = standing_out.bad & ~lasting
+    clean = maps.good & ~standing_out.any & ~lasting
     # they count as outliers; what else is said of noise is said without them
     summaries = summarise_all(seen, clean, tell=tell)
     lines_DN2 = usual_line_noise(seen.kept, seen.expected, summaries, clean)
@@ -209,6 +212,7 @@ def _measured(
         },
         copies={name: count for name, (count, _) in counted_copies(placed.kept, seen.looks).items()},
         clean=clean,
+        lasting=lasting,
         outliers=int(np.count_nonzero(outlying)),
         skipped=seen.skipped,
     )
@@ -321,6 +325,7 @@ class _Compared:
             all_outliers=measured.outliers,
             memory=measured.memory.get(one.name),
             copies=measured.copies.get(one.name, 0),
+            lasting=measured.lasting,
         )
         block = series_block(session, probes, frame, self.asked, moved, self._thicker(one))
         return _Part(view=_view(one, frame, measured.summaries[one.name]), block=block, probes=probes)

@@ -177,6 +177,7 @@ def series_probes(
     all_outliers: int,
     memory: tuple[float, int] | None,
     copies: int = 0,
+    lasting: NDArray[np.bool_] | None = None,
 ) -> SeriesProbes:
     """The probes of one series.
 
@@ -190,6 +191,7 @@ def series_probes(
         all_outliers: pixels that stand out in any series.
         memory: of outlying pixels in this series, see `memory_of`.
         copies: of frames, that this series counts.
+        lasting: pixels (row, column) whose level lasts in a later dark; they are no outliers.
     """
     first = [(variant, moved[rows[0]]) for variant, rows in zip(variants, strength_rows(variants), strict=True)]
     projection = MapProjection(
@@ -207,7 +209,12 @@ def series_probes(
         noise = frame.quantum_DN2 + frame.white_DN2
         least_DN = scales.DUST_LIMIT * frame.signal_DN if kind == "flat" else None
         outliers = count_outliers(
-            frame.residual_DN, noise, pattern.pixel_DN2, clean=clean, good=good, least_DN=least_DN
+            frame.residual_DN,
+            noise,
+            pattern.pixel_DN2,
+            clean=clean,
+            good=good if lasting is None else good & ~lasting,
+            least_DN=least_DN,
         )
     scalars = measured_scalars(
         summary,
@@ -219,6 +226,7 @@ def series_probes(
         all_outliers=all_outliers,
         memory=memory,
         copies=copies,
+        lasting=0 if lasting is None else int(np.count_nonzero(lasting)),
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:

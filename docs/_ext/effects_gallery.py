@@ -136,6 +136,8 @@ def signature(
     frames, and by the change of the variance of frame differences; the larger of the two counts.
     """
     best: tuple[float, str, dict[str, Any]] | None = None
+    if "counting" in effect.needs:
+        twin = replace(twin, instrument=replace(twin.instrument, counting=True))
     for words, request in series.items():
         before, mean, sd = usual[words]
         frames = [before, sampled(twin, request, (applied(effect),))]

@@ -18,8 +18,9 @@ from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
 from ..frames._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
-from ..frames.defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from ..frames.defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
 from ..frames.flat_change import has_always_bent, is_in_noise
+from ..frames.response import counting_noise, light_of, responded
 from ..kernels.projection import project_polychromatic
 from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
 from ..line.series_request import SeriesRequest
@@ -109,7 +110,7 @@ class ImageEffects:
             open_beam.signal_DN, open_beam.variance_DN2, state=open_beam, pattern=self.pattern, spread=base
         )
         lit = self.open_charge_DN * (blurred / self.open_level_DN) * open_beam.flat_factor
-        self.flat_DN = lit * (1.0 - open_beam.bend_per_DN * lit)
+        self.flat_DN = responded(open_beam, lit)
 
     def _usable(self) -> tuple[tuple[AppliedEffect, ...], tuple[str, ...]]:
         usable, told = [], []
@@ -133,9 +134,7 @@ class ImageEffects:
         always = [item for item in self.effects if has_always_bent(item)]
         if not always:
             return measured_DN
-        bend = self._through(self._open_state(), always, None).bend_per_DN
-        root = np.sqrt(np.maximum(1.0 - 4.0 * bend * measured_DN, 0.0))
-        return np.asarray(2.0 * measured_DN / (1.0 + root))
+        return light_of(self._through(self._open_state(), always, None), measured_DN)
 
     def _without_absorbed(
         self, read_variance_DN2: NDArray[np.float32], always: Sequence[AppliedEffect]
@@ -267,12 +266,12 @@ class ImageEffects:
         )
         lit = self.open_charge_DN / self.open_level_DN * state.flat_factor
         charge = lit * picture
-        scale = lit * self.twin.maps.gain_relative
+        scale = lit * self.twin.maps.gain_relative * counting_noise(state, charge)
         before, variance = blurred_object(state)
         # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
         before = np.maximum(before, 1e-300)
         quantum = variance / before
-        mean = charge * (1.0 - state.bend_per_DN * charge)
+        mean = responded(state, charge)
         return AffectedImage(
             state=state,
             charge_DN=charge,
@@ -377,14 +376,18 @@ class ImageEffects:
             value = value * gain_pattern(state.gain_pattern, shape)
         if state.tile_pattern is not None:
             value = value * tile_gain(state.tile_pattern, shape)
-        value = value * (1.0 - state.bend_per_DN * value)
+        value = responded(state, value)
         bad = new_bad_pixels(state, shape)
         if bad is not None:
             value = np.where(bad.dead, 0.0, value)
         value = value + self.dark_DN + electronic
         value = value + sample_offsets(state, shape, rng) / math.sqrt(averaged)
+        read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
+        if state.telegraph is not None:
+            jumping = Jumping(state.telegraph, shape, rng)
+            for _ in range(averaged):
+                value = jumping.added_to(value, read_DN / averaged, rng)
         if bad is not None:
-            read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
             value = np.where(bad.hot, value + _HOT_SIGMAS * (read_DN + 1.0), value)
         if state.step_DN > 0:
             step = state.step_DN / averaged

@@ -11,6 +11,7 @@ from ...errors import InputError
 from ..line.applied_effect import AppliedEffect
 from ..line.line_state import STAGES
 from .bad_pixels import BAD_PIXELS
+from .burn_in import BURN_IN
 from .catalogue import GROUP, Catalogue
 from .composition_error import COMPOSITION_ERROR
 from .crosstalk import CROSSTALK
@@ -45,8 +46,11 @@ from .motion_blur import MOTION_BLUR
 from .mtf_tail import MTF_TAIL
 from .nonlinearity import NONLINEARITY
 from .object_scatter import OBJECT_SCATTER
+from .off_focal import OFF_FOCAL
 from .output_drift import OUTPUT_DRIFT
+from .pile_up import PILE_UP
 from .quantisation import QUANTISATION
+from .random_telegraph import RANDOM_TELEGRAPH
 from .row_noise import ROW_NOISE
 from .veiling_glare import VEILING_GLARE
 
@@ -78,6 +82,10 @@ OURS: dict[str, Effect] = {
         LINE_FLICKER,
         GREY_ABSORBER,
         DROPPED_FRAMES,
+        OFF_FOCAL,
+        RANDOM_TELEGRAPH,
+        BURN_IN,
+        PILE_UP,
     )
 }
 EFFECTS = Catalogue(OURS)

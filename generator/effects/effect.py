@@ -206,7 +206,8 @@ class Effect:
         parameters: the first is the strength.
         stage: where in the line it acts, see line_state; timed: before the exposure, but it depends on how long that takes.
         change: (state, parameters, context) -> state, which is no change at strength 0.
-        needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`.
+        needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`,
+            `counting` (a photon counter).
         options: words that an applied effect may carry, with what they mean.
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
             diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.

@@ -6,7 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..line.line_state import FixedPattern, FloatArray, LineFlicker, LineState, TilePattern, between_lines
+from ..line.line_state import (
+    FixedPattern,
+    FloatArray,
+    LineFlicker,
+    LineState,
+    TelegraphPixels,
+    TilePattern,
+    between_lines,
+)
 
 
 def gain_pattern(pattern: FixedPattern, shape: tuple[int, int]) -> FloatArray:
@@ -63,6 +71,23 @@ def _lines(
             lines = math.sqrt(variance) * lfilter([1.0], [1.0, -next_to], drawn)
             total = total + np.expand_dims(lines, 1 - axis)
     return np.asarray(total)
+
+
+class Jumping:
+    """Pixels that jump, from exposure to exposure of a series: where they are follows from the effect's seed."""
+
+    def __init__(self, pixels: TelegraphPixels, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        self._law = pixels
+        self._where = np.random.default_rng([0x7E1E, pixels.seed]).random(shape) < pixels.share
+        self._up = rng.random(int(np.count_nonzero(self._where))) < 0.5
+
+    def added_to(self, value: FloatArray, read_DN: FloatArray | float, rng: np.random.Generator) -> FloatArray:
+        """One exposure (row, column), DN, with their levels added; they may have jumped when the next one asks."""
+        out = np.array(value, dtype=np.float64)
+        height = self._law.amplitude_reads * np.broadcast_to(read_DN, out.shape)[self._where]
+        out[self._where] += np.where(self._up, height, 0.0)
+        self._up = self._up ^ (rng.random(self._up.size) < 1.0 / self._law.stay_exposures)
+        return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,14 +19,25 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..effects import AppliedEffect, Effect, effect_of, in_order
-from ..line.line_state import FixedPattern, FloatArray, LagLaw, LineContext, LineFlicker, LineState, TilePattern
+from ..line.line_state import (
+    FixedPattern,
+    FloatArray,
+    GainMemory,
+    LagLaw,
+    LineContext,
+    LineFlicker,
+    LineState,
+    TelegraphPixels,
+    TilePattern,
+)
 from ..line.rounding import rounded_variance
 from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import mean_signal_energy_keV
 from ..line.twin import Twin
 from ._scene import BeamProjection, ModelCache
 from ._spread import NoisePattern, blurred_object, noise_pattern, spread_maps
-from .defects import gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from .defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from .response import counting_noise, responded, responds, slope
 
 __all__ = [
     "ExpectedSeries",
@@ -155,6 +166,7 @@ class ExpectedSeries:
         temporal_correlation: (3,) correlation of the quantum part over 1, 2, 3 frames.
         quantisation_step_DN: of the stored numbers, before averaging; 0: none.
         bad_pixel_share, hot_pixel_share: pixels beyond the known bad ones, and those of them that show without beam.
+        telegraph: pixels that jump, whose mean and variance are not in the maps; None: none.
         gain_pattern: of the pixels' gains, that no map knows; None: none.
         tile_pattern: the same of tiles; None: there is none.
         repeated_share: chance of a frame to be a copy of the one before; its mean and noise are those of any other.
@@ -179,6 +191,7 @@ class ExpectedSeries:
     quantisation_step_DN: float
     bad_pixel_share: float
     hot_pixel_share: float
+    telegraph: TelegraphPixels | None
     gain_pattern: FixedPattern | None
     tile_pattern: TilePattern | None
     repeated_share: float
@@ -616,6 +629,50 @@ def _with_trapped(
     return signal, trend
 
 
+def _filled_before(
+    twin: Twin, request: SeriesRequest, law: GainMemory, choice: _Choice, cache: ModelCache
+) -> FloatArray:
+    """Share of the traps (row, column) or (1, 1) that earlier exposures have left full at the begin of the series."""
+    filled: FloatArray = np.zeros((1, 1))
+    clock_s = 0.0
+    for earlier in request.previous:
+        if earlier.beam_on:
+            state, charge = choice.line(twin, earlier, cache)
+            if state.gain_memory is not None:  # else it had not set in
+                interval = earlier.interval_s(twin.instrument.readout_ms)
+                exposures = earlier.frames * earlier.exposures_per_frame
+                filled = filled * math.exp(-max(earlier.start_s - clock_s, 0.0) / law.fade_s)
+                steady, pace = _filling(law, charge.mean, interval)
+                filled = steady + (filled - steady) * np.exp(-exposures * pace)
+                clock_s = earlier.start_s + exposures * interval
+    return filled * math.exp(-max(request.start_s - clock_s, 0.0) / law.fade_s)
+
+
+def _filling(law: GainMemory, light_DN: FloatArray, interval_s: float) -> tuple[FloatArray, FloatArray]:
+    """Share of the traps that are full in the end under exposures of this light, and 1 over the exposures that it takes."""
+    filling = law.filled_per_DN * np.maximum(light_DN, 0.0)
+    pace = filling + interval_s / law.fade_s
+    return filling / pace, pace
+
+
+def _gain_course(
+    law: GainMemory, before: FloatArray, light_DN: FloatArray, interval_s: float, exposures: int, averaged: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean factor on the signal over a series, and its change: (map, profile over the stored frames of mean 0).
+
+    The mean is exact; all pixels change in the course of the one in the middle, as far as each does.
+    """
+    steady, pace = _filling(law, light_DN, interval_s)
+    away = before - steady
+    left = -np.expm1(-exposures * pace)
+    mean = steady + away * left / (exposures * -np.expm1(-pace))
+    course = np.exp(-float(np.median(pace)) * np.arange(exposures))
+    course = _frame_means(
+        (course - course.mean()) / max(1.0 - math.exp(-float(np.median(pace)) * exposures), 1e-300), averaged
+    )
+    return 1.0 + law.most * mean, law.most * away * left, course
+
+
 def _temporal_covariance(law: LagLaw | None, decay: FloatArray | None, averaged: int) -> FloatArray:
     """Covariance of stored frames (1 + lags,) over the variance of one exposure without lag."""
     if law is None or decay is None:
@@ -720,16 +777,24 @@ def expected_series(
         before = _trapped_before(twin, request, law, choice, cache)
         signal, trend = _with_trapped(law, decay, before, charge.mean, exposures, averaged)
     covariance = _temporal_covariance(state.lag, decay, averaged)
-    bend = state.bend_per_DN
-    slope: FloatArray | float = 1.0
-    if bend != 0.0:
-        slope = 1.0 - 2.0 * bend * signal
-        signal = signal * (1.0 - bend * signal)
-        trend = [(slope * amount, course) for amount, course in trend]
+    gained: FloatArray | float = 1.0
+    if state.gain_memory is not None:
+        before_it = _filled_before(twin, request, state.gain_memory, choice, cache)
+        gained, gains, profile_of_gain = _gain_course(
+            state.gain_memory, before_it, charge.mean, interval, exposures, averaged
+        )
+        trend = [*((gained * amount, course) for amount, course in trend), (gains * signal, profile_of_gain)]
+        signal = gained * signal
+    response: FloatArray | float = 1.0
+    if responds(state):
+        steepness = slope(state, signal)
+        response = steepness**2 * counting_noise(state, signal)
+        signal = responded(state, signal)
+        trend = [(steepness * amount, course) for amount, course in trend]
     quantum, white = charge.correlated, charge.white
-    if covariance[0] != 1.0 or bend != 0.0:
+    if covariance[0] != 1.0 or responds(state) or state.gain_memory is not None:
         # secondary quanta are drawn before the traps as the others are
-        quantum, white = (covariance[0] * slope**2 * variance for variance in (quantum, white))
+        quantum, white = (covariance[0] * gained**2 * response * variance for variance in (quantum, white))
     dark = cache.pixels(twin.maps, ("dark", request.exposure_ms), lambda: twin.maps.dark_at(request.exposure_ms))
     for height, profile in state.offsets:
         times = request.start_s + interval * np.arange(exposures, dtype=np.float64)
@@ -781,6 +846,7 @@ def expected_series(
         quantisation_step_DN=state.step_DN,
         bad_pixel_share=state.bad_share,
         hot_pixel_share=state.bad_share * state.bad_hot_share,
+        telegraph=state.telegraph,
         gain_pattern=state.gain_pattern if request.beam_on else None,
         tile_pattern=state.tile_pattern if request.beam_on else None,
         repeated_share=state.repeated_share,
@@ -841,13 +907,19 @@ def sample_series(
     gain = None if state.gain_pattern is None or not request.beam_on else gain_pattern(state.gain_pattern, shape)
     if state.tile_pattern is not None and request.beam_on:
         gain = (1.0 if gain is None else gain) * tile_gain(state.tile_pattern, shape)
+    filled = steady = pace = np.zeros((1, 1))
+    if state.gain_memory is not None:
+        filled = _filled_before(twin, request, state.gain_memory, choice, cache)
+        steady, pace = _filling(state.gain_memory, charge.mean, interval)
     bad = new_bad_pixels(state, shape)
+    jumping = None if state.telegraph is None else Jumping(state.telegraph, shape, rng)
     dark = np.asarray(twin.maps.dark_at(request.exposure_ms), dtype=np.float64)
     electronic = np.sqrt(_read_variance(twin, state, cache))
     highest = math.inf if twin.instrument.bits is None else 2.0**twin.instrument.bits - 1.0
     lowest = 0.0 if twin.noise.quantised else -math.inf
-    scale = np.sqrt(charge.shape * charge.relative)
-    white = np.sqrt(charge.white)
+    by_chance = counting_noise(state, charge.mean)
+    scale = np.sqrt(charge.shape * charge.relative * by_chance)
+    white = np.sqrt(charge.white * by_chance)
     before, variance = blurred_object(_quanta(state))
     # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
     quantum = variance / np.maximum(before, 1e-300)
@@ -881,13 +953,18 @@ def sample_series(
                     value = value + found
             if gain is not None:
                 value = value * gain
-            value = value * (1.0 - state.bend_per_DN * value)
+            if state.gain_memory is not None:
+                value = value * (1.0 + state.gain_memory.most * filled)
+                filled = steady + (filled - steady) * np.exp(-pace)
+            value = responded(state, value)
             if bad is not None:
                 value = np.where(bad.dead, 0.0, value)
             value = value + dark + electronic * rng.standard_normal(shape)
             for height, profile in state.offsets:
                 value += height * float(profile(np.array(now)))
             value += sample_offsets(state, shape, rng)
+            if jumping is not None:
+                value = jumping.added_to(value, electronic, rng)
             if bad is not None:
                 value = np.where(bad.hot, value + _HOT_SIGMAS * (electronic + 1.0), value)
             if state.step_DN > 0:

@@ -63,6 +63,18 @@ class LagLaw:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GainMemory:
+    """A gain that is larger by the share `most` where all traps q are full: each DN of light fills `filled_per_DN` of the empty ones.
+
+    They empty with `fade_s`: dq = filled_per_DN (1 - q) dx - q dt / fade_s.
+    """
+
+    most: float
+    filled_per_DN: float
+    fade_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FixedPattern:
     """A fixed relative pattern over the pixels, normal, drawn from `seed`.
 
@@ -123,6 +135,19 @@ class LineFlicker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TelegraphPixels:
+    """A share of the pixels, drawn from `seed`, whose level jumps up by `amplitude_reads` read noises and down again.
+
+    stay_exposures: mean stay in a level.
+    """
+
+    share: float
+    amplitude_reads: float
+    stay_exposures: float
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FinePicture:
     """A picture with sharp borders: cells finer than pixels, see `_fine_picture`.
 
@@ -157,6 +182,8 @@ class LineState:
             time, and the share of its variance that is new in every exposure.
         flicker: factors of the lines of an exposure, or None.
         lag: traps, or None.
+        blind_per_DN: pile-up k of z = x / (1 + k x), x above dark, before the nonlinearity.
+        gain_memory: of the light before, or None.
         bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
         gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
@@ -166,6 +193,7 @@ class LineState:
         step_DN: of the ADC; 0: none.
         bad_share, bad_hot_share: share of pixels that calibration does not know to be bad, and of these the hot ones, the
             rest being dead; bad_seed draws them.
+        telegraph: pixels that jump, or None.
         repeated_share: chance of a stored frame to be a copy of the one before it in its series.
     """
 
@@ -187,7 +215,9 @@ class LineState:
     output_jitter_share: float = 0.0
     flicker: LineFlicker | None = None
     lag: LagLaw | None = None
+    gain_memory: GainMemory | None = None
     bend_per_DN: float = 0.0
+    blind_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
     tile_pattern: TilePattern | None = None
     offsets: tuple[tuple[float, Callable[[FloatArray], FloatArray]], ...] = ()
@@ -199,6 +229,7 @@ class LineState:
     bad_share: float = 0.0
     bad_hot_share: float = 0.5
     bad_seed: int = 0
+    telegraph: TelegraphPixels | None = None
     repeated_share: float = 0.0
 
 

@@ -1,0 +1,84 @@
+"""Off-focal radiation: electrons that bounce off the anode strike it elsewhere; a share of the beam comes from around the spot.
+
+Seen from the object it is a second, wide source; its picture of an edge is as much larger as the detector lies behind the object:
+
+H(f) = 1 - w + w [(1 - q) exp(-2 (pi s_d f)^2) + q / (1 + 2 (pi s_d f)^2)],    s_d = s (M - 1)
+
+The open field has the same light with it and without. What lies beyond the borders of the field is taken to go on as at them.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ..line.line_state import FloatArray, LineContext, LineState, needed
+from .effect import Effect, Grid, Parameter, Shows
+
+
+def _add_source(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
+    if not context.has_scene or parameters["strength"] == 0:
+        return state
+    name = "off_focal"
+    pitch = needed(context.twin.instrument.pixel_mm, "pixel_mm", name)
+    magnification = needed(context.source_detector_mm, "source_detector_mm", name) / needed(
+        context.source_object_mm, "source_object_mm", name
+    )
+    share = parameters["strength"] / 100.0
+    width_px = parameters["width_mm"] * (magnification - 1.0) / pitch
+    peaked = parameters["peaked_share"]
+
+    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
+        squared = (2.0 * math.pi * width_px) ** 2 * (f_row**2 + f_column**2)
+        wide = (1.0 - peaked) * np.exp(-0.5 * squared) + peaked / (1.0 + 0.5 * squared)
+        return np.asarray(1.0 - share + share * wide)
+
+    return replace(state, object_transfers=(*state.object_transfers, transfer))
+
+
+OFF_FOCAL = Effect(
+    id="off_focal",
+    title="radiation from around the focal spot",
+    law=r"H(f) = 1 - w + w\left[(1 - q)\,e^{-2(\pi s_d f)^2} + \frac{q}{1 + 2(\pi s_d f)^2}\right],\quad s_d = s\,(M - 1)",
+    parameters=(
+        Parameter(
+            name="strength",
+            unit="%",
+            low=2.0,
+            high=20.0,
+            default=8.0,
+            source="share of the output from outside the focal spot: some 5-20 % without a collimator close to the anode",
+            log=False,
+            most=100.0,
+        ),
+        Parameter(
+            name="width_mm",
+            unit="mm",
+            low=1.5,
+            high=15.0,
+            default=5.0,
+            source="standard deviation along a line: electrons strike the anode again within millimetres to its rim",
+            log=True,
+        ),
+        Parameter(
+            name="peaked_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.5,
+            source="share of a profile that falls from a peak with a long tail; the rest is Gaussian",
+            log=False,
+            sought_last=True,
+        ),
+    ),
+    stage="object_blur",
+    reference="Birch, Br. J. Radiol. 49 (1976) 951-955; a second source behind the same object",
+    after_calibration=False,
+    change=_add_source,
+    needs=("scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
+    isolated_by="an opaque disc at two magnifications",
+    shows=Shows(series=("object",), axis="sharpness", flats=False),
+    absorbed="nothing",
+    grid=Grid(shares=(0.8,), variants=tuple({"width_mm": width, "peaked_share": 0.5} for width in (2.7, 8.3))),
+)

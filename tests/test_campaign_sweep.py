@@ -215,7 +215,7 @@ def test_without_dask_the_install_command_is_told(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install '\.\[cluster\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'raytwin\[cluster\]'"):
         DaskCluster("tcp://127.0.0.1:8786")
 
 

@@ -283,7 +283,7 @@ def test_without_torch_the_message_holds_the_command_that_installs_it(monkeypatc
     import sys
 
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install '\.\[segmentation\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'raytwin\[segmentation\]'"):
         build_network(QUICK, seed=0)
 
 

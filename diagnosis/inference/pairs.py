@@ -78,22 +78,25 @@ def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: i
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
     likely = sorted(seen.values(), key=lambda item: -item[0])[:_IN_FULL]
-    return [_settled(observed, point, curves, other) for _, point, other in likely]
+    return [_settled(observed, singles[point.curve.effect].best, point, curves, other) for _, point, other in likely]
 
 
-def _settled(observed: Observed, point: Point, curves: Mapping[str, Sequence[Curve]], other: str) -> Pair:
-    """Two effects by turns: `other` beside a first one at its point, then the first beside the other, and so on."""
+def _settled(
+    observed: Observed, first: CurveFit, point: Point, curves: Mapping[str, Sequence[Curve]], other: str
+) -> Pair:
+    """Two effects by turns: `other` beside a first one at its point, then the first beside the other; the likeliest turn."""
     best, fits = -math.inf, {}
+    at = replace(first, level=point.level)
     for turn in range(_TURNS):
         start, beside = _beside_first(observed, point, other)
         fit = _beside(beside, curves[other])
-        second = replace(fit.point, curve=_own(curves[other], fit))
-        evidence = start + log_prior(point) + fit.log_evidence
-        fits[other] = replace(fit, curve=second.curve)
-        before, best = best, max(best, evidence)
+        second = replace(fit, curve=_own(curves[other], fit))
+        evidence, before = start + log_prior(point) + fit.log_evidence, best
+        if evidence > best:
+            best, fits = evidence, {point.curve.effect: at, other: second}
         if turn and evidence < before + _SETTLED:
             break
-        point, other = second, point.curve.effect
+        at, point, other = second, second.point, point.curve.effect
     return Pair(log_evidence=best, fits=fits)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...generator.frames.series import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import lasting_pixels
-from ..session.even_maps import full_size, signal_map
+from ..session.even_maps import near_steps, signal_map
 from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, FirstLook
 from .calibrated_maps import CalibratedMaps
@@ -83,7 +83,10 @@ def _out_in_every_object(
     looks: Mapping[str, FirstLook],
     maps: CalibratedMaps,
 ) -> NDArray[np.bool_]:
-    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow."""
+    """Pixels that stand out of their neighbours whatever lies before them, from some time on: no dark or flat need follow.
+
+    A view in which a step of the object passes by a pixel tells nothing of it.
+    """
     from scipy.ndimage import median_filter
 
     good = maps.good
@@ -94,15 +97,19 @@ def _out_in_every_object(
             alike.setdefault((item.series.kV, item.series.exposure_ms), []).append(item)
     found = np.zeros(good.shape, dtype=bool)
     for members in alike.values():
-        times, scenes = np.zeros(good.shape), set()
-        for number, item in enumerate(reversed(members), start=1):
+        times, views = np.zeros(good.shape), np.zeros(good.shape)
+        seen_in: dict[str, NDArray[np.bool_]] = {}
+        for item in reversed(members):
             measured = maps.corrected(item, looks[item.name].mean_DN)
-            residual = measured - full_size(expected[item.name].signal_DN, good.shape)
+            signal = signal_map(expected[item.name], good.shape)
+            residual = measured - signal
             residual = residual - median_filter(residual, size=5, mode="nearest")
-            times += np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
-            scenes.add(item.series.scene)
-            if len(scenes) >= _LEAST_SCENES:
-                found |= times >= _NEARLY_ALWAYS * number
+            even = ~near_steps(signal)
+            views += even
+            times += even & (np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9))
+            seen_in[item.series.scene] = even | seen_in.get(item.series.scene, np.zeros_like(even))
+            scenes = np.sum(list(seen_in.values()), axis=0)
+            found |= (scenes >= _LEAST_SCENES) & (times >= _NEARLY_ALWAYS * views)
     return found
 
 

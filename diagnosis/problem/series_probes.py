@@ -18,11 +18,10 @@ from ..probes.frame_scalars import measured_scalars
 from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
 from ..probes.probes import ProbeName, Scalar
 from ..probes.registration import render_variance
-from ..session.even_maps import Map, full_size, signal_map
+from ..session.even_maps import Map, full_size, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
 _NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
-_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +137,7 @@ def mean_frame(
         white = white + render_variance(signal, side=side)
         if one.session.request.scene_kind not in SHARP_SCENES:
             # steps of wedges and outlines of products are rendered no better than their maps' pixels
-            mask = mask & ~_near_steps(signal)
+            mask = mask & ~near_steps(signal)
     return MeanFrame(
         signal_DN=signal, residual_DN=corrected_DN - signal, mask=mask, quantum_DN2=quantum, white_DN2=white
     )
@@ -155,15 +154,6 @@ def variance_of_what_came(
 
     seen = uniform_filter(np.asarray(corrected_DN, dtype=np.float64), _NEIGHBOURS_PX)
     return np.asarray(seen * float(variance_DN2.sum()) / max(float(signal_DN.sum()), 1e-9))
-
-
-def _near_steps(signal: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Pixels within two of a step in the signal."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
-    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
-    return steps
 
 
 def series_probes(

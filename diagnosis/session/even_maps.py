@@ -5,6 +5,8 @@ from numpy.typing import NDArray
 
 from ...generator.frames.series import ExpectedSeries
 
+_STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
+
 Map = NDArray[np.float32]
 NOWHERE: Map = np.zeros((1, 1), np.float32)
 NOWHERE.setflags(write=False)
@@ -31,3 +33,12 @@ def signal_map(expected: ExpectedSeries, shape: tuple[int, ...]) -> NDArray[np.f
 def mean_over(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:
     """Mean of a map over the pixels of a mask (row, column)."""
     return float(np.mean(full_size(image, mask.shape)[mask]))
+
+
+def near_steps(signal: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels within two of a step in a signal (row, column)."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    highest, lowest = maximum_filter(signal, 5), minimum_filter(signal, 5)
+    steps: NDArray[np.bool_] = (highest - lowest) > _STEP_SHARE * np.maximum(highest, 1e-9)
+    return steps

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._guard import bounded
-from ..errors import FileFormatError, InputError
+from ..errors import LARGEST, FileFormatError, InputError
 from ..files import given_path
 
 # What h5py and HDF5 raise at bytes that are not what they should be: whatever they like. `MemoryError` is an extent that
@@ -135,7 +135,10 @@ def number_attribute(
             f"{where}, attribute {name}", received=repr(value), expected=f"{expected} {unit}".rstrip()
         ) from None
     too_low = (lowest is not None and number < lowest) or (above is not None and number <= above)
-    if not math.isfinite(number) or too_low:
+    too_high = abs(number) > LARGEST
+    if too_high and math.isfinite(number):
+        expected += f", at most {LARGEST:g}"
+    if not math.isfinite(number) or too_low or too_high:
         raise FileFormatError(
             f"{where}, attribute {name}", received=f"{number:g} {unit}".rstrip(), expected=f"{expected} {unit}".rstrip()
         )

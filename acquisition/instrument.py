@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields, replace
 
-from ..errors import InputError
+from ..errors import LARGEST, InputError
 from .setting import Filter
 
 DETECTORS = ("area", "line", "tdi")
@@ -12,6 +12,7 @@ LAYER_FIELDS = ("inherent_filtration", "scintillator", "detector_cover", "interl
 TEXT_FIELDS = ("anode", "detector", "belt_axis", "binning_adds")
 WHOLE_FIELDS = ("bits", "tdi_stages")
 BOOLEAN_FIELDS = ("counting", "readout_overlaps")
+MOST_BITS = 32  # of the numbers that detectors write
 _SAME_PITCH = 0.01  # relative: pitches are stated to so much
 
 
@@ -65,8 +66,14 @@ class Instrument:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
             lowest_fits = value >= 0 if field.name in zero_allowed else value > 0
-            if not (math.isfinite(value) and lowest_fits):
-                raise InputError(f"instrument {field.name}", received=value, expected="a finite positive number")
+            if not (value <= LARGEST and lowest_fits):
+                raise InputError(
+                    f"instrument {field.name}",
+                    received=value,
+                    expected=f"a finite positive number, at most {LARGEST:g}",
+                )
+        if self.bits is not None and self.bits > MOST_BITS:
+            raise InputError("instrument bits", received=self.bits, expected=f"a whole number from 1 to {MOST_BITS}")
         if self.detector is not None and self.detector not in DETECTORS:
             raise InputError("instrument detector", received=self.detector, expected="one of " + ", ".join(DETECTORS))
         if self.binning_adds is not None and self.binning_adds not in BINNINGS:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from ..errors import InputError, check_number
+from ..errors import LARGEST, InputError, check_number
 
 LARGEST_BINNING = 64
 
@@ -109,9 +109,11 @@ class Setting:
             value = getattr(self, name)
             if value is not None:
                 check_number(name, value, unit=unit)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}")
-        if self.averaged < 1 or self.averaged != int(self.averaged):
+            if value is not None and not 0 < value <= LARGEST:
+                raise InputError(
+                    name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}, at most {LARGEST:g}"
+                )
+        if not 1 <= self.averaged <= LARGEST or self.averaged != int(self.averaged):
             raise InputError("averaged", received=self.averaged, expected="a whole number of frames, 1 or more")
         if not 1 <= self.binning <= LARGEST_BINNING or self.binning != int(self.binning):
             raise InputError("binning", received=self.binning, expected=f"a whole number from 1 to {LARGEST_BINNING}")

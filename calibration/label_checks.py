@@ -121,7 +121,7 @@ def load_findings(series: Sequence[Series], signals_DN: Levels) -> list[Finding]
             # of two that disagree nobody knows which is wrong: the later one is named
             agree = others.size >= 2 and float(np.max(np.abs(others / typical - 1.0))) <= LEVEL_FITS
             last_of_two = others.size == 1 and index == 1
-            if abs(math.log1p(off)) > math.log1p(LEVEL_FITS) and (agree or last_of_two):
+            if abs(math.log(rates[index] / typical)) > math.log1p(LEVEL_FITS) and (agree or last_of_two):
                 found.append(
                     Finding(
                         code=FindingCode.LOAD_LABEL,

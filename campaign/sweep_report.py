@@ -58,7 +58,7 @@ def write_report(
     rows = answer["rows"]
     size = _size_label(answer)
     shown = [row for row in rows if row["a90"] is not None]
-    ordered = [row for row in _in_order(rows) if row["trained"]]
+    ordered = [row for row in by_upper_bound(rows) if row["trained"]]
     anchors = {str(row["setting"]): f"setting-{number}" for number, row in enumerate(ordered, start=1)}
     figures: dict[str, Figure | bytes] = {}
     if shown:
@@ -114,7 +114,7 @@ def intervals_chart(
     rows: Sequence[Mapping[str, Any]], *, size: str, goal: float | None, anchors: Mapping[str, str]
 ) -> Chart:
     """a90 of each setting with its two-sided 95 % interval and one-sided bound, the smallest bound first."""
-    ordered = _in_order(rows)
+    ordered = by_upper_bound(rows)
     taken = [row for row in ordered[_MOST_BARS:] if row["recommended"]]
     ordered = [*ordered[: _MOST_BARS - len(taken)], *taken]
     ends = [row[name] for row in ordered for name in ("a90", "a90_high", "a90_upper") if row[name] is not None]
@@ -295,7 +295,7 @@ def _front(row: Mapping[str, Any]) -> str:
     return recommended if row["recommended"] else front if row["pareto"] else beaten
 
 
-def _in_order(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def by_upper_bound(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Smallest upper bound first; those without a bound, then those without a90, last."""
     return sorted(
         rows,
@@ -402,19 +402,19 @@ def _left_out_table(rows: Sequence[Mapping[str, Any]]) -> SortedTable:
         return _number(None if row["dose_uGy"] is None else row["dose_uGy"]["value"])
 
     return SortedTable(
-        header=("setting", "", "products/s", "air kerma, µGy", "contrast to noise", "reason"),
+        header=("setting", "", "reason", "products/s", "air kerma, µGy", "contrast to noise"),
         rows=tuple(
             (
                 str(row["label"]),
                 "cannot be" if not row["feasible"] else "not tried",
+                str(row["reason"]),
                 _number(row["throughput_per_s"]),
                 kerma(row),
                 _number(row["cnr_object"]),
-                str(row["reason"]),
             )
             for row in rows
         ),
-        words=frozenset({0, 1, 5}),
+        words=frozenset({0, 1, 2}),
     )
 
 

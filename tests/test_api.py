@@ -380,6 +380,8 @@ def closed():
         (lambda: rt.predict("twin.h5", kV=60, exposure_ms=20, power_w=3), "power_w; expected words among filter, kV"),
         (lambda: rt.predict("twin.h5"), "got nothing; expected a setting"),
         (lambda: rt.predict("twin.h5", kV=[50, 60], power_W=[1, 2, 3], exposure_ms=1), "2 of kV, 3 of power_W"),
+        (lambda: rt.predict("twin.h5", kV=[], power_W=[], exposure_ms=1), "an empty list"),
+        (lambda: rt.read_twin("twin.h5").predict([]), "an empty list"),
         (lambda: rt.predict("twin.h5", kV=60, power_W=1, exposure_ms=1, filter="Cux:1"), "Cux"),
         (lambda: rt.predict(3, kV=60, power_W=1, exposure_ms=1), "twin: got int"),
         (lambda: rt.calibrate([]), "acquisition: got none"),

@@ -14,7 +14,7 @@ from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, w
 from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
 from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed, Point
-from raytwin.diagnosis.inference.pairs import Single, weigh_pairs
+from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
 from raytwin.diagnosis.inference.search import _in_turn, _Slopes, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
@@ -505,7 +505,8 @@ def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
         curve = one_node("one", response, low=0.5, high=50.0)
         at = np.array([strength])
         none = np.zeros(1)
-        return CurveFit(curve=curve, by_level=none, log_evidence=0.0, level=0.0, strengths=at, log_likelihood=none)
+        by_level = {"by_level": none, "at_any_strength": none}
+        return CurveFit(curve=curve, **by_level, log_evidence=0.0, level=0.0, strengths=at, log_likelihood=none)
 
     known = _Slopes(("width", "order"), true + 0.3 * rng.standard_normal(true.shape), 1.0)
     learnt = known.learnt(fit(start, 1.0), fit(ahead, 2.0), step)
@@ -731,6 +732,29 @@ def test_the_likelihood_beside_an_effect_is_that_of_its_law_and_what_it_may_be_o
     added = float(np.trace(covariance) - np.trace(np.eye(PROBES) + factors @ factors.T)) - float(row @ row)
     effective = observed.nuisances.solve(curve.response(2.0))
     assert added == pytest.approx((0.2**2 + 0.1**2) * float(effective @ effective), rel=0.1)
+
+
+@pytest.mark.parametrize("strength", [3.0, 0.8 / 30.0])
+def test_the_evidence_of_an_effect_at_its_point_is_its_own_also_where_it_would_be_weaker_than_is_tried(strength):
+    (curve,) = (replace(one, low=1.0) for one in independent((200, 600.0)))
+    residual = curve.response(strength) + np.random.default_rng(3).standard_normal(PROBES)
+    observed = seen(residual)
+    fit = fit_curve(observed, curve, exact=True)
+    beside = observed.beside(fit.point)
+    evidence = beside.log_likelihood - observed.log_likelihood + log_prior(observed, fit.point)
+    # half of the rest: a response is no straight line in the logarithm of its strength
+    assert evidence == pytest.approx(fit.log_evidence + np.log(LEVELS.of_kind[0]), abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("strength", "off", "named"), [(0.05, 1.5, UNKNOWN), (0.05, 0.1, "effect0"), (2.0, 1.5, "effect0")]
+)
+def test_what_is_implausibly_weak_and_unlike_a_law_is_of_another_kind(strength, off, named):
+    rng = np.random.default_rng(6)
+    made = [replace(one, low=1.0) for one in independent((400, 500.0), *[(10, 1.0)] * 8)]
+    law = 1.0 + off * rng.standard_normal(30)[GROUPS]
+    residual = strength * made[0].response(1.0) * law + rng.standard_normal(PROBES)
+    assert weigh(residual, np.zeros((PROBES, 1)), made)[0].effects == (named,)
 
 
 @pytest.mark.parametrize(("share", "elsewhere", "named"), [(0.02, False, False), (0.02, True, True), (0.6, True, True)])

@@ -57,19 +57,24 @@ def row_of(weighed: Weighed, planted: str) -> dict:
     others = [fit for fit in weighed.fits if fit.curve.effect != planted]
     if own:
         best = max(own, key=lambda fit: fit.log_evidence)
-        row["kind"] = told_by_law(observed, best, best.level, parts)
+        row["kind"] = told_by_law(observed, best, parts)
     if others:
         likest = max(others, key=lambda fit: fit.log_evidence)
-        row["another"] = told_by_law(observed, likest, LEVELS.levels[-1], parts)
+        row["another"] = told_by_law(observed, likest, parts, another=True)
         row["likest"] = likest.curve.effect
         row["left_out"] = told(weigh_hypotheses([(observed, others)], **parts))
     return row
 
 
-def told_by_law(observed: Observed, fit: CurveFit, level: float, parts: dict) -> dict:
-    """Log evidence of a law by level, and with a rest of any length beside it, at a level; that length over what the law does."""
-    evidence, ratio = evidence_with_rest(observed, [fit.at_level(level)], **parts)
-    return {"by_level": list(fit.by_level), "with_rest": evidence, "ratio": ratio}
+def told_by_law(observed: Observed, fit: CurveFit, parts: dict, *, another: bool = False) -> dict:
+    """Log evidence of a law by level, and with a rest of any length beside it; that length over what the law does.
+
+    another: the effect is only like the law's: it has any strength, and where it leaves a rest the law is off by most.
+    """
+    by_level = fit.at_any_strength if another else fit.by_level
+    point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
+    evidence, ratio = evidence_with_rest(observed, [point], **parts, another=another)
+    return {"by_level": list(by_level), "with_rest": evidence, "ratio": ratio}
 
 
 def told(hypotheses) -> dict:

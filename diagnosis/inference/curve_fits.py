@@ -25,12 +25,14 @@ _REACHES = (0.05, 0.01, 0.002, 0.0004, 0.0)  # least relative widths about which
 class CurveFit:
     """One curve against a residual.
 
-    Fields: curve; by_level (level,): log evidence over none with the law off by each level; log_evidence: the same, averaged over the
-    levels' frequencies; level: the likeliest; strengths and log_likelihood (node,) over none at that level; share: as of a `Point`.
+    Fields: curve; by_level (level,): log evidence over none with the law off by each level; at_any_strength (level,): the same with a
+    prior of the strength that is even over all its reach; log_evidence: by_level averaged over the levels' frequencies; level: the
+    likeliest; strengths and log_likelihood (node,) over none at that level; share: as of a `Point`.
     """
 
     curve: Curve
     by_level: NDArray[np.float64]
+    at_any_strength: NDArray[np.float64]
     log_evidence: float
     level: float
     strengths: NDArray[np.float64]
@@ -51,9 +53,10 @@ class CurveFit:
         """Where the likelihood is highest, the law off by another level."""
         return Point(curve=self.curve, strength=self.best, level=level, share=self.share)
 
-    def averaged(self, frequencies: Sequence[float]) -> float:
-        """Log evidence over none with levels of these frequencies."""
-        return _over_levels(self.by_level, frequencies)
+    @property
+    def of_another(self) -> float:
+        """Log evidence over none of an effect that is only like the curve's: its levels' frequencies, and any strength."""
+        return _over_levels(self.at_any_strength, LEVELS.of_another)
 
 
 def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) -> float:
@@ -87,6 +90,7 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
     return CurveFit(
         curve=curve,
         by_level=by_level + curve.log_prior,
+        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + curve.log_prior,
         log_evidence=_over_levels(by_level, frequencies) + curve.log_prior,
         level=0.0 if exact else levels.levels[likeliest],
         strengths=found[likeliest][1],
@@ -99,7 +103,13 @@ def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> Curv
     alone = observed.standing(curve.effect)
     fit = fit_curve(alone, alone.scaled(curve), exact=exact)
     more = observed.over_none(curve.effect)
-    return replace(fit, curve=curve, by_level=fit.by_level + more, log_evidence=fit.log_evidence + more)
+    return replace(
+        fit,
+        curve=curve,
+        by_level=fit.by_level + more,
+        at_any_strength=fit.at_any_strength + more,
+        log_evidence=fit.log_evidence + more,
+    )
 
 
 def fit_effects(observed: Observed, curves: Sequence[Curve]) -> list[CurveFit]:
@@ -157,7 +167,7 @@ class _Terms:
         for reach in _REACHES:
             at = int(np.argmax(value))
             width = max(1.0 / math.sqrt(max(float(quadratic[at]), 1e-6)), reach)
-            strengths = _refined(coarse, float(strengths[at]), width)
+            strengths = refined(coarse, float(strengths[at]), width)
             value, quadratic = self.at(strengths)
         return strengths, value
 
@@ -193,7 +203,7 @@ def _chance_of(curve: Curve) -> NDArray[np.float64]:
     return np.asarray(curve.spread[:, shows].T)
 
 
-def _refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
+def refined(strengths: NDArray[np.float64], best: float, width: float) -> NDArray[np.float64]:
     """Nodes with a finer set about `best`, 6 relative widths to each side."""
     span = np.linspace(-6.0, 6.0, 49) * min(max(width, 1e-6), 0.5)
     near = best * np.exp(span)
@@ -220,7 +230,7 @@ def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.floa
 def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
     """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence."""
     top = max(fit.log_evidence for fit in fits)
-    likely = [fit for fit in fits if fit.log_evidence > top - 12.0]
+    likely = [fit for fit in fits if fit.log_evidence >= top - 12.0]
     nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
     total = np.full(len(nodes), -np.inf)
     for fit in likely:

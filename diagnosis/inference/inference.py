@@ -9,8 +9,8 @@ responses to the nuisances times their prior standard deviations.
     effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
-    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, as far off as
-              effects of other kinds are from the law that resembles them most
+    unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, of any strength
+              that is tried, and as far off as effects of other kinds are from the law that resembles them most
 """
 
 import math
@@ -182,11 +182,19 @@ def _by_effects(weighed: Sequence[tuple[Hypothesis, float]]) -> tuple[Hypothesis
 
 
 def evidence_with_rest(
-    observed: Observed, points: Sequence[Point], *, parts: NDArray[np.intp], part_names: Sequence[str]
+    observed: Observed,
+    points: Sequence[Point],
+    *,
+    parts: NDArray[np.intp],
+    part_names: Sequence[str],
+    another: bool = False,
 ) -> tuple[float, float]:
-    """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs."""
+    """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs.
+
+    another: they are only like these.
+    """
     rests = _Rests(observed, parts, part_names)
-    evidence, found = rests.beside(points)
+    evidence, found = rests.beside(points, another=another)
     return evidence, rests.ratio(points, found)
 
 
@@ -230,9 +238,7 @@ class _Rests:
 
     def of_another(self, single: Single) -> float:
         """Log evidence over none of an effect that is only like one of the catalogue's."""
-        plain = log_mean_exp(
-            np.array([fit.averaged(LEVELS.of_another) for fit in single.fits if len(fit.by_level) > 1])
-        )
+        plain = log_mean_exp(np.array([fit.of_another for fit in single.fits if len(fit.by_level) > 1]))
         points = [single.best.at_level(LEVELS.levels[-1])]
         evidence, found = self.beside(points, another=True)
         evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
@@ -243,11 +249,16 @@ class _Rests:
         """Log evidence over none of effects at their points with a rest beside them, and what that rest is."""
         effects = [point.curve.effect for point in points]
         alone = beside = self._observed.standing(*effects)
+        priors = 0.0
         for point in points:
+            others = alone
+            for other in points:
+                others = others if other is point else others.beside(other)
+            priors += log_prior(others, point, another=another)
             beside = beside.beside(point)
         found = beyond(beside, self._parts, self._names)
         evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
-        evidence += found.log_evidence + sum(log_prior(point, another=another) for point in points)
+        evidence += found.log_evidence + priors
         return evidence, found
 
 

@@ -121,13 +121,24 @@ class Observed:
 
     def beside(self, point: Point) -> "Observed":
         """What is left once an effect stands there, its strength about as it says."""
+        left, of_strength = self._less(point)
+        free = point.strength_sd * of_strength[:, None]
+        if not np.any(free):
+            return left
+        return replace(left, nuisances=left.nuisances.over(np.ones(len(free)), free, csc_array((0, len(free)))))
+
+    def told_of_strength(self, point: Point) -> tuple[float, float]:
+        """Slope and curvature, >= 0, of the log likelihood in the logarithm of a point's strength, about that strength."""
+        left, of_strength = self._less(point)
+        both = np.stack([left.residual, of_strength])
+        inner = left.nuisances.inner(both, both)
+        return float(inner[0, 1]), max(float(inner[1, 1]), 0.0)
+
+    def _less(self, point: Point) -> tuple["Observed", NDArray[np.float64]]:
+        """What an effect leaves at a point, and the slope (probe,) of its response with the logarithm of the strength."""
         wide = self.widened(self.scaled(point.curve), point.strength, point.level) or self
         own = wide.scaled(point.curve)
-        free = point.strength_sd * slope(own, point.strength)[:, None]
-        nuisances = wide.nuisances
-        if np.any(free):
-            nuisances = nuisances.over(np.ones(len(free)), free, csc_array((0, len(free))))
-        return replace(wide, residual=wide.residual - own.response(point.strength), nuisances=nuisances)
+        return replace(wide, residual=wide.residual - own.response(point.strength)), slope(own, point.strength)
 
     def of_probes(self, probes: NDArray[np.bool_]) -> "Observed":
         """Of some of its probes (probe,)."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.curves import Curve
-from .curve_fits import IMPLAUSIBLE, CurveFit, fit_curve, log_integral, log_mean_exp
+from .curve_fits import CurveFit, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
-from .observed import FREE_SD, Observed, Point
+from .observed import Observed, Point
 
 _IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
 _TURNS, _SETTLED = 6, 0.1  # in which two settle, and gain of log evidence that ends them
@@ -87,16 +87,18 @@ def _settled(
     """Two effects by turns: `other` beside a first one at its point, then the first beside the other; the likeliest turn."""
     best, fits = -math.inf, {}
     at = replace(first, level=point.level)
+    start, beside = _beside_first(observed, point, other)
     for turn in range(_TURNS):
-        start, beside = _beside_first(observed, point, other)
         fit = _beside(beside, curves[other])
         second = replace(fit, curve=_own(curves[other], fit))
-        evidence, before = start + log_prior(point) + fit.log_evidence, best
+        start_second, beside_second = _beside_first(observed, second.point, point.curve.effect)
+        evidence, before = start + log_prior(beside_second, point) + fit.log_evidence, best
         if evidence > best:
             best, fits = evidence, {point.curve.effect: at, other: second}
         if turn and evidence < before + _SETTLED:
             break
         at, point, other = second, second.point, point.curve.effect
+        start, beside = start_second, beside_second
     return Pair(log_evidence=best, fits=fits)
 
 
@@ -167,16 +169,26 @@ def left_in_place(
     return top + math.log(max(left, 1e-300)) - there
 
 
-def log_prior(point: Point, *, another: bool = False) -> float:
+def log_prior(observed: Observed, point: Point, *, another: bool = False) -> float:
     """Log of what a point takes of the prior: its curve's, how often laws (of `another` kind) are off by its level, its strengths'.
 
-    Strengths are even in their logarithm; those about the point are as free as `Observed.beside` leaves them.
+    Strengths are even in their logarithm, of `another` kind over all the curve's reach. The Gaussian that `Observed.beside` frees
+    them by is no prior: what it gives is taken off, and the integral over the reach put in its place. About a point, where the
+    likelihood is highest, that falls to both sides, but at an end of the reach.
+
+    Args:
+        observed: what all other effects leave, without this one.
+        point: with strengths as free as it says.
+        another: the effect is only like the curve's.
     """
-    curve, log = point.curve, math.log
-    if curve.low <= point.strength <= curve.high:
-        density = (1.0 - IMPLAUSIBLE) / log(curve.high / curve.low)
-    else:
-        low, high = curve.reach
-        density = IMPLAUSIBLE / (log(high / low) - log(curve.high / curve.low))
-    strengths = log(density) + log(math.sqrt(2.0 * math.pi) * FREE_SD)
-    return curve.log_prior + point.share + log_frequency(point.level, another=another) + strengths
+    curve = point.curve
+    slope, curvature = observed.told_of_strength(point)
+    width = 1.0 / (curvature + point.strength_sd**-2)
+    free = 0.5 * (slope**2 * width + math.log(width / point.strength_sd**2))
+    strengths = refined(curve.log_strengths(), point.strength, math.sqrt(width))
+    x = strengths / point.strength - 1.0  # responses are nearly straight in the strength
+    pull = 0.0 if strengths[0] < point.strength < strengths[-1] else slope
+    within = log_integral(
+        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if another else (curve.low, curve.high))
+    )
+    return curve.log_prior + point.share + log_frequency(point.level, another=another) + within - free

@@ -106,7 +106,8 @@ def _out_in_every_object(
             residual = residual - median_filter(residual, size=5, mode="nearest")
             even = ~near_steps(signal)
             views += even
-            times += even & (np.abs(residual) > _OUTLYING * max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9))
+            spread = max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
+            times += even & (np.abs(residual) > _OUTLYING * spread)
             seen_in[item.series.scene] = even | seen_in.get(item.series.scene, np.zeros_like(even))
             scenes = np.sum(list(seen_in.values()), axis=0)
             found |= (scenes >= _LEAST_SCENES) & (times >= _NEARLY_ALWAYS * views)

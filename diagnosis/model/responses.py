@@ -290,8 +290,7 @@ def _context(
     repeatable: int,
     later_darks: tuple[tuple[int, int], ...],
 ) -> ScalarContext:
-    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; repeatable,
-    later_darks: see there."""
+    """What a series' scalar probes refer to; previous_DN: signal of the last lit series before it; others as its fields."""
     in_use, clean = int(clean.sum()), clean & seen.readable[item.name]
     kind, frames, lit = item.series.kind, item.series.n_frames, item.request.beam_on
     lit_DN = np.asarray(signal_DN if lit else 0.0)

@@ -78,9 +78,9 @@ class ScalarContext:
     counts_all_outliers: this series stands for all, where pixels are counted that stand out anywhere; gain (row, column):
     of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; whole_lines: good pixels fill
     rows and columns, so that noise of these is seen; repeatable: frames of all series that this one stands for, which may be copies
-    of others; later_darks: frames, and
-    exposures a frame, of all later darks, this one first if it is one, where pixels that stand out of darks are counted; areas: the
-    good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels over that of all good ones.
+    of others; later_darks: frames, and exposures a frame, of all later darks, this one first if it is one, where pixels that stand
+    out of darks are counted; areas: the good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels
+    over that of all good ones.
     """
 
     kind: str

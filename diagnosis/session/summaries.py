@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...calibration.frame_checks import CopyScan, repeats_the_last
 from ...errors import InputError
+from ...generator.line.twin import LEAST_PIXELS
 
 LAGS: tuple[tuple[int, int], ...] = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0))
 BLOCK_PX = 8  # side of the blocks whose means show slow texture
@@ -98,8 +99,8 @@ def _pieces(
     """
     use = good.astype(np.float32)
     n_good = int(good.sum())
-    if n_good < 16:
-        raise InputError(name, received=f"{n_good} usable pixels", expected="at least 16")
+    if n_good < LEAST_PIXELS:
+        raise InputError(name, received=f"{n_good} usable pixels", expected=f"at least {LEAST_PIXELS}")
     shape_of_one = np.ones(good.shape, np.float32) if pattern is None else np.asarray(pattern, dtype=np.float32)
     reference: NDArray[np.float32] | None = None
     last: NDArray[np.float32] | None = None

@@ -200,8 +200,8 @@ def _above_noise(
 
 def _pattern(item: SessionSeries, signal: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     """How one unit of a frame's common factor looks."""
-    mean = float(signal[usable].mean())
-    return signal / mean if item.request.beam_on and mean > 0 else None
+    mean = float(signal[usable].mean()) if item.request.beam_on and usable.any() else 0.0
+    return signal / mean if mean > 0 else None
 
 
 def _labels(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # name of the map of pixels that calibration found bad, in twin files, answers and options; an effect that bears the same name
 # adds pixels that this map has not
 BAD_PIXEL_MAP = "bad_pixels"
+LEAST_PIXELS = 16  # that are not bad: with fewer, medians and spreads over a frame say nothing
 # reason codes of bad pixels; a pixel carries the first that applies
 BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
 

@@ -22,6 +22,7 @@ from ..effects import AppliedEffect, in_order
 from ..line.spectral_signal import SpectrumCorrection
 from ..line.twin import (
     BAD_PIXEL_MAP,
+    LEAST_PIXELS,
     DetectorMaps,
     Estimate,
     Level,
@@ -267,6 +268,12 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         raise FileFormatError(
             f"twin {path}", received=f"maps of shapes {sorted(shapes)}", expected="maps (row, column) of one shape"
         )
+    bad = _array(maps, BAD_PIXEL_MAP, np.uint8)
+    usable = int(np.count_nonzero(bad == 0))
+    if usable < LEAST_PIXELS:
+        raise FileFormatError(
+            f"twin {path}", received=f"{usable} pixels that are not bad", expected=f"at least {LEAST_PIXELS}"
+        )
     spectral = _spectral_from_group(file["spectral"], path) if "spectral" in file else None
     return Twin(
         instrument=instrument,
@@ -276,7 +283,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
             dark_DN_per_ms=_array(maps, "dark_DN_per_ms", np.float32),
             gain_relative=_array(maps, "gain_relative", np.float32),
             read_variance_DN2=_array(maps, "read_variance_DN2", np.float32),
-            bad_pixels=_array(maps, BAD_PIXEL_MAP, np.uint8),
+            bad_pixels=bad,
         ),
         noise=NoiseModel(
             spread=_spread(noise, path),

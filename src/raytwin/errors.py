@@ -33,6 +33,9 @@ class InputError(RaytwinError, ValueError):
         return f"{text}; {self.remedy}" if self.remedy else text
 
 
+LARGEST = 1e12  # in the units of this package no length, time, load, dose or number of photons of a line comes near
+
+
 def check_number(argument: str, value: object, *, unit: str = "") -> None:
     """Refuse what is no real number.
 

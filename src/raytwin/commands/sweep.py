@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin sweep`."""
     from ..api._progress import Bar
     from ..api.campaigns import SweepPlan, sweep
+    from ..campaign.sweep_report import by_upper_bound
 
     if arguments.output is None and not arguments.plan:
         raise InputError("-o", received="none", expected="a folder for the sweep, or --plan to look ahead only")
@@ -98,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         count = f"{len(rows)} setting{'s' * (len(rows) != 1)}"
         lines = [*_plan_lines(rows), f"{count}, {result['feasible']} feasible, {result['to_train']} to train"]
     else:
-        lines = [*_result_lines(result["rows"], result["other_size"]), result["sentence"]]
+        lines = [*_result_lines(by_upper_bound(result["rows"]), result["other_size"]), result["sentence"]]
         lines += _measurement_lines(result["decision"])
         lines.append(f"report: {result['paths']['report']}")
     answer(result, as_json=arguments.json, text="\n".join(lines))

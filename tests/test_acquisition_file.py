@@ -246,6 +246,7 @@ def test_another_format_or_version_is_named(path):
             "series flat, attribute exposure_ms: got -20 ms; expected a finite number of 0 or more ms",
         ),
         ({"exposure_ms": np.nan}, "series flat, attribute exposure_ms: got nan ms"),
+        ({"exposure_ms": 1e300}, "exposure_ms: got 1e+300 ms; expected a finite number of 0 or more, at most 1e+12 ms"),
         ({"exposure_ms": "long"}, "attribute exposure_ms: got 'long'; expected a finite number of 0 or more ms"),
         ({"kV": np.inf}, "attribute kV: got inf kV"),
         ({"kV": -40}, "attribute kV: got -40 kV"),

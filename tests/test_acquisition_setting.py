@@ -81,6 +81,7 @@ def test_load_is_power_over_voltage_times_time():
         ("kv=forty,exposure_ms=20", "setting, kv: got 'forty'; expected a number"),
         ("kv=40,exposure_ms=-20", "exposure_ms: got -20.0 ms; expected a finite value above 0 ms"),
         ("kv=nan,exposure_ms=20", "kV: got nan kV"),
+        ("kv=40,exposure_ms=1e300", "exposure_ms: got 1e+300 ms; expected a finite value above 0 ms, at most 1e+12"),
         ("kv=40,exposure_ms=20,filter=Cu", "filter: got 'Cu'; expected MATERIAL:mm"),
         ("kv=40,exposure_ms=20,filter=Cu:-1", "thickness of filter Cu: got -1.0 mm"),
         ("kv=40,exposure_ms=20,averaged=0", "averaged: got 0; expected a whole number of frames"),
@@ -109,6 +110,12 @@ def test_a_filter_needs_a_name_that_the_grammar_can_hold():
 def test_an_instrument_refuses_numbers_out_of_range(field, value):
     with pytest.raises(InputError, match=f"instrument {field}: got .*; expected a finite positive number"):
         Instrument(**{field: value})
+
+
+def test_an_instrument_has_no_more_bits_than_detectors_write():
+    assert Instrument(bits=32).bits == 32
+    with pytest.raises(InputError, match="instrument bits: got 33; expected a whole number from 1 to 32"):
+        Instrument(bits=33)
 
 
 def test_an_instrument_knows_its_words():

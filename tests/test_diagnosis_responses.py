@@ -20,6 +20,7 @@ from raytwin.diagnosis.probes.registration import Placement
 from raytwin.diagnosis.problem.nuisance_columns import local_nuisances
 from raytwin.diagnosis.problem.series_probes import variance_of_what_came
 from raytwin.diagnosis.session.even_maps import compact, full_size
+from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px
 from raytwin.generator.frames.series import SeriesRequest
@@ -59,6 +60,12 @@ def maps_of(kept, means_DN, expected):
         if item.name in means_DN
     }
     return calibrated_maps(kept, expected, looks, twin=twin(), good=GOOD)
+
+
+def test_flats_without_light_make_no_gain_map():
+    flat = series("flat", "flat", exposure_ms=50.0)
+    with pytest.raises(InputError, match="gain map of the calibrating flats: got 0 pixels that see light"):
+        maps_of([flat], {"flat": np.full(SHAPE, -900.0)}, {"flat": expectation(1000.0)})
 
 
 @given(

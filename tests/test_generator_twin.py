@@ -175,6 +175,10 @@ DAMAGES = {
         lambda file: [file["maps"].pop("bad_pixels"), file["maps"].create_dataset("bad_pixels", data=np.zeros((2, 2)))],
         "one shape",
     ),
+    "no pixel that can be used": (
+        lambda file: replaced(file, "maps/bad_pixels", np.ones(SHAPE, np.uint8)),
+        "0 pixels that are not bad; expected at least 16",
+    ),
     "a map of text": (
         lambda file: [file["maps"].pop("dark_DN"), file["maps"].create_dataset("dark_DN", data="abc")],
         "one shape|damaged file",

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import InputError
 from ...generator.frames.series import ExpectedSeries
-from ...generator.line.twin import Twin
+from ...generator.line.twin import LEAST_PIXELS, Twin
 from ..probes.fixed_pattern import smooth_part
 from ..session.even_maps import full_size, mean_over
 from ..session.session import SessionSeries
@@ -115,6 +116,9 @@ def calibrated_maps(
         looks: mean frames and numbers of frames, by name.
         twin: calibrated; its own maps stand in where no series calibrates.
         good: pixels that are not known to be bad (row, column).
+
+    Raises:
+        InputError: next to no pixel sees light.
     """
     darks = [item for item in kept if item.calibrates and item.series.kind == "dark"]
     flats = [item for item in kept if item.calibrates and item.series.kind == "flat"]
@@ -139,6 +143,13 @@ def calibrated_maps(
             gain_darks[name] -= share * part
         signal = np.maximum(full_size(model.signal_DN, good.shape), 1e-9)
         gain += shares[item.name] * (looks[item.name].mean_DN - under.under(item)) / signal
+    lit = good & (gain > _LEAST_GAIN)
+    if np.count_nonzero(lit) < LEAST_PIXELS:
+        raise InputError(
+            "gain map of the calibrating flats",
+            received=f"{np.count_nonzero(lit)} pixels that see light",
+            expected=f"at least {LEAST_PIXELS}",
+        )
     return CalibratedMaps(
         darks=under,
         gain=gain,
@@ -147,7 +158,7 @@ def calibrated_maps(
         gain_quantum=quantum,
         gain_white=white,
         gain_darks=gain_darks,
-        good=good & (gain > _LEAST_GAIN),
+        good=lit,
         frames={item.name: looks[item.name].frames for item in flats},
     )
 

@@ -53,10 +53,9 @@ class CurveFit:
         """Where the likelihood is highest, the law off by another level."""
         return Point(curve=self.curve, strength=self.best, level=level, share=self.share)
 
-    @property
-    def of_another(self) -> float:
-        """Log evidence over none of an effect that is only like the curve's: its levels' frequencies, and any strength."""
-        return _over_levels(self.at_any_strength, LEVELS.of_another)
+    def of_another(self, *, any_strength: bool) -> float:
+        """Log evidence over none of an effect that is only like the curve's, of any strength or one that is plausible for it."""
+        return _over_levels(self.at_any_strength if any_strength else self.by_level, LEVELS.of_another)
 
 
 def _over_levels(by_level: NDArray[np.float64], frequencies: Sequence[float]) -> float:

@@ -236,9 +236,15 @@ class _Rests:
         moved = math.hypot(*(self._observed.length(point.curve, point.strength) for point in acting))
         return found.length / max(moved, 1.0)
 
+    def _any_strength(self, effect: str) -> bool:
+        """Whether what is like an effect may have any strength: next to none of what the twin has is that effect gone."""
+        return not self._observed.has(effect)
+
     def of_another(self, single: Single) -> float:
         """Log evidence over none of an effect that is only like one of the catalogue's."""
-        plain = log_mean_exp(np.array([fit.of_another for fit in single.fits if len(fit.by_level) > 1]))
+        any_strength = self._any_strength(single.best.curve.effect)
+        full = [fit for fit in single.fits if len(fit.by_level) > 1]
+        plain = log_mean_exp(np.array([fit.of_another(any_strength=any_strength) for fit in full]))
         points = [single.best.at_level(LEVELS.levels[-1])]
         evidence, found = self.beside(points, another=True)
         evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY
@@ -254,7 +260,8 @@ class _Rests:
             others = alone
             for other in points:
                 others = others if other is point else others.beside(other)
-            priors += log_prior(others, point, another=another)
+            any_strength = another and self._any_strength(point.curve.effect)
+            priors += log_prior(others, point, another=another, any_strength=any_strength)
             beside = beside.beside(point)
         found = beyond(beside, self._parts, self._names)
         evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood

@@ -169,17 +169,18 @@ def left_in_place(
     return top + math.log(max(left, 1e-300)) - there
 
 
-def log_prior(observed: Observed, point: Point, *, another: bool = False) -> float:
+def log_prior(observed: Observed, point: Point, *, another: bool = False, any_strength: bool = False) -> float:
     """Log of what a point takes of the prior: its curve's, how often laws (of `another` kind) are off by its level, its strengths'.
 
-    Strengths are even in their logarithm, of `another` kind over all the curve's reach. The Gaussian that `Observed.beside` frees
-    them by is no prior: what it gives is taken off, and the integral over the reach put in its place. About a point, where the
-    likelihood is highest, that falls to both sides, but at an end of the reach.
+    Strengths are even in their logarithm. The Gaussian that `Observed.beside` frees them by is no prior: what it gives is taken off, and
+    the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both sides, but at an
+    end of the reach.
 
     Args:
         observed: what all other effects leave, without this one.
         point: with strengths as free as it says.
         another: the effect is only like the curve's.
+        any_strength: that the curve is tried at, none more plausible than another.
     """
     curve = point.curve
     slope, curvature = observed.told_of_strength(point)
@@ -189,6 +190,6 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False) -> flo
     x = strengths / point.strength - 1.0  # responses are nearly straight in the strength
     pull = 0.0 if strengths[0] < point.strength < strengths[-1] else slope
     within = log_integral(
-        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if another else (curve.low, curve.high))
+        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if any_strength else (curve.low, curve.high))
     )
     return curve.log_prior + point.share + log_frequency(point.level, another=another) + within - free

@@ -172,9 +172,9 @@ def left_in_place(
 def log_prior(observed: Observed, point: Point, *, another: bool = False, any_strength: bool = False) -> float:
     """Log of what a point takes of the prior: its curve's, how often laws (of `another` kind) are off by its level, its strengths'.
 
-    Strengths are even in their logarithm. The Gaussian that `Observed.beside` frees them by is no prior: what it gives is taken off, and
-    the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both sides, but at an
-    end of the reach.
+    Strengths are even in their logarithm. The Gaussian that `Observed.beside` frees them by is no prior: what it gives is taken off,
+    and the integral over the reach put in its place. About a point, where the likelihood is highest, that falls to both sides, but at
+    an end of the reach.
 
     Args:
         observed: what all other effects leave, without this one.

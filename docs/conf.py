@@ -5,8 +5,6 @@ import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
-from jupyter_client.connect import ConnectionFileMixin
-
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
 
@@ -14,10 +12,6 @@ sys.path.insert(0, str(HERE / "_ext"))
 os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["RAYTWIN_FLEXRAY"] = str(HERE.parent / "data" / "real" / "flexray")
-if (
-    os.name == "posix"
-):  # notebooks talk to their kernel through files of this user instead of ports that others may listen at
-    ConnectionFileMixin.transport.default_value = "ipc"
 
 project = "raytwin"
 author = "The raytwin developers"

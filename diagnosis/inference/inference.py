@@ -10,7 +10,8 @@ responses to the nuisances times their prior standard deviations.
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
     unknown   m = 0 and an extra variance in any number of families of probes; or like an effect of the catalogue, of any strength
-              that is tried, and as far off as effects of other kinds are from the law that resembles them most
+              that is tried (what the twin has: of a plausible one), as far off as effects of other kinds are from the law that
+              resembles them most
 """
 
 import math

@@ -91,7 +91,9 @@ def settings_from_words(words: Mapping[str, Any]) -> tuple[Setting, ...] | Setti
             expected="lists of one length, which go together entry by entry",
         )
     count = next(iter(lengths.values()))
-    return _some(tuple(as_setting({**words, **{name: lists[name][row] for name in lists}}) for row in range(count)))
+    return _one_or_more(
+        tuple(as_setting({**words, **{name: lists[name][row] for name in lists}}) for row in range(count))
+    )
 
 
 def predict_setting(twin: Twin, setting: Setting) -> Prediction:
@@ -128,10 +130,10 @@ def asked_settings(
         return settings_from_words(words)
     if isinstance(settings, Setting | str):
         return as_setting(settings)
-    return _some(tuple(as_setting(item) for item in settings))
+    return _one_or_more(tuple(as_setting(item) for item in settings))
 
 
-def _some(settings: tuple[Setting, ...]) -> tuple[Setting, ...]:
+def _one_or_more(settings: tuple[Setting, ...]) -> tuple[Setting, ...]:
     if not settings:
         raise InputError("settings", received="an empty list", expected="one setting or more")
     return settings

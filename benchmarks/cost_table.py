@@ -33,7 +33,8 @@ from raytwin.generator.frames.series import SeriesRequest, expected_series, samp
 
 SIZES = ((64, 64), (128, 128), (380, 478), (760, 956), (1520, 1912))
 ENERGIES = (25, 50, 100, 200)
-EFFECT_COUNTS = (0, 1, 5, 10, len(EFFECTS))
+OF_INTEGRATORS = [one for one in EFFECTS.values() if "counting" not in one.needs]
+EFFECT_COUNTS = (0, 1, 5, 10, len(OF_INTEGRATORS))
 
 
 def milliseconds(work: Callable[[], object], turns: int) -> tuple[float, float]:
@@ -120,7 +121,7 @@ def effects_table(turns: int) -> None:
             for count in EFFECT_COUNTS:
                 chosen = tuple(
                     AppliedEffect(id=one.id, parameters={p.name: p.default for p in one.parameters}, since="always")
-                    for one in list(EFFECTS.values())[:count]
+                    for one in OF_INTEGRATORS[:count]
                 )
                 cells.append(milliseconds(lambda w=work, c=chosen: w(c), turns))
             print(

@@ -29,7 +29,8 @@ from raytwin.generator import (
     sample_frames,
 )
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.frames.line_model import LineModel
+from raytwin.generator.line.series_request import SeriesRequest
 
 SIZES = ((64, 64), (128, 128), (380, 478), (760, 956), (1520, 1912))
 ENERGIES = (25, 50, 100, 200)
@@ -114,8 +115,8 @@ def effects_table(turns: int) -> None:
             product_material="chicken_breast",
         )
         for name, work in (
-            ("sampled", lambda e, t=twin, r=request: list(sample_series(t, r, rng=rng, effects=e))),
-            ("expected", lambda e, t=twin, r=request: expected_series(t, r, effects=e)),
+            ("sampled", lambda e, t=twin, r=request: list(LineModel(t, effects=e).sample(r, rng=rng))),
+            ("expected", lambda e, t=twin, r=request: LineModel(t, effects=e).expect(r)),
         ):
             cells = []
             for count in EFFECT_COUNTS:

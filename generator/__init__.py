@@ -28,17 +28,17 @@ if TYPE_CHECKING:
         Effect,
         Parameter,
     )
-    from .frames.series import (
-        ExpectedSeries,
-        LineMemory,
-        ModelCache,
-        SeriesRequest,
+    from .frames.conditions import (
         beam_conditions,
-        expected_series,
-        sample_series,
         session_conditions,
         with_conditions,
     )
+    from .frames.line_model import (
+        ExpectedSeries,
+        LineMemory,
+        LineModel,
+    )
+    from .frames.model_cache import ModelCache
     from .kernels.kernels import (
         draw_key,
         sample_frames,
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .kernels.projection import (
         project_polychromatic,
     )
+    from .line.series_request import SeriesRequest
     from .line.spectral_signal import (
         BeamSignal,
         OpenBeam,
@@ -151,13 +152,14 @@ _LAZY = {
     "Effect": "effects",
     "Estimate": "line.twin",
     "ExpectedImage": "datasets.render",
-    "ExpectedSeries": "frames.series",
+    "ExpectedSeries": "frames.line_model",
     "GenerationSummary": "datasets.generate",
     "Geometry": "datasets.render",
     "Level": "line.twin",
     "Levels": "predictions.predict_many",
-    "LineMemory": "frames.series",
-    "ModelCache": "frames.series",
+    "LineMemory": "frames.line_model",
+    "LineModel": "frames.line_model",
+    "ModelCache": "frames.model_cache",
     "NoiseModel": "line.twin",
     "OpenBeam": "line.spectral_signal",
     "PSF_MODELS": "spread.psf",
@@ -178,7 +180,7 @@ _LAZY = {
     "TwoMaterialTables": "references.two_material",
     "UncalibratedLine": "predictions.contrast",
     "apply_top_up": "references.topup",
-    "beam_conditions": "frames.series",
+    "beam_conditions": "frames.conditions",
     "Spread": "spread.psf",
     "blur_variance_share": "spread.psf",
     "compute_contrast_map": "predictions.contrast",
@@ -186,7 +188,6 @@ _LAZY = {
     "draw_key": "kernels.kernels",
     "estimate_from_sd": "line.twin",
     "estimate_shift_px": "spread.registration",
-    "expected_series": "frames.series",
     "gain_behind_object": "line.spectral_signal",
     "generate_dataset": "datasets.generate",
     "generate_from_description": "datasets.generate_described",
@@ -209,8 +210,7 @@ _LAZY = {
     "sample_frames": "kernels.kernels",
     "sample_quanta": "kernels.kernels",
     "sample_scene": "scenes.describe",
-    "sample_series": "frames.series",
-    "session_conditions": "frames.series",
+    "session_conditions": "frames.conditions",
     "shift_image": "spread.registration",
     "shipped_calibration": "twins.shipped",
     "shipped_calibrations": "twins.shipped",
@@ -219,7 +219,7 @@ _LAZY = {
     "spectral_model_of": "predictions.predict",
     "tabulate_two_materials": "references.two_material",
     "transfer_pair": "references.transfer",
-    "with_conditions": "frames.series",
+    "with_conditions": "frames.conditions",
     "write_twin": "twins.twin_io",
     "asked_settings": "predictions.predict_settings",
     "calibration_answer": "twins.twin_answer",
@@ -249,6 +249,7 @@ __all__ = [
     "Level",
     "Levels",
     "LineMemory",
+    "LineModel",
     "ModelCache",
     "NoiseModel",
     "OpenBeam",
@@ -278,7 +279,6 @@ __all__ = [
     "draw_key",
     "estimate_from_sd",
     "estimate_shift_px",
-    "expected_series",
     "gain_behind_object",
     "gaussian_spread",
     "generate_dataset",
@@ -304,7 +304,6 @@ __all__ = [
     "sample_frames",
     "sample_quanta",
     "sample_scene",
-    "sample_series",
     "session_conditions",
     "shift_image",
     "shipped_calibration",

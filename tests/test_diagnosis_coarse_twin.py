@@ -15,7 +15,8 @@ from raytwin.cli import main
 from raytwin.diagnosis.session import coarse
 from raytwin.diagnosis.session.coarse_twin import twin_in_squares
 from raytwin.generator.effects import AppliedEffect
-from raytwin.generator.frames.series import SeriesRequest, expected_series
+from raytwin.generator.frames.line_model import LineModel
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.twins.twin_io import read_twin
 
 pytestmark = pytest.mark.slow
@@ -74,7 +75,7 @@ def test_spectra_give_squares_the_level_of_pixels_and_fewer_dn_a_photon(both, se
         flat = next(item for item in acquisition.of_kind("flat") if item.setting is not None)
         fine = calibrate_twin(acquisition, rng=np.random.default_rng(1))
     request = SeriesRequest(kind="flat", frames=4, exposure_ms=flat.exposure_ms, setting=replace(flat.setting, kV=64.0))
-    whole, small = expected_series(fine, request), expected_series(squares, request)
+    whole, small = LineModel(fine).expect(request), LineModel(squares).expect(request)
     good = squares.maps.bad_pixels == 0
     there = means_of_squares(np.asarray(whole.signal_DN), factor)
     # bad pixels apart, which are no light's doing

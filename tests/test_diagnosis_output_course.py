@@ -5,7 +5,7 @@ import pytest
 
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.diagnosis.problem.output_course import OutputCourse, rms_about_mean
-from raytwin.generator.frames.series import SeriesRequest
+from raytwin.generator.line.series_request import SeriesRequest
 
 READOUT_MS = 10.0
 

@@ -22,7 +22,8 @@ from raytwin.diagnosis.problem.series_block import jitter_of
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.effects._light_spread import spread_transfer
 from raytwin.generator.effects.misregistration import parts_px
-from raytwin.generator.frames.series import SeriesRequest, expected_series
+from raytwin.generator.frames.line_model import LineModel
+from raytwin.generator.line.series_request import SeriesRequest
 
 PROBES = 60
 
@@ -393,8 +394,8 @@ def test_where_an_effect_is_said_not_to_show_the_forward_model_is_as_without_it(
         applied = AppliedEffect(id=effect, parameters={"strength": strong}, since="always")
         if request.kind in EFFECTS[effect].shows.series:
             continue
-        with_it = expected_series(twin, request, effects=(applied,), use_measured_level=False)
-        without = expected_series(twin, request, effects=(), use_measured_level=False)
+        with_it = LineModel(twin, effects=(applied,), use_measured_level=False).expect(request)
+        without = LineModel(twin, effects=(), use_measured_level=False).expect(request)
         for name in ("mean_DN", "quantum_variance_DN2", "white_variance_DN2", "row_variance_DN2", "frame_factor_rms"):
             assert np.array_equal(getattr(with_it, name), getattr(without, name)), (request.kind, name)
     # objects show whatever there is

@@ -24,7 +24,7 @@ from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.diagnosis.session.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS
-from raytwin.generator.frames.series import session_conditions
+from raytwin.generator.frames.conditions import session_conditions
 from raytwin.generator.twins.twin_io import read_twin
 
 FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"

@@ -23,7 +23,7 @@ from raytwin.diagnosis.session.even_maps import compact, full_size
 from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px
-from raytwin.generator.frames.series import SeriesRequest
+from raytwin.generator.line.series_request import SeriesRequest
 
 SHAPE = (12, 16)
 GOOD = np.ones(SHAPE, dtype=bool)

@@ -27,7 +27,8 @@ from raytwin.acquisition.setting import setting_from_text
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.datasets.generate import ChannelModel
 from raytwin.generator.predictions.predict import predict_flatfield
-from raytwin.generator.frames.series import SeriesRequest, expected_series
+from raytwin.generator.frames.line_model import LineModel
+from raytwin.generator.line.series_request import SeriesRequest
 
 few = {"worn_screen", "heel", "gain_map_error", "nonlinearity", "kv_error"}  # all take three times as long
 found = diagnose(sys.argv[1], without=sorted(set(EFFECTS) - few), seed=1)
@@ -36,7 +37,7 @@ setting = setting_from_text("kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05")
 flat = SeriesRequest(kind="flat", setting=setting, frames=2, exposure_ms=20.0)
 worn = (AppliedEffect(id="worn_screen", parameters={"strength": 10.0}, since="calibration"),)
 middle = tuple(side // 2 for side in twin.maps.shape)
-levels = [expected_series(twin, flat, effects=effects).signal_DN[middle] for effects in ((), worn)]
+levels = [LineModel(twin, effects=effects).expect(flat).signal_DN[middle] for effects in ((), worn)]
 images = ChannelModel(twin, setting, "water_liquid", "repaired", worn).image_effects
 plain, changed = (predict_flatfield(replace(twin, effects=effects), setting).mean_DN.value for effects in ((), worn))
 print(json.dumps({

@@ -18,18 +18,12 @@ from raytwin.generator.effects.focal_spot import _transfer_of_spot
 from raytwin.generator.effects.k_fluorescence import line_energy_keV
 from raytwin.generator.effects.misregistration import angles_of, parts_px
 from raytwin.generator.frames._distortion import displacement_px, distorted
-from raytwin.generator.frames.series import (
-    LineMemory,
-    ModelCache,
-    SeriesRequest,
-    beam_conditions,
-    expected_series,
-    sample_series,
-    session_conditions,
-    with_conditions,
-)
+from raytwin.generator.frames.conditions import beam_conditions, session_conditions, with_conditions
+from raytwin.generator.frames.line_model import LineMemory, LineModel
+from raytwin.generator.frames.model_cache import ModelCache
 from raytwin.generator.line.line_state import STAGES, LineState
 from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.line.spectral_signal import OpenBeam
 from raytwin.generator.predictions.predict import spectral_model_of
 from raytwin.generator.spread.psf import blur_variance_share
@@ -122,7 +116,7 @@ def line_for(line, effects):
 
 
 def expect(line, asked, effects=(), cache=CACHE):
-    return expected_series(line_for(line, effects), asked, effects=effects, cache=cache)
+    return LineModel(line_for(line, effects), effects=effects, cache=cache).expect(asked)
 
 
 # ------------------------------------------------------------------------------------------------ the catalogue
@@ -236,7 +230,9 @@ def test_samples_have_the_expected_mean_variance_and_covariance(series_line, nam
     expected = expect(series_line, asked, effects)
     rng = np.random.default_rng(7)
     frames = np.stack(
-        list(sample_series(line_for(series_line, effects), asked, rng=rng, effects=effects, cache=CACHE, memory=None))
+        list(
+            LineModel(line_for(series_line, effects), effects=effects, cache=CACHE).sample(asked, rng=rng, memory=None)
+        )
     ).astype(np.float64)
     residual = frames - expected.mean_DN
     for image, course in expected.trend_DN or ():
@@ -629,7 +625,7 @@ def test_what_is_released_in_a_pause_is_found_in_the_next_frame_as_far_as_the_pa
     np.testing.assert_allclose(first, left * (1 - decay) + share * (held - left), rtol=1e-9)
     np.testing.assert_allclose(second, left * decay * (1 - decay), rtol=1e-9)
     memory = LineMemory(trapped_DN=np.stack([held] * 4) / 4, time_s=400 * 0.022)
-    sampled = next(sample_series(series_line, after, rng=np.random.default_rng(0), effects=effect, memory=memory))
+    sampled = next(LineModel(series_line, effects=effect).sample(after, rng=np.random.default_rng(0), memory=memory))
     assert (sampled - 1200.0).mean() == pytest.approx(first.mean(), abs=4 * 12 / 40)
 
 
@@ -722,8 +718,8 @@ def test_sampled_lag_conserves_what_the_frames_and_the_traps_hold(series_line):
     )
     asked = request(frames=30)
     memory = LineMemory()
-    with_lag = sum(sample_series(quiet, asked, rng=np.random.default_rng(1), effects=effect, memory=memory))
-    without = sum(sample_series(quiet, asked, rng=np.random.default_rng(1), effects=()))
+    with_lag = sum(LineModel(quiet, effects=effect).sample(asked, rng=np.random.default_rng(1), memory=memory))
+    without = sum(LineModel(quiet, effects=()).sample(asked, rng=np.random.default_rng(1)))
     np.testing.assert_allclose(with_lag + memory.trapped_DN.sum(axis=0), without, rtol=1e-5)
 
 
@@ -871,7 +867,7 @@ def test_row_noise_of_frames_fades_from_line_to_line_as_expected(series_line, co
     effect = applied("row_noise", 2.0, since="calibration", column_share=columns, together_lines=together)
     expected = expect(series_line, asked, effect)
     assert expected.offsets_together_lines == together
-    frames = np.stack(list(sample_series(series_line, asked, effects=effect, rng=np.random.default_rng(4))))
+    frames = np.stack(list(LineModel(series_line, effects=effect).sample(asked, rng=np.random.default_rng(4))))
     lines = (frames - frames.mean(axis=0)).mean(axis=1 if columns else 2)
     variance = (
         expected.row_variance_DN2 + expected.column_variance_DN2 + np.mean(expected.white_variance_DN2) / SHAPE[0]
@@ -962,8 +958,8 @@ def test_patterns_are_fixed_by_their_seed(series_line):
 
     def pattern(name, seed):
         effect = applied(name, EFFECTS[name].strength.high, pattern_seed=seed)
-        (frame,) = sample_series(series_line, quiet, rng=np.random.default_rng(0), effects=effect, cache=CACHE)
-        (base,) = sample_series(series_line, quiet, rng=np.random.default_rng(0), effects=(), cache=CACHE)
+        (frame,) = LineModel(series_line, effects=effect, cache=CACHE).sample(quiet, rng=np.random.default_rng(0))
+        (base,) = LineModel(series_line, effects=(), cache=CACHE).sample(quiet, rng=np.random.default_rng(0))
         return (frame - base).ravel()
 
     for name in ("gain_map_error", "bad_pixels"):
@@ -1281,7 +1277,7 @@ def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series
 
 def test_only_counters_lose_counts(series_line):
     with pytest.raises(InputError, match="only counters have a dead time"):
-        expected_series(series_line, request(), effects=applied("pile_up"))
+        LineModel(series_line, effects=applied("pile_up")).expect(request())
 
 
 @pytest.mark.parametrize("peaked", [0.0, 1.0])
@@ -1359,7 +1355,9 @@ def test_a_share_of_an_output_s_drift_may_be_new_in_every_exposure(series_line):
     averaged = expect(series_line, request(setting=f"{MEASURED},averaged=1000", frame_interval_ms=22000.0), effect)
     variance = 0.02**2 * (0.6 * 2 * 0.1 / 22.0 + 0.4 / 1000)
     assert averaged.frame_factor_rms == pytest.approx(math.sqrt(variance), rel=0.02)
-    frames = sample_series(series_line, request(frames=400), rng=np.random.default_rng(3), effects=effect, cache=CACHE)
+    frames = LineModel(series_line, effects=effect, cache=CACHE).sample(
+        request(frames=400), rng=np.random.default_rng(3)
+    )
     factor = np.array([float(np.mean(frame - found.dark_DN) / np.mean(found.signal_DN)) for frame in frames])
     steps = np.diff(factor)
     # a first-order process and white noise: 400 frames leave some 7 % of the steps' variance open
@@ -1372,8 +1370,8 @@ def test_hot_pixels_are_their_share_of_the_bad_ones(series_line):
     assert found.hot_pixel_share == pytest.approx(0.25 * found.bad_pixel_share)
     frames = np.stack(
         list(
-            sample_series(
-                series_line, request("dark", setting=None, frames=20), rng=np.random.default_rng(5), effects=effect
+            LineModel(series_line, effects=effect).sample(
+                request("dark", setting=None, frames=20), rng=np.random.default_rng(5)
             )
         )
     )

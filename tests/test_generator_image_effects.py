@@ -14,8 +14,9 @@ from raytwin.generator.datasets.generate import ChannelModel, ReferenceImages, g
 from raytwin.generator.datasets.generate_described import DescribedScenes
 from raytwin.generator.datasets.render import render_expected
 from raytwin.generator.effects import EFFECTS, AppliedEffect, effect_of
+from raytwin.generator.frames.line_model import LineModel
 from raytwin.generator.frames.response import responded
-from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.scenes.describe import read_description
 from raytwin.generator.twins.twin_io import write_twin
 
@@ -84,13 +85,13 @@ def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_lin
         product_material="water_liquid",
         scene_kind="product",
     )
-    wanted = expected_series(series_line, asked, effects=(applied,))
-    mean = responded(image.state, image.charge_DN)
+    wanted = LineModel(series_line, effects=(applied,)).expect(asked)
+    mean = responded(image.state, image.charge.mean)
     # a smooth hill: cells that are flat within a pixel are as good as the series' slopes within 2e-3
     np.testing.assert_allclose(mean, wanted.signal_DN, rtol=3e-3)
-    flat = expected_series(series_line, replace(asked, kind="flat", thickness_mm=None), effects=(applied,))
+    flat = LineModel(series_line, effects=(applied,)).expect(replace(asked, kind="flat", thickness_mm=None))
     np.testing.assert_allclose(effects.flat_DN, flat.signal_DN * np.ones(SHAPE), rtol=3e-4)
-    plain = expected_series(series_line, asked, effects=())
+    plain = LineModel(series_line, effects=()).expect(asked)
     if effect in ("object_scatter", "composition_error", "heel", "veiling_glare"):
         assert np.abs(wanted.signal_DN / plain.signal_DN - 1).max() > 4e-3
 
@@ -116,7 +117,7 @@ def test_the_noise_of_images_with_an_effect_is_that_of_the_series_model(series_l
         product_material="water_liquid",
         scene_kind="product",
     )
-    drawn = sample_series(series_line, asked, effects=(applied,), rng=np.random.default_rng(4))
+    drawn = LineModel(series_line, effects=(applied,)).sample(asked, rng=np.random.default_rng(4))
     series = np.stack(list(drawn)).astype(np.float64)
     inner = (slice(None), slice(4, -4), slice(4, -4))
     variances, neighbours = [], []
@@ -271,8 +272,8 @@ def test_what_came_after_calibration_changes_references_and_what_was_always_ther
             asked = SeriesRequest(
                 kind="object", setting=HIGH, frames=1, exposure_ms=20.0, thickness_mm={"water_liquid": thickness}
             )
-            with_it = expected_series(series_line, asked, effects=twin.effects).signal_DN
-            without = expected_series(series_line, asked, effects=()).signal_DN
+            with_it = LineModel(series_line, effects=twin.effects).expect(asked).signal_DN
+            without = LineModel(series_line, effects=()).expect(asked).signal_DN
             wanted = float(np.mean(np.log(with_it / without)[centre[1:]]))
             assert drop == pytest.approx(wanted, rel=0.05) and wanted > 0.02
         else:
@@ -290,7 +291,7 @@ def test_a_late_change_of_the_picture_reaches_references_as_the_series_model_has
         kind="object", setting=HIGH, frames=1, exposure_ms=20.0, thickness_mm={"water_liquid": hill(15.0)}
     )
     shape = series_line.levels[1].flat_shape
-    wanted = [expected_series(series_line, asked, effects=one).signal_DN / shape for one in ((applied,), ())]
+    wanted = [LineModel(series_line, effects=one).expect(asked).signal_DN / shape for one in ((applied,), ())]
     level = model.image_effects.open_level_DN
     np.testing.assert_allclose(change, (wanted[0] - wanted[1]) / level, atol=2e-3, rtol=0.05)
 
@@ -345,13 +346,13 @@ def test_a_beam_that_changed_after_calibration_hardens_references_as_the_model_s
     )
     for plane, setting in enumerate((LOW, HIGH)):
         objects = [
-            expected_series(series_line, replace(asked, setting=setting), effects=one).signal_DN
+            LineModel(series_line, effects=one).expect(replace(asked, setting=setting)).signal_DN
             for one in (twin.effects, ())
         ]
         flats = [
-            expected_series(
-                series_line, replace(asked, kind="flat", thickness_mm=None, setting=setting), effects=one
-            ).signal_DN
+            LineModel(series_line, effects=one)
+            .expect(replace(asked, kind="flat", thickness_mm=None, setting=setting))
+            .signal_DN
             for one in (twin.effects, ())
         ]
         logs = [-np.log(obj / flat)[16:24, 16:24].mean() for obj, flat in zip(objects, flats, strict=True)]

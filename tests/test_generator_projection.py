@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from raytwin.errors import InputError
-from raytwin.generator.frames._scene import _distinct
+from raytwin.generator.frames.scene import _distinct
 from raytwin.generator.kernels.projection import project_polychromatic
 
 TOLERANCE = 1e-4  # relative; what the docstring promises

@@ -13,8 +13,10 @@ from raytwin.acquisition.setting import filters_from_text, setting_from_text
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.frames._spread import noise_pattern
-from raytwin.generator.frames.series import LineMemory, ModelCache, SeriesRequest, expected_series, sample_series
+from raytwin.generator.frames.line_model import LineMemory, LineModel
+from raytwin.generator.frames.model_cache import ModelCache
 from raytwin.generator.line.line_state import LineState
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.line.spectral_signal import OpenBeam
 from raytwin.generator.line.twin import gaussian_spread
 from raytwin.generator.line.twin_spectrum import slope_over_gain, white_gain_DN
@@ -60,7 +62,7 @@ def product():
 @pytest.mark.parametrize("averaged", [1, 8])
 def test_a_flat_at_a_measured_level_is_the_predicted_flatfield(series_line, averaged):
     asked = request(setting=f"{MEASURED},averaged={averaged}", frame_interval_ms=None)
-    found = expected_series(series_line, asked)
+    found = LineModel(series_line).expect(asked)
     predicted = predict_flatfield(series_line, asked.setting)
     shape = series_line.levels[0].flat_shape
     np.testing.assert_allclose(found.signal_DN, predicted.mean_DN.value * shape, rtol=1e-5)
@@ -74,7 +76,7 @@ def test_a_flat_at_a_measured_level_is_the_predicted_flatfield(series_line, aver
 
 def test_an_unmeasured_beam_is_the_spectral_model_at_its_best(series_line):
     setting = setting_from_text("kv=60,current_ma=0.5,exposure_ms=20,filter=Al:2")
-    found = expected_series(series_line, request(setting=str(setting)))
+    found = LineModel(series_line).expect(request(setting=str(setting)))
     model = spectral_model_of(series_line)
     beam = OpenBeam(kV=60.0, filters=setting.filters)
     exact = model.signal(series_line.spectral.best[None, :], beam)
@@ -94,7 +96,7 @@ def test_an_unmeasured_beam_is_the_spectral_model_at_its_best(series_line):
 def test_noise_of_an_unmeasured_beam_is_as_predicted(make_model_twin, text):
     """Secondary quanta add the same for each DN of signal in every beam, here as in `predict_flatfield`."""
     twin = make_model_twin((24, 24))
-    found = expected_series(twin, request(setting=text))
+    found = LineModel(twin).expect(request(setting=text))
     predicted = predict_flatfield(twin, setting_from_text(text))
     variance = float(np.median(found.quantum_variance_DN2 + found.white_variance_DN2))
     assert variance == pytest.approx(predicted.sd_DN.value**2, rel=1e-4)
@@ -106,7 +108,7 @@ def test_noise_of_secondary_quanta_follows_the_signal_behind_a_hardening_slab(ma
     twin = make_model_twin((24, 24))
     behind = {"Al": np.full((24, 24), 10.0)}
     slab, flat = (
-        expected_series(twin, request(kind, thickness_mm=maps)) for kind, maps in (("object", behind), ("flat", {}))
+        LineModel(twin).expect(request(kind, thickness_mm=maps)) for kind, maps in (("object", behind), ("flat", {}))
     )
     white = [(one.white_variance_DN2 - twin.noise.read_variance_DN2) / one.signal_DN for one in (slab, flat)]
     np.testing.assert_allclose(white[0], white[1], rtol=1e-2)
@@ -116,7 +118,7 @@ def test_noise_of_secondary_quanta_follows_the_signal_behind_a_hardening_slab(ma
 
 def test_a_slab_attenuates_as_the_exact_sum_over_energies(series_line):
     asked = request("object", thickness_mm=slab())
-    found = expected_series(series_line, asked).signal_DN / expected_series(series_line, request()).signal_DN
+    found = LineModel(series_line).expect(asked).signal_DN / LineModel(series_line).expect(request()).signal_DN
     model = spectral_model_of(series_line)
     beam = OpenBeam(kV=90.0, filters=filters_from_text("Cu:0.05"))
     weights = model.moment_weights(series_line.spectral.best, beam)[0]
@@ -127,8 +129,8 @@ def test_a_slab_attenuates_as_the_exact_sum_over_energies(series_line):
 
 
 def test_signal_falls_with_the_square_of_the_distance(series_line):
-    near = expected_series(series_line, request())
-    far = expected_series(series_line, request(source_detector_mm=2 * 1059.0))
+    near = LineModel(series_line).expect(request())
+    far = LineModel(series_line).expect(request(source_detector_mm=2 * 1059.0))
     np.testing.assert_allclose(near.signal_DN, 4 * far.signal_DN, rtol=1e-9)
 
 
@@ -136,17 +138,17 @@ def test_scales_of_the_spectrum_scale_signal_and_variance(series_line):
     """gamma e^d: signal e^d, variance e^2d; the projection behind a scene is not made again."""
     cache = ModelCache()
     asked = request("object", thickness_mm=product())
-    base = expected_series(series_line, asked, cache=cache)
+    base = LineModel(series_line, cache=cache).expect(asked)
     changed = series_line.spectral.best.copy()
     changed[series_line.spectral.names.index("log_DN_per_keV")] += 0.02
-    found = expected_series(series_line, asked, parameters=changed, cache=cache)
+    found = LineModel(series_line, parameters=changed, cache=cache).expect(asked)
     np.testing.assert_allclose(found.signal_DN, base.signal_DN * math.exp(0.02), rtol=1e-9)
     np.testing.assert_allclose(found.quantum_variance_DN2, base.quantum_variance_DN2 * math.exp(0.04), rtol=1e-9)
 
 
 def test_averaging_n_exposures_divides_all_noise_by_n(series_line):
-    one = expected_series(series_line, request())
-    many = expected_series(series_line, request(setting=f"{MEASURED},averaged=16", frame_interval_ms=352.0))
+    one = LineModel(series_line).expect(request())
+    many = LineModel(series_line).expect(request(setting=f"{MEASURED},averaged=16", frame_interval_ms=352.0))
     np.testing.assert_allclose(many.mean_DN, one.mean_DN, rtol=1e-12)
     np.testing.assert_allclose(many.quantum_variance_DN2, one.quantum_variance_DN2 / 16, rtol=1e-12)
     np.testing.assert_allclose(many.white_variance_DN2, one.white_variance_DN2 / 16, rtol=1e-12)
@@ -154,7 +156,7 @@ def test_averaging_n_exposures_divides_all_noise_by_n(series_line):
 
 @pytest.mark.parametrize("kind", ["dark", "afterglow"])
 def test_without_beam_and_without_lag_there_is_the_dark_alone(series_line, kind):
-    found = expected_series(series_line, request(kind, setting=None, exposure_ms=100.0))
+    found = LineModel(series_line).expect(request(kind, setting=None, exposure_ms=100.0))
     np.testing.assert_allclose(found.mean_DN, 1200.0 + 0.1 * 80.0, rtol=1e-6)
     np.testing.assert_allclose(found.white_variance_DN2, 12.0**2 + 1 / 12, rtol=1e-6)
     assert np.all(found.signal_DN == 0) and np.all(found.quantum_variance_DN2 == 0)
@@ -162,19 +164,19 @@ def test_without_beam_and_without_lag_there_is_the_dark_alone(series_line, kind)
 
 def test_a_declared_open_level_stands_in_for_an_unknown_tube_load(series_line):
     asked = request(setting="kv=90,exposure_ms=20,filter=Cu:0.05", open_signal_DN=5000.0)
-    found = expected_series(series_line, asked)
+    found = LineModel(series_line).expect(asked)
     np.testing.assert_allclose(found.signal_DN, 5000.0 * series_line.levels[1].flat_shape, rtol=1e-6)
 
 
 def test_a_twin_without_spectrum_still_knows_its_measured_flats(series_line):
     bare = replace(series_line, spectral=None)
-    one, other = expected_series(bare, request()), expected_series(series_line, request())
+    one, other = LineModel(bare).expect(request()), LineModel(series_line).expect(request())
     np.testing.assert_allclose(one.mean_DN, other.mean_DN, rtol=1e-9)
     np.testing.assert_allclose(one.quantum_variance_DN2, other.quantum_variance_DN2, rtol=1e-9)
 
 
 def test_the_level_at_the_end_of_the_adc_is_flagged(series_line):
-    found = expected_series(series_line, request(setting="kv=90,power_w=45,exposure_ms=500,filter=Cu:0.05"))
+    found = LineModel(series_line).expect(request(setting="kv=90,power_w=45,exposure_ms=500,filter=Cu:0.05"))
     assert found.saturated_share == 1.0
     assert np.all(found.mean_DN <= 65535)
 
@@ -186,16 +188,16 @@ def test_a_cache_never_takes_one_scene_for_another(series_line):
     cache = ModelCache()
     for water in (1.0, 5.0, 9.0) * 3:
         # mappings are dropped at once, so that a later one may lie at the same address
-        found = expected_series(series_line, request("object", thickness_mm=slab(water)), cache=cache)
-        fresh = expected_series(series_line, request("object", thickness_mm=slab(water)))
+        found = LineModel(series_line, cache=cache).expect(request("object", thickness_mm=slab(water)))
+        fresh = LineModel(series_line).expect(request("object", thickness_mm=slab(water)))
         np.testing.assert_allclose(found.mean_DN, fresh.mean_DN, rtol=1e-12)
 
 
 def test_a_small_cache_forgets_and_projects_again(series_line):
     cache = ModelCache(budget_bytes=1)
     scenes = [slab(1.0), slab(5.0)]
-    first = [expected_series(series_line, request("object", thickness_mm=item), cache=cache) for item in scenes]
-    again = [expected_series(series_line, request("object", thickness_mm=item), cache=cache) for item in scenes]
+    first = [LineModel(series_line, cache=cache).expect(request("object", thickness_mm=item)) for item in scenes]
+    again = [LineModel(series_line, cache=cache).expect(request("object", thickness_mm=item)) for item in scenes]
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.mean_DN, other.mean_DN)
 
@@ -221,8 +223,8 @@ def test_an_opaque_edge_is_as_a_continuous_spread_shows_it(series_line, angle):
     The mean of exp(-mu t) is not exp(-mu mean t): without care a thick plate's edge would stand half a pixel off.
     """
     covered, truth = slanted_edge(angle=angle)
-    flat = expected_series(series_line, request())
-    found = expected_series(series_line, request("object", thickness_mm={"W": 2.0 * covered}))
+    flat = LineModel(series_line).expect(request())
+    found = LineModel(series_line).expect(request("object", thickness_mm={"W": 2.0 * covered}))
     error = (found.signal_DN / flat.signal_DN - truth)[4:-4, 4:-4]
     assert np.abs(error).max() < 0.01
     assert math.sqrt(np.mean(error[np.abs(truth[4:-4, 4:-4] - 0.5) < 0.49] ** 2)) < 0.004
@@ -234,9 +236,9 @@ def test_a_displaced_scene_is_the_scene_drawn_elsewhere(series_line, displacemen
     covered, _ = slanted_edge(angle=angle)
     beyond = displacement[1] * math.cos(angle) + displacement[0] * math.sin(angle)
     _, truth = slanted_edge(angle=angle, offset_px=0.3 + beyond)
-    flat = expected_series(series_line, request())
+    flat = LineModel(series_line).expect(request())
     asked = request("object", thickness_mm={"W": 2.0 * covered}, displacement_px=displacement)
-    error = (expected_series(series_line, asked).signal_DN / flat.signal_DN - truth)[6:-6, 6:-6]
+    error = (LineModel(series_line).expect(asked).signal_DN / flat.signal_DN - truth)[6:-6, 6:-6]
     assert np.abs(error).max() < 0.01
     # a scene without sharp borders, on its pixels
     row, column = np.indices(SHAPE)
@@ -244,8 +246,8 @@ def test_a_displaced_scene_is_the_scene_drawn_elsewhere(series_line, displacemen
     def hill(down, right):
         return {"water_liquid": 20 * np.exp(-((row - 20 - down) ** 2 + (column - 20 - right) ** 2) / 50)}
 
-    moved = expected_series(series_line, request("object", thickness_mm=hill(0, 0), displacement_px=displacement))
-    known = expected_series(series_line, request("object", thickness_mm=hill(*displacement)))
+    moved = LineModel(series_line).expect(request("object", thickness_mm=hill(0, 0), displacement_px=displacement))
+    known = LineModel(series_line).expect(request("object", thickness_mm=hill(*displacement)))
     np.testing.assert_allclose(moved.signal_DN, known.signal_DN, rtol=2e-3)
 
 
@@ -259,11 +261,11 @@ def test_a_scene_of_points_is_moved_without_ringing_beside_its_steps(series_line
     )
     row, column = np.indices(SHAPE)
     step = {"Al": np.where((row > 12) & (column > 14), 6.0, 0.0)}
-    flat = expected_series(points, request()).signal_DN
+    flat = LineModel(points).expect(request()).signal_DN
 
     def drawn(displacement_px):
         asked = request("object", thickness_mm=step, displacement_px=displacement_px)
-        return np.asarray(expected_series(points, asked).signal_DN / flat)
+        return np.asarray(LineModel(points).expect(asked).signal_DN / flat)
 
     still, moved = drawn((0.0, 0.0)), drawn(displacement)
     # an effect that displaces the scene draws it the same way
@@ -273,7 +275,7 @@ def test_a_scene_of_points_is_moved_without_ringing_beside_its_steps(series_line
         parameters={"strength": size, "direction_deg": along, "magnification_deg": 0.0},
         since="always",
     )
-    by_effect = expected_series(points, request("object", thickness_mm=step), effects=(shifted,)).signal_DN / flat
+    by_effect = LineModel(points, effects=(shifted,)).expect(request("object", thickness_mm=step)).signal_DN / flat
     np.testing.assert_allclose(by_effect, moved, rtol=1e-6)
     far = ndimage.distance_transform_edt(~((np.abs(row - 12.5) < 4.5) | (np.abs(column - 14.5) < 4.5))) > 0
     # cosines of the pixels alone would leave half a per cent of the step ten pixels away from it
@@ -351,8 +353,8 @@ def moments(frames, expected):
 
 def test_samples_have_the_expected_mean_variance_and_covariance(series_line):
     asked = request("object", thickness_mm=product(), frames=400)
-    expected = expected_series(series_line, asked)
-    frames = np.stack(list(sample_series(series_line, asked, rng=np.random.default_rng(5)))).astype(np.float64)
+    expected = LineModel(series_line).expect(asked)
+    frames = np.stack(list(LineModel(series_line).sample(asked, rng=np.random.default_rng(5)))).astype(np.float64)
     z, ratio, spread = moments(frames, expected)
     # 1600 pixels of which about one in four is independent of its neighbours
     independent = z.size / 4
@@ -377,8 +379,8 @@ def test_few_photons_are_counted_not_gaussian(series_line):
         noise=replace(series_line.noise, quantised=False, white_fraction=0.0),
         maps=replace(series_line.maps, read_variance_DN2=np.zeros(SHAPE, np.float32)),
     )
-    expected = expected_series(quiet, asked)
-    frames = np.stack(list(sample_series(quiet, asked, rng=np.random.default_rng(2))))
+    expected = LineModel(quiet).expect(asked)
+    frames = np.stack(list(LineModel(quiet).sample(asked, rng=np.random.default_rng(2))))
     residual = (frames - expected.mean_DN) / np.sqrt(expected.quantum_variance_DN2)
     skewness = float((residual**3).mean())
     assert skewness > 0.5
@@ -389,7 +391,7 @@ def test_the_same_seed_gives_the_same_frames_and_another_seed_others(series_line
     asked = request("object", thickness_mm=product(), frames=2)
 
     def frames(seed):
-        return np.stack(list(sample_series(series_line, asked, rng=np.random.default_rng(seed))))
+        return np.stack(list(LineModel(series_line).sample(asked, rng=np.random.default_rng(seed))))
 
     np.testing.assert_array_equal(frames(1), frames(1))
     assert np.any(frames(1) != frames(2))
@@ -397,7 +399,7 @@ def test_the_same_seed_gives_the_same_frames_and_another_seed_others(series_line
 
 def test_samples_are_whole_numbers_within_the_adc(series_line):
     asked = request(setting="kv=90,power_w=45,exposure_ms=400,filter=Cu:0.05", frames=1)
-    (frame,) = sample_series(series_line, asked, rng=np.random.default_rng(0))
+    (frame,) = LineModel(series_line).sample(asked, rng=np.random.default_rng(0))
     assert frame.max() == 65535
     assert np.array_equal(frame, np.rint(frame))
 
@@ -407,12 +409,12 @@ def test_memory_is_handed_from_series_to_series(series_line):
     memory = LineMemory()
     rng = np.random.default_rng(3)
     exposed = request(frames=60)
-    list(sample_series(series_line, exposed, rng=rng, effects=lag, memory=memory))
+    list(LineModel(series_line, effects=lag).sample(exposed, rng=rng, memory=memory))
     assert memory.time_s == pytest.approx(60 * 0.022)
     assert memory.trapped_DN.shape == (4, *SHAPE)
     after = request("afterglow", setting=None, frames=20, start_s=60 * 0.022, previous=(exposed,))
-    seen = np.stack(list(sample_series(series_line, after, rng=rng, effects=lag, memory=memory)))
-    expected = expected_series(series_line, after, effects=lag)
+    seen = np.stack(list(LineModel(series_line, effects=lag).sample(after, rng=rng, memory=memory)))
+    expected = LineModel(series_line, effects=lag).expect(after)
     assert expected.signal_DN.mean() > 50
     assert abs((seen - expected.mean_DN).mean()) < 4 * 12.0 / math.sqrt(seen.size) + 1e-3 * expected.signal_DN.mean()
 
@@ -428,7 +430,7 @@ def test_traps_empty_in_pauses_that_are_stated_and_else_for_as_long_as_the_law_s
         lag = AppliedEffect(
             id="image_lag", parameters={"strength": 5.0, "release_s": 1.0, "spread": 1.0, "idle_s": idle_s}
         )
-        return float(expected_series(series_line, after, effects=(lag,)).signal_DN.mean())
+        return float(LineModel(series_line, effects=(lag,)).expect(after).signal_DN.mean())
 
     assert left(2.0) > 1.0
     assert left(3.0) / left(2.0) == pytest.approx(1.0 if pause_stated else math.exp(-1.0), rel=1e-9)
@@ -469,10 +471,10 @@ def test_a_twin_file_with_unreadable_effects_is_refused(series_line, tmp_path, t
 
 def test_effects_of_the_twin_act_unless_others_are_given(series_line):
     noisy = replace(series_line, effects=(AppliedEffect(id="excess_noise", parameters={"strength": 50.0}),))
-    base = expected_series(series_line, request())
-    own = expected_series(noisy, request())
+    base = LineModel(series_line).expect(request())
+    own = LineModel(noisy).expect(request())
     np.testing.assert_allclose(own.quantum_variance_DN2, 1.5 * base.quantum_variance_DN2)
-    none = expected_series(noisy, request(), effects=())
+    none = LineModel(noisy, effects=()).expect(request())
     np.testing.assert_allclose(none.quantum_variance_DN2, base.quantum_variance_DN2)
 
 
@@ -506,17 +508,17 @@ def test_a_request_that_makes_no_sense_is_refused(changes, message):
 )
 def test_a_series_that_cannot_be_expected_says_why(series_line, changes, message):
     with pytest.raises(InputError, match=message):
-        expected_series(series_line, request("object", **changes))
+        LineModel(series_line).expect(request("object", **changes))
 
 
 def test_a_scene_needs_a_spectrum(series_line):
     with pytest.raises(InputError, match="twin without spectral part"):
-        expected_series(replace(series_line, spectral=None), request("object", thickness_mm=slab()))
+        LineModel(replace(series_line, spectral=None)).expect(request("object", thickness_mm=slab()))
 
 
 def test_parameters_of_another_model_are_refused(series_line):
     with pytest.raises(InputError, match="spectral parameters"):
-        expected_series(series_line, request(), parameters=np.zeros(2))
+        LineModel(series_line, parameters=np.zeros(2)).expect(request())
 
 
 # ------------------------------------------------------------------------------------------------ any detector
@@ -548,9 +550,9 @@ def test_detectors_of_any_shape_take_any_effect(series_line, shape):
     cache = ModelCache()
     for name in EFFECTS:
         effects = (AppliedEffect(id=name, parameters={}, since="calibration"),)
-        found = expected_series(line, asked, effects=effects, cache=cache)
+        found = LineModel(line, effects=effects, cache=cache).expect(asked)
         assert found.mean_DN.shape == shape and np.isfinite(found.mean_DN).all(), name
-        for frame in sample_series(line, asked, rng=np.random.default_rng(0), effects=effects, cache=cache):
+        for frame in LineModel(line, effects=effects, cache=cache).sample(asked, rng=np.random.default_rng(0)):
             assert frame.shape == shape and np.isfinite(frame).all(), name
 
 
@@ -575,8 +577,8 @@ def test_a_series_is_the_same_whatever_was_asked_of_the_cache_before(series_line
     cache = ModelCache()
     asked = [longer, request("object", thickness_mm=scene, displacement_px=(0.3, -0.2)), request(), longer]
     for item in asked:
-        kept = expected_series(series_line, item, effects=effects, cache=cache)
-        fresh = expected_series(series_line, item, effects=effects)
+        kept = LineModel(series_line, effects=effects, cache=cache).expect(item)
+        fresh = LineModel(series_line, effects=effects).expect(item)
         np.testing.assert_allclose(kept.mean_DN, fresh.mean_DN, rtol=1e-12)
         np.testing.assert_allclose(kept.quantum_variance_DN2, fresh.quantum_variance_DN2, rtol=1e-12)
         np.testing.assert_allclose(kept.white_variance_DN2, fresh.white_variance_DN2, rtol=1e-12)
@@ -586,8 +588,8 @@ def test_light_goes_as_the_load_of_the_tube(series_line):
     scene = product()
     effects = (AppliedEffect(id="object_scatter", parameters={"strength": 10.0}, since="calibration"),)
     weak, strong = (
-        expected_series(
-            series_line, request("object", MEASURED.replace("=20", f"={ms}"), thickness_mm=scene), effects=effects
+        LineModel(series_line, effects=effects).expect(
+            request("object", MEASURED.replace("=20", f"={ms}"), thickness_mm=scene)
         )
         for ms in (20, 50)
     )

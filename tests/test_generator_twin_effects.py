@@ -13,8 +13,9 @@ from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.files import sha256_of_file
 from raytwin.generator.effects import EFFECTS, AppliedEffect
+from raytwin.generator.frames.line_model import LineModel
 from raytwin.generator.frames.present_line import present_line
-from raytwin.generator.frames.series import SeriesRequest, expected_series, sample_series
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.predictions.predict import predict_flatfield
 from raytwin.generator.predictions.predict_many import predict_levels
 from raytwin.generator.twins.twin_io import read_twin, write_twin
@@ -85,8 +86,8 @@ def test_a_prediction_with_any_effect_is_what_the_series_model_expects_of_a_long
     interval = asked.interval_s(twin.instrument.readout_ms)
     exposed = math.ceil(3600.0 / interval)
     asked = replace(asked, start_s=exposed * interval, previous=(replace(asked, frames=exposed),))
-    with_it = expected_series(twin, asked, effects=(applied,))
-    without = expected_series(twin, asked, effects=())
+    with_it = LineModel(twin, effects=(applied,)).expect(asked)
+    without = LineModel(twin, effects=()).expect(asked)
 
     def noise(flat):
         common = flat.row_variance_DN2 + flat.column_variance_DN2
@@ -194,11 +195,11 @@ def session_with(path, twin, effects, settings):
     with write_acquisition(path, twin.instrument) as writer:
         for exposure_ms in sorted({one.exposure_ms for one in settings}):
             dark = SeriesRequest(kind="dark", setting=None, frames=30, exposure_ms=exposure_ms)
-            frames = np.stack(list(sample_series(twin, dark, rng=rng, effects=())))
+            frames = np.stack(list(LineModel(twin, effects=()).sample(dark, rng=rng)))
             writer.add_series(f"dark_{exposure_ms:g}", kind="dark", exposure_ms=exposure_ms, frames=frames)
         for setting in settings:
             flat = SeriesRequest(kind="flat", setting=setting, frames=30, exposure_ms=setting.exposure_ms)
-            frames = np.stack(list(sample_series(twin, flat, rng=rng, effects=effects)))
+            frames = np.stack(list(LineModel(twin, effects=effects).sample(flat, rng=rng)))
             writer.add_series(f"flat_{setting.kV:g}", kind="flat", setting=setting, frames=frames)
     return path
 

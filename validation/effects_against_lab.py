@@ -30,14 +30,10 @@ from raytwin.acquisition import open_acquisition
 from raytwin.calibration.calibrate import calibrate_twin
 from raytwin.diagnosis.session.session import read_session
 from raytwin.generator.effects import EFFECTS, AppliedEffect
-from raytwin.generator.frames.series import (
-    ExpectedSeries,
-    ModelCache,
-    SeriesRequest,
-    expected_series,
-    session_conditions,
-    with_conditions,
-)
+from raytwin.generator.frames.conditions import session_conditions, with_conditions
+from raytwin.generator.frames.line_model import ExpectedSeries, LineModel
+from raytwin.generator.frames.model_cache import ModelCache
+from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.line.twin import Estimate, Twin
 from raytwin.lab import EffectRequest, run_protocol
 
@@ -196,7 +192,7 @@ def fit_effect(name: str, measured: list[Measured], twin: Twin) -> dict[str, Any
         parts = [
             residuals(
                 item,
-                expected_series(changed, item.request, effects=effects, parameters=parameters, cache=cache),
+                LineModel(changed, effects=effects, parameters=parameters, cache=cache).expect(item.request),
                 good,
             )
             for item in measured

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from ...acquisition.acquisition_io import open_acquisition, write_acquisition
 from ...acquisition.setting import Filter, Setting, text_from_filters
 from ...errors import InputError, RaytwinError
-from ...generator.frames.series import SeriesRequest, expected_series, sample_series, with_conditions
+from ...generator.frames.conditions import with_conditions
+from ...generator.frames.line_model import LineModel
+from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
 from ..inference.nuisances import Nuisances
 from ..inference.whitening import Whitening
@@ -176,7 +178,7 @@ def _as_bright(setting: Setting, as_: Setting, twin: Twin) -> Setting | None:
 
     def level(one: Setting) -> float:
         request = SeriesRequest(kind="flat", setting=one, frames=1, exposure_ms=one.exposure_ms)
-        return float(np.mean(expected_series(twin, request, use_measured_level=False).signal_DN))
+        return float(np.mean(LineModel(twin, use_measured_level=False).expect(request).signal_DN))
 
     try:
         found = _scaled(setting, level(as_) / max(level(setting), 1e-9))
@@ -396,7 +398,7 @@ def _write(
                     setting=request.setting,
                     exposure_ms=None if request.setting is not None else item.exposure_ms,
                     dtype=np.float32,
-                    frames=np.stack(list(sample_series(twin, request, rng=rng, use_measured_level=False))),
+                    frames=np.stack(list(LineModel(twin, use_measured_level=False).sample(request, rng=rng))),
                     scene=item.scene,
                     source_object_mm=item.source_object_mm,
                     panel_rotation_deg=item.panel_rotation_deg or None,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
-from ...generator.frames.series import with_conditions
+from ...generator.frames.conditions import with_conditions
 from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL
 from ..inference.inference import Hypothesis

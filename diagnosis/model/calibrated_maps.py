@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import LEAST_PIXELS, Twin
 from ..probes.fixed_pattern import smooth_part
 from ..session.even_maps import full_size, mean_over

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
 from ..probes.lasting import lasting_pixels
 from ..session.even_maps import near_steps, signal_map

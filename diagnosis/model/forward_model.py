@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.effects.effect import Displacement, Placement
-from ...generator.frames.series import ExpectedSeries, ModelCache, SeriesRequest, expected_series, with_conditions
+from ...generator.frames.conditions import with_conditions
+from ...generator.frames.line_model import ExpectedSeries, LineModel
+from ...generator.frames.model_cache import ModelCache
+from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
 from ..probes.registration import SHARP_PX
 from ..session.session import SessionSeries
 from .changes import OF_BEAMS_GROWS, TwinChange, Variant, departures_found
 
-_CACHE_BYTES = 200_000_000
+_CACHE_BYTES = 400_000_000
 _IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
 _IN_MAPS_OF_BEAMS = "maps of beams"  # the twin's own maps hold what was always there of these
 _OBJECTS_ALONE = ("object",)
@@ -200,14 +203,9 @@ class ForwardModel:
             acting = (item for item in effects if item.since == "always" or request.after_calibration)
             effects = tuple(replace(item, since="calibration") if item.id in in_maps else item for item in acting)
             request = replace(request, after_calibration=True)
-        return expected_series(
-            change.twin,
-            request,
-            effects=effects,
-            parameters=change.parameters,
-            cache=self.cache,
-            use_measured_level=False,
-        )
+        return LineModel(
+            change.twin, effects=effects, parameters=change.parameters, cache=self.cache, use_measured_level=False
+        ).expect(request)
 
 
 def strength_rows(variants: Sequence[Variant]) -> list[range]:

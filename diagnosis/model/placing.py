@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries, SeriesRequest
+from ...generator.frames.line_model import ExpectedSeries
+from ...generator.line.series_request import SeriesRequest
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
 from ..probes.registration import LARGEST_PX, Placement, left_over, register, register_drawn
 from ..session.even_maps import full_size, signal_map

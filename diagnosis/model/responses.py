@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ..probes.fixed_pattern import lines_of, pattern_noise
 from ..probes.line_scalars import bent_share
 from ..probes.model_scalars import expected_scalars

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern
 from ..session.even_maps import mean_over
 from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2

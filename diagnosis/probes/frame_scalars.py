@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import EACH_LINE, LineFlicker, between_lines
 from .scalar_context import ScalarContext
 

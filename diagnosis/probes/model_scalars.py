@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .fixed_pattern import NO_PATTERN, shares_of_pixels, shares_of_tiles

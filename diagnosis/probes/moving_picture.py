@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import LEAST_NOISE_DN2, PIECE_FRAMES
 from ._moving_loops import own_parts, sums_of_lines, sums_of_products
 from .scalar_context import ScalarContext

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 
 
 def autocovariance(expected: ExpectedSeries, dr: int, dc: int) -> float:

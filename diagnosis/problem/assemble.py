@@ -12,7 +12,8 @@ from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import light_of_shares
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
-from ...generator.frames.series import beam_conditions, expected_series, session_conditions, with_conditions
+from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
+from ...generator.frames.line_model import LineModel
 from ...generator.line.twin import Twin
 from ..checks.preparation import PreparedSession
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
@@ -560,16 +561,11 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     They take the place of the same ones that the base has.
     """
     shape = problem.base.maps.shape
-    cache = draft_cache()
+    effects = with_found(problem.base.effects, effects)
+    line = LineModel(problem.base, effects=effects, use_measured_level=False, cache=draft_cache())
     moved: dict[str, NDArray[np.float64]] = {}
     for view in problem.views:
-        changed = expected_series(
-            problem.base,
-            view.session.request,
-            effects=with_found(problem.base.effects, effects),
-            cache=cache,
-            use_measured_level=False,
-        )
+        changed = line.expect(view.session.request)
         moved[view.session.name] = np.asarray(changed.mean_DN) - np.asarray(view.expected.mean_DN)
 
     def lit(view: SeriesView) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ..model.changes import LINE_NOISE_LIMIT
 from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import SeriesRequest
+from ...generator.line.series_request import SeriesRequest
 
 _MOMENTS = 8  # of a series, that stand for its exposures against another's
 

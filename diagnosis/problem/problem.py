@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
 from ..inference.observed import Point
 from ..inference.seen import Blocks, Responder

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 
 _STEP_SHARE = 0.12  # of the brighter side, over five pixels: more is a step
 

@@ -10,7 +10,7 @@ from ...acquisition.acquisition_io import AcquisitionFile, Series
 from ...acquisition.log_images import holds_shares
 from ...calibration.repeated_frames import Beam, beam_of
 from ...errors import InputError
-from ...generator.frames.series import SeriesRequest
+from ...generator.line.series_request import SeriesRequest
 
 _REMEMBERED = 12  # series before one's own whose trapped charge may still be there
 _GAP_S = 1.0  # between series whose times are not stated

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile
 from ...errors import InputError
-from ...generator.frames.series import ExpectedSeries
+from ...generator.frames.line_model import ExpectedSeries
 from .even_maps import full_size, signal_map
 from .session import SessionSeries
 from .summaries import LEAST_NOISE_DN2, FirstLook, SeriesSummary, look_at_series, summarise_series

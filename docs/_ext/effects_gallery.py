@@ -58,7 +58,7 @@ def example_line() -> Any:
 def example_series(shape: tuple[int, int]) -> dict[str, Any]:
     """Series in which an effect may show, in words -> request."""
     from raytwin.acquisition.setting import setting_from_text
-    from raytwin.generator.frames.series import SeriesRequest
+    from raytwin.generator.line.series_request import SeriesRequest
 
     common = {"frames": FRAMES, "frame_interval_ms": 60.0, "start_s": 540.0, "index": 9}
     settings = {
@@ -109,19 +109,19 @@ def applied(effect: Any) -> Any:
 
 def sampled(twin: Any, request: Any, effects: tuple[Any, ...]) -> np.ndarray:
     """Frames (frame, row, column), DN; the same random numbers with and without effects."""
-    from raytwin.generator.frames.series import sample_series
+    from raytwin.generator.frames.line_model import LineModel
 
-    frames = sample_series(twin, request, rng=np.random.default_rng(7), effects=effects)
+    frames = LineModel(twin, effects=effects).sample(request, rng=np.random.default_rng(7))
     return np.stack(list(frames)).astype(float)
 
 
 def without_effects(twin: Any, series: dict[str, Any]) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Frames, expected mean and standard deviation of a pixel of each series of the line without effects."""
-    from raytwin.generator.frames.series import expected_series
+    from raytwin.generator.frames.line_model import LineModel
 
     found = {}
     for words, request in series.items():
-        usual = expected_series(twin, request, effects=())
+        usual = LineModel(twin, effects=()).expect(request)
         sd = np.sqrt(usual.quantum_variance_DN2 + usual.white_variance_DN2) * np.ones(usual.mean_DN.shape)
         found[words] = (sampled(twin, request, ()), usual.mean_DN, sd)
     return found

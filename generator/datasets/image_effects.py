@@ -17,10 +17,11 @@ from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
-from ..frames._spread import NoisePattern, blurred_object, noise_pattern, optical_transfer, spread_maps
-from ..frames.defects import Jumping, gain_pattern, new_bad_pixels, sample_flicker, sample_offsets, tile_gain
+from ..frames._spread import NoisePattern, noise_pattern, optical_transfer
 from ..frames.flat_change import has_always_bent, is_in_noise
-from ..frames.response import counting_noise, light_of, responded
+from ..frames.light import Charge, charge_of, of_quanta
+from ..frames.response import light_of, responded
+from ..frames.stages import Chain, Clock, Exposure, LineMemory, Panel, Quanta, TubeOutput, chain_of
 from ..kernels.projection import project_polychromatic
 from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
 from ..line.series_request import SeriesRequest
@@ -30,26 +31,18 @@ from ..line.twin_spectrum import spectral_model_of
 from ..spread._fine_picture import FineCells, pixel_means
 
 _PICTURE = ("arrivals", "object_blur", "optics")
-_HOT_SIGMAS = 20.0  # of the read noise, as in series of frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AffectedImage:
     """One channel of a scene on its way through a line with effects, without noise.
 
-    Fields: state after all stages; charge_DN (row, column): mean of one exposure above dark, before the response; scale,
-    white_DN: factors of the quantum noise and sd of what is white in it; before_DN, quantum_DN: mean before the spread
-    under even illumination, and the worth of a quantum; pattern: correlation of the noise; log_image: -ln of the mean over
-    the open field's.
+    Fields: state after all stages; charge of one exposure above dark, before the response; log_image: -ln of the mean over the open
+    field's.
     """
 
     state: LineState
-    charge_DN: FloatArray = field(repr=False)
-    scale: FloatArray = field(repr=False)
-    white_DN: FloatArray = field(repr=False)
-    before_DN: FloatArray = field(repr=False)
-    quantum_DN: FloatArray = field(repr=False)
-    pattern: NoisePattern = field(repr=False)
+    charge: Charge = field(repr=False)
     log_image: FloatArray = field(repr=False)
 
 
@@ -106,11 +99,7 @@ class ImageEffects:
         self.gain_factor = noise_pattern(base, self._open_state()).share / left
         self.read_variance_DN2 = self._without_absorbed(self.read_variance_DN2, spread)
         # light spreads over the borders of what stands in the beam
-        blurred, _ = spread_maps(
-            open_beam.signal_DN, open_beam.variance_DN2, state=open_beam, pattern=self.pattern, spread=base
-        )
-        lit = self.open_charge_DN * (blurred / self.open_level_DN) * open_beam.flat_factor
-        self.flat_DN = responded(open_beam, lit)
+        self.flat_DN = responded(open_beam, self._charge(open_beam).mean)
 
     def _usable(self) -> tuple[tuple[AppliedEffect, ...], tuple[str, ...]]:
         usable, told = [], []
@@ -154,6 +143,7 @@ class ImageEffects:
             parameters=None if self.twin.spectral is None else self.twin.spectral.best,
             signal_DN=level * one,
             variance_DN2=level * self.gain_DN * one,
+            secondary_DN=self.secondary_DN,
             flat_factor=one,
             step_DN=1.0 if self.twin.noise.quantised else 0.0,
         )
@@ -250,52 +240,25 @@ class ImageEffects:
         state = self._through(state, later, thickness_mm)
         if focal_blur_px > 0 and not any(effect_of(item).images.spot for item in self.effects):
             state = replace(state, object_transfers=(*state.object_transfers, _gaussian(focal_blur_px)))
-        return self._image_of(state)
+        charge = self._charge(state)
+        ratio = np.maximum(responded(state, charge.mean), 1e-30) / np.maximum(self.flat_DN, 1e-30)
+        return AffectedImage(state=state, charge=charge, log_image=-np.log(ratio))
 
-    def _image_of(self, state: LineState) -> AffectedImage:
-        noise = self.twin.noise
-        # secondary quanta follow the signal, whatever the spectrum
-        white = np.minimum(self.secondary_DN * np.maximum(state.signal_DN, 0.0), 0.9 * state.variance_DN2)
-        state = replace(state, variance_DN2=self.gain_factor * (state.variance_DN2 - white))
-        picture, _ = spread_maps(
-            state.signal_DN,
-            state.variance_DN2,
-            state=state,
+    def _charge(self, state: LineState) -> Charge:
+        return charge_of(
+            of_quanta(state, self.gain_factor),
+            shape=self.open_charge_DN / self.open_level_DN,
+            relative=np.maximum(self.twin.maps.gain_relative, 0.0),
             pattern=self.pattern,
-            spread=noise.spread.value,
-        )
-        lit = self.open_charge_DN / self.open_level_DN * state.flat_factor
-        charge = lit * picture
-        scale = lit * self.twin.maps.gain_relative * counting_noise(state, charge)
-        before, variance = blurred_object(state)
-        # a quantum's worth, so that their number is Poisson; floors where an opaque object lets nothing through
-        before = np.maximum(before, 1e-300)
-        quantum = variance / before
-        mean = responded(state, charge)
-        return AffectedImage(
-            state=state,
-            charge_DN=charge,
-            scale=np.sqrt(np.maximum(scale, 0.0)),
-            white_DN=np.sqrt(np.maximum(scale * self.secondary_DN * picture, 0.0)),
-            before_DN=before,
-            quantum_DN=np.maximum(quantum, 1e-9 * float(np.max(quantum)) + 1e-300),
-            pattern=self.pattern,
-            log_image=-np.log(np.maximum(mean, 1e-30) / np.maximum(self.flat_DN, 1e-30)),
+            spread=self.twin.noise.spread.value,
         )
 
     def sample(self, image: AffectedImage, rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (row, column) of one frame, or of the mean of the setting's averaged frames, DN."""
-        shape = self.twin.maps.shape
-        rounding = 1.0 / 12.0 if self.twin.noise.quantised else 0.0
-        electronic = np.sqrt(np.maximum(np.asarray(self.read_variance_DN2, dtype=np.float64) - rounding, 0.0))
-        total = np.zeros(shape)
-        for _ in range(self.setting.averaged):
-            noise = image.scale * image.pattern.sample(image.before_DN, image.quantum_DN, shape, rng)
-            noise += image.white_DN * rng.standard_normal(shape)
-            factor = self._output_factor(1, rng)
-            charge = factor * image.charge_DN + math.sqrt(factor) * noise
-            total += self._counts(charge, electronic * rng.standard_normal(shape), averaged=1, rng=rng)
-        return (total / self.setting.averaged).astype(np.float32)
+        chain = self._chain(self.setting.averaged)
+        state = of_quanta(image.state, self.gain_factor)
+        quanta = Quanta(state, image.charge, TubeOutput(state, LineMemory()), chain.shape)
+        return chain.sample(quanta, 0, rng)
 
     # ------------------------------------------------------------------------------------------ reference images
 
@@ -348,53 +311,27 @@ class ImageEffects:
     def read_out(self, charge_DN: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.float32]:
         """Counts with dark (row, column) of charge that has all its noise but that of rows, columns and output, DN."""
         averaged = self.setting.averaged
-        charge = self._output_factor(averaged, rng) * np.asarray(charge_DN, dtype=np.float64)
-        return self._counts(charge, 0.0, averaged=averaged, rng=rng).astype(np.float32)
+        chain = self._chain(1, mean_of=averaged, noisy=False)
+        output = TubeOutput(self._end, LineMemory()).sample_mean(chain.clock.interval_s, averaged, rng)
+        charge = output * np.asarray(charge_DN, dtype=np.float64)
+        return chain.read(charge, Exposure(0, 0.0, rng)).astype(np.float32)
 
-    # ------------------------------------------------------------------------------------------ response and readout
+    # ------------------------------------------------------------------------------------------ readout
 
-    def _output_factor(self, averaged: int, rng: np.random.Generator) -> float:
-        state = self._end
-        if state.output_rms <= 0:
-            return 1.0
-        interval_s = (self.setting.exposure_ms + (self.twin.instrument.readout_ms or 0.0)) / 1000.0
-        lag = np.arange(1, averaged)
-        rho = np.exp(-lag * interval_s / max(state.output_correlation_s, 1e-12))
-        wandering = 1.0 - state.output_jitter_share
-        share = float((1.0 + 2.0 * wandering * np.sum((1.0 - lag / averaged) * rho)) / averaged)
-        return max(1.0 + math.sqrt(share) * state.output_rms * float(rng.standard_normal()), 0.0)
-
-    def _counts(
-        self, charge: FloatArray, electronic: FloatArray | float, *, averaged: int, rng: np.random.Generator
-    ) -> FloatArray:
-        state, shape = self._end, self.twin.maps.shape
-        value = charge
-        if state.flicker is not None:
-            flicker = replace(state.flicker, rms=state.flicker.rms / math.sqrt(averaged))
-            value = value * sample_flicker(flicker, shape, rng)
-        if state.gain_pattern is not None:
-            value = value * gain_pattern(state.gain_pattern, shape)
-        if state.tile_pattern is not None:
-            value = value * tile_gain(state.tile_pattern, shape)
-        value = responded(state, value)
-        bad = new_bad_pixels(state, shape)
-        if bad is not None:
-            value = np.where(bad.dead, 0.0, value)
-        value = value + self.dark_DN + electronic
-        value = value + sample_offsets(state, shape, rng) / math.sqrt(averaged)
-        read_DN = np.sqrt(np.asarray(self.read_variance_DN2, dtype=np.float64))
-        if state.telegraph is not None:
-            jumping = Jumping(state.telegraph, shape, rng)
-            for _ in range(averaged):
-                value = jumping.added_to(value, read_DN / averaged, rng)
-        if bad is not None:
-            value = np.where(bad.hot, value + _HOT_SIGMAS * (read_DN + 1.0), value)
-        if state.step_DN > 0:
-            step = state.step_DN / averaged
-            value = np.rint(value / step) * step
-        bits = self.twin.instrument.bits
-        highest = math.inf if bits is None else 2.0**bits - 1.0
-        return np.asarray(np.clip(value, 0.0 if self.twin.noise.quantised else -math.inf, highest))
+    def _chain(self, averaged: int, *, mean_of: int = 1, noisy: bool = True) -> Chain:
+        """Stages of the readout; mean_of, noisy: as in `chain_of`."""
+        twin = self.twin
+        rounding = 1.0 / 12.0 if twin.noise.quantised else 0.0
+        panel = Panel(
+            shape=twin.maps.shape,
+            dark_DN=np.asarray(self.dark_DN, dtype=np.float64),
+            read_DN2=np.maximum(np.asarray(self.read_variance_DN2, dtype=np.float64) - rounding, 0.0),
+            bits=twin.instrument.bits,
+            from_zero=twin.noise.quantised,
+        )
+        interval_s = (self.setting.exposure_ms + (twin.instrument.readout_ms or 0.0)) / 1000.0
+        clock = Clock(start_s=0.0, interval_s=interval_s, frames=1, averaged=averaged)
+        return chain_of(self._end, panel, clock, mean_of=mean_of, noisy=noisy)
 
 
 def _gaussian(sigma_px: float) -> Transfer:

@@ -1,6 +1,6 @@
 """Blur and noise correlation of one series: transfer functions on cosine transforms, whose borders mirror."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -12,6 +12,8 @@ from ..line.line_state import FloatArray, LineState
 from ..spread._fine_picture import averaging, cosines_at_pixels, fine_frequencies, kept_cosines, sampled_picture
 from ..spread.psf import Spread, base_transfer_1d, convolve_separable, whole_spectrum
 from ._distortion import distorted
+
+Kept = Callable[[object, Callable[[], Any]], Any]  # (name, make) -> what is made once under the name
 
 _GRID = 64  # cells of the noise power spectrum per axis
 _REACH = 14  # of the noise kernel where effects change it, px
@@ -167,13 +169,13 @@ def spread_maps(
     pattern: NoisePattern,
     spread: Spread,
     draft: bool = False,
-    known: dict[object, Any] | None = None,
+    kept: Kept | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Picture after all blur (DN), and quantum variance after blur of the object and spread of the quanta (DN^2).
 
     draft: a third of the work for pictures that are compared with each other: the variance is not blurred (it is right
-    away from edges), and cosines that the spread leaves below 1e-3 are left out. known: transfer functions of earlier
-    calls with the same blur and spread.
+    away from edges), and cosines that the spread leaves below 1e-3 are left out. kept: keeps transfer functions for calls
+    with the same blur and spread.
     """
     if signal_DN.shape == (1, 1):
         return signal_DN, pattern.share * variance_DN2
@@ -185,7 +187,7 @@ def spread_maps(
     narrowest = (
         0.0 if state.tails or spread.tail_share > 0 else spread.sigma_px * min(spread.aspect, 1 / spread.aspect) ** 0.5
     )
-    kept = [kept_cosines(length, narrowest, 1e-3 if draft else 1e-5) for length in shape]
+    cosines = [kept_cosines(length, narrowest, 1e-3 if draft else 1e-5) for length in shape]
     rest = signal_DN if fine is None else None if signal_DN is fine.signal_DN else signal_DN - fine.signal_DN
     blurred: NDArray[np.floating] = np.zeros(shape)
     if spread.separable and not (state.object_transfers or state.tails or state.optical_transfers):
@@ -198,29 +200,28 @@ def spread_maps(
             return np.asarray(rows @ picture @ columns.T)
 
         if fine is not None:
-            key = (spread, state.shift_px, *kept)
+            key = (spread, state.shift_px, *cosines)
             if key not in fine.fine.drawn:
-                fine.fine.drawn[key] = drawn(fine.fine.cells, kept)
+                fine.fine.drawn[key] = drawn(fine.fine.cells, cosines)
             blurred = fine.scale * fine.fine.drawn[key]
         if rest is not None:
             blurred = blurred + drawn(rest, shape)
     else:
-        transfers: dict[object, Any] = {} if known is None else known
 
         def transfer(counts: Sequence[int]) -> FloatArray:
-            key = (shape, *counts)
-            if key not in transfers:
+            def made() -> FloatArray:
                 frequency = [fine_frequencies(length)[:count] for length, count in zip(shape, counts, strict=True)]
                 f_row, f_column = frequency[0][:, None], frequency[1][None, :]
                 whole = optical_transfer(state, spread, f_row, f_column)
                 blur = _object_transfer(state, f_row, f_column)
-                transfers[key] = whole if blur is None else whole * blur
-            return np.asarray(transfers[key])
+                return whole if blur is None else whole * blur
+
+            return np.asarray(made() if kept is None else kept((shape, *counts), made))
 
         pictures: list[tuple[NDArray[np.floating], FloatArray]] = []
         if fine is not None:
-            sharp = fine.scale * fine.fine.transform[: kept[0], : kept[1]]
-            pictures.append((sharp, transfer(kept)))
+            sharp = fine.scale * fine.fine.transform[: cosines[0], : cosines[1]]
+            pictures.append((sharp, transfer(cosines)))
         if rest is not None:
             pictures.append((dctn(rest, type=2), transfer(shape)))
         blurred = sampled_picture(pictures, shape, state.shift_px)

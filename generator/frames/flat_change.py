@@ -16,7 +16,8 @@ from ...errors import InputError
 from ..effects import AppliedEffect, effect_of
 from ..line.series_request import SeriesRequest
 from ..line.twin import Twin
-from .series import ExpectedSeries, ModelCache, expected_series
+from .line_model import ExpectedSeries, LineModel
+from .model_cache import ModelCache
 
 _STEADY_S = 3600.0  # of beam before the frames that are predicted
 
@@ -131,7 +132,7 @@ def _flat(twin: Twin, effects: Sequence[AppliedEffect], setting: Setting, cache:
     one_s = asked.interval_s(twin.instrument.readout_ms) * asked.exposures_per_frame
     frames = math.ceil(_STEADY_S / one_s)
     steady = replace(asked, start_s=frames * one_s, previous=(replace(asked, frames=frames),))
-    return expected_series(twin, steady, effects=effects, cache=cache)
+    return LineModel(twin, effects=effects, cache=cache).expect(steady)
 
 
 def _level(flat: ExpectedSeries) -> float:

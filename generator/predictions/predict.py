@@ -257,7 +257,7 @@ def predict_flatfield(twin: Twin, setting: Setting, *, after_calibration: bool =
     With binning, mean, noise and photons are those of a binned pixel, gain and slope remain those of one pixel.
 
     The twin's effects are in it: those on beam and noise in its numbers (`present_line`), others by what they change in
-    `expected_series`, long after the beam was switched on. Intervals hold what is not known of their strengths and laws
+    `LineModel`'s flat, long after the beam was switched on. Intervals hold what is not known of their strengths and laws
     (`AppliedEffect.sd`), as a share of what each changes.
 
     Args:

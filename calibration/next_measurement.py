@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acquisition.setting import Filter, Setting, filters_from_text, text_from_filters
+from ..generator.line.measured_flats import measured_flats
 from ..generator.line.spectral_signal import OpenBeam
 from ..generator.line.twin import Estimate, Twin
 from ..generator.predictions.predict import spectral_model_of
@@ -250,16 +251,15 @@ def _exposed(twin: Twin, kV: float, filters: tuple[Filter, ...], rate_DN_per_mAs
         kV, filters: the beam.
         rate_DN_per_mAs: of the beam, at 1 m and on 1 mm2.
     """
-    points = [
-        point for point in twin.evidence.get("photon_transfer", ()) if point.get("used") and point.get("load_mAs")
+    flats = [
+        (flat.signal_DN, flat.exposure_ms, 1000.0 * flat.load_mAs / flat.exposure_ms * flat.kV)
+        for flat in measured_flats(twin)
+        if flat.load_mAs and flat.exposure_ms and flat.kV
     ]
-    if not points:
+    if not flats:
         return None
-    signals = [float(point["signal_DN"]) for point in points]
-    exposures = [float(point["exposure_ms"]) for point in points]
-    power_W = max(
-        1000.0 * float(point["load_mAs"]) / float(point["exposure_ms"]) * float(point["kV"]) for point in points
-    )
+    signals, exposures, powers = (list(column) for column in zip(*flats, strict=True))
+    power_W = max(powers)
     if twin.instrument.maximum_power_w is not None:
         power_W = min(power_W, twin.instrument.maximum_power_w)
     distance = twin.instrument.source_detector_mm or 1000.0

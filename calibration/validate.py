@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..files import sha256_of_file
 from ..generator.effects import effect_of
 from ..generator.frames.present_line import present_line
+from ..generator.line.measured_flats import measured_flats
 from ..generator.line.twin import Estimate, Twin
 from ..generator.predictions.predict import predict_flatfield
 from ..results import Result, Table, axes_or_new, frame, plain
@@ -399,10 +400,11 @@ def leave_one_out(
     usable = [level for level in twin.levels if level.kV is not None and level.rate_DN_per_mAs is not None]
     if twin.spectral is None or len(usable) < 2:
         return ()
-    points = [
-        point for point in twin.evidence.get("photon_transfer", ()) if point.get("used") and point.get("load_mAs")
-    ]
-    loads = {str(point["series"]): (float(point["load_mAs"]), float(point["exposure_ms"])) for point in points}
+    loads = {
+        flat.series: (flat.load_mAs, flat.exposure_ms)
+        for flat in measured_flats(twin)
+        if flat.load_mAs and flat.exposure_ms
+    }
     transmissions = transmissions_of_evidence(twin)
     rows = []
     for level in usable:

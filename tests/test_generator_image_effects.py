@@ -9,6 +9,7 @@ import pytest
 from raytwin.acquisition.dataset_io import DatasetRow, read_dataset, write_dataset
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.cli import main
+from raytwin.errors import InputError
 from raytwin.generator.datasets.fresh import FreshReferences
 from raytwin.generator.datasets.generate import ChannelModel, ReferenceImages, generate_dataset
 from raytwin.generator.datasets.generate_described import DescribedScenes
@@ -68,14 +69,15 @@ def fine_moments(twin, setting, thickness_mm):
 
 
 @pytest.mark.parametrize("effect", sorted(set(EFFECTS) - set(NOT_IN_IMAGES) - {"kv_error", "filtration_error"}))
-def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_line, effect):
-    applied = AppliedEffect(id=effect, parameters={}, since="calibration")
+@pytest.mark.parametrize("size", ["weak", "usual", "strong", "beyond"])
+def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_line, effect, size):
+    known = EFFECTS[effect].strength
+    strength = {"weak": known.low, "usual": known.default, "strong": known.high, "beyond": 1.8 * known.high}[size]
+    applied = AppliedEffect(id=effect, parameters={"strength": strength}, since="calibration")
     if effect == "pile_up":
         series_line = replace(series_line, instrument=replace(series_line.instrument, counting=True))
     thickness = hill()
     effects = channel(series_line, [applied]).image_effects
-    thicker = thickness * effects.attenuation_scale(("water_liquid",)).get("water_liquid", 1.0)
-    image = effects.image(*fine_moments(series_line, HIGH, thicker), {"water_liquid": thickness}, focal_blur_px=0.0)
     asked = SeriesRequest(
         kind="object",
         setting=HIGH,
@@ -85,14 +87,21 @@ def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_lin
         product_material="water_liquid",
         scene_kind="product",
     )
-    wanted = LineModel(series_line, effects=(applied,)).expect(asked)
+    try:
+        wanted = LineModel(series_line, effects=(applied,)).expect(asked)
+    except InputError as refused:
+        # no line can have as much of it
+        assert size == "beyond" and effects.warnings == (f"effect {effect} is not in the images: {refused}",)
+        return
+    thicker = thickness * effects.attenuation_scale(("water_liquid",)).get("water_liquid", 1.0)
+    image = effects.image(*fine_moments(series_line, HIGH, thicker), {"water_liquid": thickness}, focal_blur_px=0.0)
     mean = responded(image.state, image.charge.mean)
-    # a smooth hill: cells that are flat within a pixel are as good as the series' slopes within 2e-3
-    np.testing.assert_allclose(mean, wanted.signal_DN, rtol=3e-3)
+    # a smooth hill: cells that are flat within a pixel are as good as the series' slopes within 2e-3; 1 DN where most is absorbed
+    np.testing.assert_allclose(mean, wanted.signal_DN, rtol=3e-3, atol=3e-4 * float(effects.flat_DN.max()))
     flat = LineModel(series_line, effects=(applied,)).expect(replace(asked, kind="flat", thickness_mm=None))
     np.testing.assert_allclose(effects.flat_DN, flat.signal_DN * np.ones(SHAPE), rtol=3e-4)
     plain = LineModel(series_line, effects=()).expect(asked)
-    if effect in ("object_scatter", "composition_error", "heel", "veiling_glare"):
+    if size == "usual" and effect in ("object_scatter", "composition_error", "heel", "veiling_glare"):
         assert np.abs(wanted.signal_DN / plain.signal_DN - 1).max() > 4e-3
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of
+from ..line.measured_flats import measured_flats
 from ..line.series_request import SeriesRequest
 from ..line.twin import Twin
 from .line_model import ExpectedSeries, LineModel
@@ -100,11 +101,7 @@ def _at_signal(setting: Setting, factor: float) -> Setting:
 def _calibrated_signal_DN(twin: Twin, setting: Setting) -> float | None:
     """Median signal of the flats that calibrated: of the setting's own level where it was measured, else of all, DN."""
     own = twin.level_at(setting)
-    known = [
-        float(point["signal_DN"])
-        for point in twin.evidence.get("photon_transfer", ())
-        if point.get("used") and (own is None or point.get("series") in own.series)
-    ]
+    known = [flat.signal_DN for flat in measured_flats(twin) if own is None or flat.series in own.series]
     return float(np.median(known)) if known else None
 
 

@@ -3,6 +3,7 @@
 Files:
     twin              the twin: maps, noise, levels per beam, posterior of the spectrum, effects
     spectral_signal   level, gain, photons and kerma of an open beam, for many parameter sets at once
+    measured_flats    the flats that a twin was calibrated with
     twin_spectrum     a twin's spectral model; photon-transfer slope over gain; secondary quanta
     twin_numbers      a twin with another gain or spectrum, its levels moved along
     line_state        the stages from beam to ADC, and what the state of the line holds at each

@@ -1,7 +1,7 @@
 """Flatfield of a twin at a setting, measured or not: mean, noise, gain, photons and dose, with 95 % intervals."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from ...spectra import checked_kV
 from ..frames.present_line import PresentLine, present_line
 from ..line.binning import binned_pixel
 from ..line.line_limits import check_count_rate, check_limits
+from ..line.measured_flats import measured_flats
 from ..line.spectral_signal import OpenBeam
 from ..line.twin import Estimate, Level, SpectralPosterior, Twin, estimate_from_log_draws, estimate_from_sd
 from ..line.twin_spectrum import slope_over_gain, slope_share, spectral_model_of
@@ -209,11 +210,7 @@ def _outside(twin: Twin, setting: Setting, signal_DN: float) -> tuple[str, ...]:
     found: list[str] = []
     if twin.spectral is not None:
         found += spectrum_outside(twin.spectral, kV=setting.kV, filters=setting.filters)
-    points = [
-        float(point["signal_DN"])
-        for point in twin.evidence.get("photon_transfer", ())
-        if isinstance(point, Mapping) and point.get("used") and float(point.get("signal_DN", 0.0)) > 0
-    ]
+    points = [flat.signal_DN for flat in measured_flats(twin)]
     if points and not min(points) / _FAR_BELOW <= signal_DN <= max(points) * _FAR_ABOVE:
         found.append(f"level ({min(points):.0f} to {max(points):.0f} DN calibrated)")
     return tuple(found)

@@ -1,0 +1,55 @@
+"""The flats that a twin was calibrated with, as its evidence tells them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ...errors import InputError
+from .twin import Twin
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredFlat:
+    """A series of flats whose level and noise made the twin.
+
+    Fields: series: its name; signal_DN: median above dark, above 0; kV, exposure_ms, load_mAs of an exposure: None where unknown.
+    """
+
+    series: str
+    signal_DN: float
+    kV: float | None
+    exposure_ms: float | None
+    load_mAs: float | None
+
+
+def measured_flats(twin: Twin) -> tuple[MeasuredFlat, ...]:
+    """The flats of known signal that were used, in the order of the acquisition; none where the evidence has none.
+
+    Raises:
+        InputError: evidence that is no list of series with numbers.
+    """
+    points = twin.evidence.get("photon_transfer") or ()
+    try:
+        found = [_flat(point) for point in points if point["used"]]
+    except (TypeError, KeyError, ValueError, AttributeError):
+        raise InputError(
+            "evidence of the twin",
+            received="`photon_transfer` that cannot be read",
+            expected="a row for each flat with `series`, `used` and `signal_DN`",
+            remedy="calibrate again",
+        ) from None
+    return tuple(flat for flat in found if flat.signal_DN > 0)
+
+
+def _flat(point: Mapping[str, Any]) -> MeasuredFlat:
+    def number(name: str) -> float | None:
+        value = point.get(name)
+        return None if value is None else float(value)
+
+    return MeasuredFlat(
+        series=str(point["series"]),
+        signal_DN=float(point["signal_DN"]),
+        kV=number("kV"),
+        exposure_ms=number("exposure_ms"),
+        load_mAs=number("load_mAs"),
+    )

@@ -40,6 +40,22 @@ def delta_r(
     Source: Andriiashen, van Liere, van Leeuwen, Batenburg, X-ray Image Generation as a Method of Performance
         Prediction for Real-Time Inspection: a Case Study (the definition of Delta R), and its authors' code (the ring).
     """
+    inside, ring = object_and_ring(M_low, M_high, foreign_object_mask, dilations=dilations)
+    low, high = (np.asarray(image, dtype=np.float64) for image in (M_low, M_high))
+    return float(np.mean(low[inside] / high[inside]) - np.mean(low[ring] / high[ring]))
+
+
+def object_and_ring(
+    M_low: NDArray[np.floating],
+    M_high: NDArray[np.floating],
+    foreign_object_mask: NDArray[np.bool_],
+    *,
+    dilations: int = DILATIONS,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels (row, column) of a foreign object and of the ring of product around it, as `delta_r` compares them.
+
+    Args, errors: as `delta_r`.
+    """
     from scipy.ndimage import binary_dilation, generate_binary_structure
 
     low = np.asarray(M_low, dtype=np.float64)
@@ -68,7 +84,7 @@ def delta_r(
                 expected=f"pixels with {needed}",
                 remedy="check that mask and image belong together",
             )
-    return float(np.mean(low[inside] / high[inside]) - np.mean(low[ring] / high[ring]))
+    return inside, ring
 
 
 def check_dilations(dilations: int) -> None:

@@ -30,20 +30,20 @@ class DemoPlan:
     calibration_frames a series; products, test_products (images of the two sets); exposures_ms of the fast settings; generated
     (training pairs an exposure); networks an exposure; start (`starter`: networks start from the one that comes with raytwin;
     `shared`: from one that is trained first, with first_steps on the least noisy images, then shared_steps on all exposures);
-    steps (of each network after its start; from the starter those at 1 s, doubled for each shorter exposure); rate (of
+    steps (of each network after its start; from the starter those at 1 s, twice as many for shorter exposures); rate (of
     learning, peak, from the starter); batch; threads of each training and trial (None: all; networks this small wait longer for
-    a second thread than it saves, and the weights depend on the number); seed; recipe of the training where the start is
-    `shared`; gap (of the chapter that plants an effect).
+    a second thread than it saves, and the weights depend on the number); workers (processes that share the networks of an exposure);
+    seed; recipe of the training where the start is `shared`; gap (of the chapter that plants an effect).
     """
 
     size: tuple[int, int] = (96, 128)
     pixel_mm: float = 0.45
-    source_detector_mm: float | None = 2000.0
-    bones_mm: tuple[float, ...] | None = 2 * (1.5, 2.5, 4.0, 7.0, 11.0, 15.0)
+    source_detector_mm: float | None = 1700.0
+    bones_mm: tuple[float, ...] | None = 2 * (1.5, 2.5, 4.0, 7.0, 12.0, 20.0)
     calibration_frames: int = 16
     products: int = 72
     test_products: int = 86
-    exposures_ms: tuple[float, ...] = (100.0, 50.0)
+    exposures_ms: tuple[float, ...] = (100.0, 50.0, 20.0)
     generated: int = 144
     networks: int = 3
     start: str = "starter"
@@ -53,6 +53,7 @@ class DemoPlan:
     rate: float = 2e-3
     batch: int = 8
     threads: int | None = 1
+    workers: int = 2
     seed: int = 1
     recipe: str = "raytwin"
     gap: GapPlan = field(default_factory=GapPlan)
@@ -60,7 +61,16 @@ class DemoPlan:
     def __post_init__(self) -> None:
         if self.start not in ("starter", "shared"):
             raise InputError("start", received=self.start, expected="starter or shared")
-        for name in ("products", "test_products", "generated", "networks", "first_steps", "shared_steps", "steps"):
+        for name in (
+            "products",
+            "test_products",
+            "generated",
+            "networks",
+            "first_steps",
+            "shared_steps",
+            "steps",
+            "workers",
+        ):
             if getattr(self, name) < 1:
                 raise InputError(name, received=getattr(self, name), expected="1 or more")
 
@@ -98,6 +108,7 @@ PAPER_PLAN = DemoPlan(
     steps=2000,
     batch=2,
     threads=None,
+    workers=1,
 )
 
 
@@ -142,7 +153,7 @@ def _networks(chain: Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[
     """Networks trained, tried and compared.
 
     Each starts from the network that comes with raytwin, or from one shared by all that is trained before. From the one that
-    comes with raytwin, noisier images take longer: each shorter exposure twice the steps.
+    comes with raytwin, noisier images than those at 1 s take twice the steps.
     """
     at = chain.path
     threads = [] if plan.threads is None else ["--threads", str(plan.threads)]
@@ -158,14 +169,14 @@ def _networks(chain: Chain, plan: DemoPlan, exposures: Sequence[float]) -> dict[
     detection: dict[str, Any] = {}
     pod: dict[str, Any] = {}
     compared: dict[str, Any] = {}
-    for place, exposure in enumerate(exposures):
+    for exposure in exposures:
         number = f"{exposure:g}ms"
-        steps = plan.steps * (2**place if plan.start == "starter" else 1)
+        steps = plan.steps * (2 if plan.start == "starter" and exposure < max(exposures) else 1)
         dataset = "references.h5" if exposure == 1000.0 else f"train_{number}.h5"
         training[number] = chain.step(
             f"train_{number}",
             ["train", at(dataset), "-o", at(f"runs_{number}"), *common, "--networks", str(plan.networks),
-             "--steps", str(steps), "--start-from", start],
+             "--workers", str(plan.workers), "--steps", str(steps), "--start-from", start],
             outputs=[f"runs_{number}"],
         )  # fmt: skip
         kinds = ["real"] if exposure == 1000.0 else ["real", "test"]

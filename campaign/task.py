@@ -3,6 +3,7 @@
 A designer trains networks on the twin's images, tries them on others of the twin's images and believes the a90 that comes out. So
 
     a90_before, a90_after   trained and tried on images of the twin as it was, and with the effects that were found
+    a90_library             as a90_after, with objects made of the library's material where their own could be told
     a90_real                trained and tried on measured images
 
 and, beside them, the twin's networks tried on the measured images. All are tried on the same objects where the measured
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..acquisition.acquisition_io import AcquisitionFile, open_acquisition
 from ..acquisition.contrast import DILATIONS, dilations_for_pixel
@@ -45,13 +47,14 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 SIZES = {"size_mm": "mm", "contrast": ""}
-ARMS = ("before", "after", "measured")
+ARMS = ("before", "after", "library", "measured")
 # (networks of, tried on images of)
 TRIALS = (
     ("before", "before"),
     ("before", "measured"),
     ("after", "after"),
     ("after", "measured"),
+    ("library", "library"),
     ("measured", "measured"),
 )
 _FEWEST_TO_LEARN = 8  # measured images with a foreign object, below which networks of their own are not trained
@@ -159,14 +162,19 @@ def run_task(
     measured = _measured_images(brought, directory, before, plan)
     source = _source(brought, measured, before, plan)
     warnings = list(measured.warnings)
+    tell("what the objects are made of")
+    materials, unknown = source.own_materials(after, measured)
+    warnings += unknown
     tell("images of the twin before and after")
     for name, twin in (("before", before), ("after", after)):
         warnings += source.write(twin, directory / f"{name}_train.h5", directory / f"{name}_test.h5", directory)
+    if materials:
+        source.write_library(after, directory / "library_train.h5", directory / "library_test.h5")
     same = _same_images(directory / "before_test.h5", directory / "after_test.h5")
     effects = [item.id for item in after.effects if item not in before.effects]
     if same and effects:
         warnings.append("the effects found change no image: a90_after is a90_before")
-    arms = [name for name in ARMS if not (same and name == "after")]
+    arms = [name for name in ARMS if not (same and name == "after") and (materials or name != "library")]
     learn = _with_objects(measured.path, ("train", "val"))
     if learn < _FEWEST_TO_LEARN:
         arms.remove("measured")
@@ -200,8 +208,16 @@ def run_task(
             answers[f"after_on_{images}"] = answers[f"before_on_{told}"]
     real = "measured_on_measured" if "measured" in arms else "after_on_measured"
     result: dict[str, Any] = {}
-    for key, name in (("a90_real", real), ("a90_before", "before_on_before"), ("a90_after", "after_on_after")):
-        found = answers[name]
+    for key, name in (
+        ("a90_real", real),
+        ("a90_before", "before_on_before"),
+        ("a90_after", "after_on_after"),
+        ("a90_library", "library_on_library"),
+    ):
+        found = answers.get(name)
+        if found is None:
+            result[key] = result[f"{key}_95"] = None
+            continue
         result[key] = found["a90"]
         result[f"{key}_95"] = found["a90_95_interval"]
         if found["a90"] is None:
@@ -214,7 +230,8 @@ def run_task(
         "networks": plan.networks,
         "real_networks": "measured" if "measured" in arms else "generated",
         "curves": answers,
-        "compare": _comparisons(directory, real, plan, same=same),
+        "compare": _comparisons(directory, real, plan, same=same, library=bool(materials)),
+        "materials": materials,
         "products": source.text,
         "folder": directory.name,
         "warnings": list(dict.fromkeys(warnings)),
@@ -465,7 +482,39 @@ class _KnownSource:
             )
             for one in scenes
         ]
+        self.library = self.scenes
         self.own = own
+
+    def own_materials(self, twin: "Twin", measured: _Measured) -> tuple[list[dict[str, Any]], list[str]]:
+        """What the measured objects are made of, by those that networks learn from; scenes are made of that from now on."""
+        from ..generator.datasets.known_scenes import KnownScenes
+        from .object_material import object_materials
+
+        if not self.own:
+            return [], []
+        images: dict[str, list[NDArray[np.floating]]] = {}
+        with read_dataset(measured.path) as dataset:
+            for number, row in enumerate(dataset.rows):
+                if row.split in ("train", "val") and row.foreign_object:
+                    images.setdefault(scene_of(row.image), []).append(dataset.images(number))
+        line = KnownScenes(twin, low=self.low, high=self.high, product_material=self.material)
+        found, told = object_materials(
+            line,
+            self.library,
+            {name: np.mean(frames, axis=0) for name, frames in images.items()},
+            product=self.material,
+            dilations=dilations_for_pixel(line.geometry.pixel_mm),
+        )
+        for material in found:
+            self.scenes = [material.scene(scene) for scene in self.scenes]
+        return [material.as_dict() for material in found], [
+            f"the objects' own material is not known: {one}" for one in told
+        ]
+
+    def write_library(self, twin: "Twin", train: Path, test: Path) -> None:
+        """Images of the same scenes with objects of the library's material."""
+        for path, splits in ((train, ("train", "val")), (test, ("test",))):
+            self._write(twin, path, splits, self.low, self.high, self.plan.draws, scenes=self.library)
 
     def sizes(self) -> Mapping[str, float]:
         """Contrast of each scene in the images of the twin as it was, without noise: one number for all kinds of images."""
@@ -483,14 +532,22 @@ class _KnownSource:
         return path
 
     def _write(
-        self, twin: "Twin", path: Path, splits: Sequence[str], low: Setting, high: Setting, draws: int
+        self,
+        twin: "Twin",
+        path: Path,
+        splits: Sequence[str],
+        low: Setting,
+        high: Setting,
+        draws: int,
+        *,
+        scenes: "Sequence[KnownScene] | None" = None,
     ) -> tuple[str, ...]:
         from ..generator.datasets.known_scenes import KnownScenes, generate_known_scenes
 
         if path.exists():
             return tuple(KnownScenes(twin, low=low, high=high, product_material=self.material).warnings)
-        scenes = [one for one in self.scenes if one.row.split in splits]
-        if not scenes:
+        chosen = [one for one in (self.scenes if scenes is None else scenes) if one.row.split in splits]
+        if not chosen:
             raise InputError(
                 "products",
                 received=f"none of split {' or '.join(splits)}",
@@ -498,7 +555,7 @@ class _KnownSource:
             )
         return generate_known_scenes(
             twin,
-            scenes,
+            chosen,
             path,
             low=low,
             high=high,
@@ -517,6 +574,12 @@ class _DescribedSource:
         self.description = read_description(path)
         self.plan, self.low, self.high = plan, measured.low, measured.high
         self.text = f"the description {path.name}"
+
+    def own_materials(self, twin: "Twin", measured: _Measured) -> tuple[list[dict[str, Any]], list[str]]:
+        return [], []
+
+    def write_library(self, twin: "Twin", train: Path, test: Path) -> None:
+        """Nothing: the objects' own material is not known."""
 
     def sizes(self) -> Mapping[str, float]:
         return {}
@@ -560,6 +623,12 @@ class _ReferenceSource:
     def __init__(self, path: Path, measured: _Measured, plan: TaskPlan) -> None:
         self.path, self.plan, self.low, self.high = path, plan, measured.low, measured.high
         self.text = f"the reference images {path.name}"
+
+    def own_materials(self, twin: "Twin", measured: _Measured) -> tuple[list[dict[str, Any]], list[str]]:
+        return [], []
+
+    def write_library(self, twin: "Twin", train: Path, test: Path) -> None:
+        """Nothing: the objects' own material is not known."""
 
     def sizes(self) -> Mapping[str, float]:
         return {}
@@ -696,7 +765,7 @@ def _train(
     return folders
 
 
-def _comparisons(directory: Path, real: str, plan: TaskPlan, *, same: bool) -> dict[str, Any]:
+def _comparisons(directory: Path, real: str, plan: TaskPlan, *, same: bool, library: bool) -> dict[str, Any]:
     """a90 of pairs of tables against each other, images shared where they are of the same objects."""
     from ..pod import check_trials, compare_pod, read_pod_table
 
@@ -708,6 +777,8 @@ def _comparisons(directory: Path, real: str, plan: TaskPlan, *, same: bool) -> d
         }
     elif real == "after_on_measured":
         wanted = {"before_against_real": ("before_on_before", "before_on_measured")}
+    if library:
+        wanted["after_against_library"] = ("before_on_before" if same else "after_on_after", "library_on_library")
     result: dict[str, Any] = {}
     for name, (second, first) in wanted.items():
         tables = [read_pod_table(directory / f"hits_{one}.csv", size=plan.size) for one in (first, second)]

@@ -187,7 +187,10 @@ def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_s
 ):
     after = with_effect(twin, "object_scatter", 10.0)
     found = run_task(twin, after, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=TaskPlan())
-    assert set(found["curves"]) == {f"{networks}_on_{images}" for networks, images in task_module.TRIALS}
+    # five objects to learn from: too few to tell what they are made of
+    trials = [trial for trial in task_module.TRIALS if "library" not in trial]
+    assert set(found["curves"]) == {f"{networks}_on_{images}" for networks, images in trials}
+    assert found["a90_library"] is None and any("own material is not known" in line for line in found["warnings"])
     assert found["effects"] == ["object_scatter"]
     assert found["real_networks"] == "measured"
     images = {}

@@ -200,5 +200,16 @@ def task_text(task: Mapping[str, Any]) -> str:
     what = "the size" if task["size"] == "size_mm" else "the contrast"
     start = f"In detection, {what} found in nine of ten cases (a90)"
     if not task["effects"]:
-        return f"{start} is {told('a90_before')} by the twin; measured: {told('a90_real')}."
-    return f"{start} moves from {told('a90_before')} to {told('a90_after')}; measured: {told('a90_real')}."
+        text = f"{start} is {told('a90_before')} by the twin; measured: {told('a90_real')}."
+    else:
+        text = f"{start} moves from {told('a90_before')} to {told('a90_after')}; measured: {told('a90_real')}."
+    for found in task.get("materials", ()):
+        low, high = (found["contrast_change_percent"][name] for name in ("low_kV", "high_kV"))
+        at_low, at_high = (f"{one['value']:+.2g} % ({one['low']:+.2g} to {one['high']:+.2g})" for one in (low, high))
+        text += (
+            f" The contrast of {found['material']} differs from the library's by {at_low} at the low voltage and by {at_high} at the"
+            " high one."
+        )
+    if task.get("materials"):
+        text += f" Images of the twin have it so; with the library's material a90 is {told('a90_library')}."
+    return text

@@ -14,7 +14,7 @@ Files:
     ensemble           networks of one recipe in several processes
     table              the paper's table; table_page: its page
     fresh_noise        training with new noise at every look
-    task               POD before and after a diagnosis
+    task               POD before and after a diagnosis; object_material: what its objects are made of
     starter            images of the starter network
     chain              commands in order, answers kept
     lab_line           the paper's experiment on the virtual lab: line and images

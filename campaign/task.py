@@ -7,8 +7,8 @@ A designer trains networks on the twin's images, tries them on others of the twi
     a90_real                trained and tried on measured images
 
 and, beside them, the twin's networks tried on the measured images. All are tried on the same objects where the measured
-products' path lengths are known. All networks start from one network that learnt from both twins. The measured images must
-come from the line as it is now, with foreign objects whose masks are known.
+products' path lengths are known. All networks start from one network that learnt from both twins, which starts from the one that
+comes with raytwin. The measured images must come from the line as it is now, with foreign objects whose masks are known.
 
 Every file stands in one folder; what is there already is not made again, and training goes on where it stopped.
 """
@@ -58,6 +58,7 @@ TRIALS = (
     ("measured", "measured"),
 )
 _FEWEST_TO_LEARN = 8  # measured images with a foreign object, below which networks of their own are not trained
+_WORKERS = 2  # processes that share the networks of a kind; the weights do not depend on their number
 _START_AVERAGED = 16  # the common start learns from images of as many frames: noisy ones teach a new network nothing
 
 
@@ -74,7 +75,7 @@ class TaskPlan:
     """
 
     networks: int = 3
-    start_steps: int = 240
+    start_steps: int = 60
     steps: int = 60
     batch: int = 8
     crop_px: int = 64
@@ -730,20 +731,23 @@ def _train(
     directory: Path, arms: Sequence[str], measured: Path, plan: TaskPlan, *, device: str, tell: Tell
 ) -> dict[str, Path]:
     """Folders of networks: one common start, then `networks` of each kind."""
-    from ..segmentation import RECIPES, recipe_for_fine_tuning
+    from ..segmentation import starter_recipe
 
     with read_dataset(measured) as images:
         crop = plan.crop_px if 0 < plan.crop_px < min(images.shape) else None
-    first = replace(RECIPES["raytwin"], steps=plan.start_steps, batch=plan.batch, crop_px=crop)
-    later = replace(recipe_for_fine_tuning(RECIPES["raytwin"]), steps=plan.steps, batch=plan.batch, crop_px=crop)
+    recipe = replace(starter_recipe(), batch=plan.batch, crop_px=crop)
+    # networks this small wait longer for a second thread than it saves
+    workers = _WORKERS if device == "cpu" else None
     start = directory / "networks_start"
     train_on_file(
         directory / "start.h5",
         start,
-        recipe=first,
+        recipe=replace(recipe, steps=plan.start_steps),
         networks=1,
         seed=plan.seed,
+        start_from="starter",
         device=device,
+        workers=workers,
         tell=tell,
         name="common start",
     )
@@ -754,11 +758,12 @@ def _train(
         train_on_file(
             dataset,
             folders[arm],
-            recipe=later,
+            recipe=replace(recipe, steps=plan.steps),
             networks=plan.networks,
             seed=plan.seed,
             start_from=start,
             device=device,
+            workers=workers,
             tell=tell,
             name=f"networks of {arm}",
         )

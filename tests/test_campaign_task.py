@@ -9,6 +9,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition, read_dataset
 from raytwin.acquisition.pairs import PairCorrector, object_pairs
+from raytwin.campaign import object_material
 from raytwin.campaign import task as task_module
 from raytwin.campaign.task import TaskInput, TaskPlan, check_task, run_task, scene_of
 from raytwin.cli import main
@@ -148,7 +149,7 @@ def test_maps_of_another_detector_are_refused(line, twin):
 @pytest.fixture
 def stand_in(monkeypatch):
     """Networks that see an object when it is longer than what their images allow; a fifth of their looks go wrong."""
-    limits = {"before": 0.6, "after": 1.2, "measured": 1.0}
+    limits = {"before": 0.6, "after": 1.2, "library": 0.9, "measured": 1.0}
     trained = []
 
     def train(directory, arms, measured, plan, *, device, tell):
@@ -183,14 +184,16 @@ def stand_in(monkeypatch):
 
 
 def test_task_tries_twins_that_differ_by_the_effect_and_measured_images_on_the_same_objects(
-    line, twin, tmp_path, stand_in
+    line, twin, tmp_path, stand_in, monkeypatch
 ):
+    monkeypatch.setattr(object_material, "_FEWEST", 3)
     after = with_effect(twin, "object_scatter", 10.0)
     found = run_task(twin, after, TaskInput(measured=line / "products.h5"), tmp_path / "task", plan=TaskPlan())
-    # five objects to learn from: too few to tell what they are made of
-    trials = [trial for trial in task_module.TRIALS if "library" not in trial]
-    assert set(found["curves"]) == {f"{networks}_on_{images}" for networks, images in trials}
-    assert found["a90_library"] is None and any("own material is not known" in line for line in found["warnings"])
+    assert set(found["curves"]) == {f"{networks}_on_{images}" for networks, images in task_module.TRIALS}
+    (bone,) = found["materials"]
+    assert bone["material"] == "rib_bone" and bone["objects"] >= 3
+    assert "after_against_library" in found["compare"]
+    assert "with the library's material a90 is" in task_text(found)
     assert found["effects"] == ["object_scatter"]
     assert found["real_networks"] == "measured"
     images = {}
@@ -260,6 +263,9 @@ def test_too_few_measured_images_to_learn_from_leave_the_improved_twins_networks
 def test_a_stopped_task_goes_on_and_another_one_is_refused(line, twin, tmp_path, stand_in):
     brought = TaskInput(measured=line / "products.h5")
     first = run_task(twin, twin, brought, tmp_path / "task", plan=TaskPlan())
+    # five objects to learn from: too few to tell what they are made of
+    assert first["a90_library"] is None and first["materials"] == []
+    assert any("own material is not known" in line for line in first["warnings"])
     times = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "task").glob("*_test.h5")}
     assert run_task(twin, twin, brought, tmp_path / "task", plan=TaskPlan()) == first
     assert times == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "task").glob("*_test.h5")}
@@ -372,7 +378,7 @@ def test_a_noisier_line_is_followed_from_session_to_a90(line, tmp_path, capsys):
         "--session",
         "1",
         "--products",
-        "32",
+        "40",
     ]
     assert main([*words, "--bones-mm", "1,1.5,2.5,4", "--effect", "excess_noise=60@always"]) == 0
     capsys.readouterr()

@@ -255,7 +255,12 @@ def _where(answer: Mapping[str, Any]) -> SortedTable:
 
 def _task_rows(task: Mapping[str, Any]) -> SortedTable:
     """One line for each kind of networks and of images that they were tried on."""
-    names = {"before": "twin before", "after": "twin after", "measured": "measured images"}
+    names = {
+        "before": "twin before",
+        "after": "twin after",
+        "library": "twin after, objects of the library's material",
+        "measured": "measured images",
+    }
 
     def shown(value: float | None) -> str:
         return "none" if value is None else f"{value:.3g}"

@@ -16,6 +16,7 @@ from typing import Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, filters_from_text, setting_from_text
 from ..errors import InputError
+from ..segmentation.recipe import RECIPES, STARTER
 
 SIZES = ("contrast", "size_mm")
 LINKS = ("cloglog", "loglog", "logit", "probit")
@@ -23,6 +24,7 @@ METHODS = ("auto", "ml", "firth")
 PAIRS = ("in_turn", "at_once")
 KEEP_OF = ("throughput", "all")
 MOST_SETTINGS = 10_000
+_START_STEPS = 240  # of random weights, on the references
 _FEWEST_TO_CALIBRATE = 4  # of settings, for the two numbers of an observer: observers.efficiency
 
 Pair = tuple[Setting, Setting]
@@ -112,19 +114,20 @@ class Screening:
 class Training:
     """How networks are trained.
 
-    Fields: recipe; networks and images (pairs generated to learn from) of each setting; steps of each network; batch; crop_px
-    (squares round the objects, 0: whole images); start_steps of the one network that all start from, on the references (0: they
-    start from random weights); mixed_steps of it after that, on the references with start_shares of their exposure; start: the low
-    and high setting of those first images where products come from a description.
+    Fields: recipe (`starter`: networks start from the one that comes with raytwin; others from random weights); networks and
+    images (pairs generated to learn from) of each setting; steps of each network; batch; crop_px (squares round the objects, 0:
+    whole images); start_steps of one network that learns from the references first and that all start from (0: there is none);
+    mixed_steps of it after that, on the references with start_shares of their exposure; start: the low and high setting of those
+    first images where products come from a description.
     """
 
-    recipe: str = "raytwin"
+    recipe: str = STARTER
     networks: int = 5
     images: int = 150
     steps: int = 60
     batch: int = 8
     crop_px: int = 0
-    start_steps: int = 240
+    start_steps: int = 0
     mixed_steps: int = 60
     start_shares: tuple[float, ...] = (0.2, 0.05)
     start: tuple[str, str] | None = None
@@ -750,14 +753,12 @@ def _screening(words: _Words, folder: Path) -> Screening:
 
 
 def _training(words: _Words) -> Training:
-    from ..segmentation.recipe import RECIPES
-
-    usual = Training()
+    recipe = words.choice("recipe", STARTER, (STARTER, *RECIPES))
+    usual = Training(recipe=recipe, start_steps=0 if recipe == STARTER else _START_STEPS)
     least = {"networks": 1, "images": 4, "steps": 1, "batch": 2, "crop_px": 0, "start_steps": 0, "mixed_steps": 0}
     wholes = {name: words.whole(name, getattr(usual, name), least=low) for name, low in least.items()}
     if 0 < wholes["crop_px"] < 16:
         raise words.error("crop_px", wholes["crop_px"], "0 for whole images, or 16 pixels and more")
-    recipe = words.choice("recipe", usual.recipe, tuple(RECIPES))
     shares = words.take("start_shares")
     given = list(usual.start_shares) if shares is None else shares
     if not isinstance(given, list):
@@ -777,7 +778,6 @@ def _training(words: _Words) -> Training:
         usual,
         **wholes,
         start=(texts[0], texts[1]) if texts else None,
-        recipe=recipe,
         start_shares=tuple(_number(one, refuse, above=0.0, least=0.0, most=0.9) for one in given),
     )
     words.done()

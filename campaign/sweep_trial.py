@@ -26,6 +26,7 @@ from ..acquisition.pairs import split_by_product
 from ..acquisition.setting import setting_from_text
 from ..errors import FileFormatError, InputError, RaytwinError
 from ..files import sha256_of_file, whole_file
+from ..segmentation.recipe import STARTER
 from ._leash import line_from_parent
 from ._plain import canonical, digest, plain, read_object
 from .sweep_file import SIZES, Campaign, CurveOptions, Pair, Training, Trying, text_of_pair
@@ -290,7 +291,6 @@ def run_task(task: Task, *, tell: Tell = lambda line: None) -> None:
 def _run_start(task: Task, tell: Tell) -> None:
     """A network that learnt from the least noisy images, then from noisier ones (those teach a new network nothing)."""
     from ..generator.twins.twin_io import read_twin
-    from ..segmentation import recipe_for_fine_tuning
 
     folder = Path(task["folder"])
     training = task["training"]
@@ -306,7 +306,7 @@ def _run_start(task: Task, tell: Tell) -> None:
         own = _references_own(task)
     recipe = _recipe(training, clear)
 
-    def train(path: Path, chosen: "Recipe", steps: int, *, name: str, said: str, start: Path | None = None) -> Path:
+    def train(path: Path, chosen: "Recipe", steps: int, *, name: str, said: str, start: str | Path | None) -> Path:
         train_on_file(
             path,
             folder / name,
@@ -320,7 +320,8 @@ def _run_start(task: Task, tell: Tell) -> None:
         )
         return folder / name
 
-    learnt = train(clear, recipe, training["start_steps"], name="first", said="start")
+    shipped = STARTER if training["recipe"] == STARTER else None
+    learnt = train(clear, recipe, training["start_steps"], name="first", said="start", start=shipped)
     if training["mixed_steps"] and training["start_shares"]:
         parts = []
         images = max(training["images"] // len(training["start_shares"]), _FEWEST_START_IMAGES)
@@ -332,7 +333,7 @@ def _run_start(task: Task, tell: Tell) -> None:
         if not mixed.exists():
             with ExitStack() as stack:
                 concatenate_datasets([stack.enter_context(read_dataset(part)) for part in parts], mixed)
-        later = recipe_for_fine_tuning(recipe)
+        later = _later(training, recipe)
         steps = training["mixed_steps"]
         learnt = train(mixed, later, steps, name="mixed", said="start, noisier images", start=learnt)
         _remove(*parts, mixed)
@@ -412,7 +413,6 @@ def _of_other_size(curve: Mapping[str, Any]) -> dict[str, Any]:
 def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
     """Hit table of a setting; what was told on the way."""
     from ..generator.twins.twin_io import read_twin
-    from ..segmentation import recipe_for_fine_tuning
 
     training, trying, seeds = task["training"], task["trying"], task["seeds"]
     pair = (setting_from_text(task["low"]), setting_from_text(task["high"]))
@@ -431,9 +431,9 @@ def _trial(task: Task, folder: Path, tell: Tell) -> dict[str, Any]:
         # the setting cannot be, however often it is tried
         return {"refused": str(error), "warnings": warnings}
     recipe = _recipe(training, train)
-    start = None
+    start: str | Path | None = STARTER if training["recipe"] == STARTER else None
     if task["start"] is not None:
-        recipe = recipe_for_fine_tuning(recipe)
+        recipe = _later(training, recipe)
         start = Path(task["start"]) / read_object(Path(task["start"]) / "start.json")["networks"]
     networks = folder / "networks"
     train_on_file(
@@ -547,13 +547,21 @@ def _pair(texts: Sequence[str]) -> Pair:
     return setting_from_text(texts[0]), setting_from_text(texts[1])
 
 
+def _later(training: Mapping[str, Any], recipe: "Recipe") -> "Recipe":
+    """How a network that has learnt already goes on; the shipped one's recipe is such a one."""
+    from ..segmentation import recipe_for_fine_tuning
+
+    return recipe if training["recipe"] == STARTER else recipe_for_fine_tuning(recipe)
+
+
 def _recipe(training: Mapping[str, Any], dataset: Path) -> "Recipe":
-    from ..segmentation import RECIPES
+    from ..segmentation import RECIPES, starter_recipe
 
     crop = int(training["crop_px"])
     with read_dataset(dataset) as images:
         smallest = min(images.shape)
-    return replace(RECIPES[training["recipe"]], batch=training["batch"], crop_px=crop if 0 < crop < smallest else None)
+    usual = starter_recipe() if training["recipe"] == STARTER else RECIPES[training["recipe"]]
+    return replace(usual, batch=training["batch"], crop_px=crop if 0 < crop < smallest else None)
 
 
 # ------------------------------------------------------------------------------------------------ a process of its own

@@ -74,7 +74,7 @@ class TaskPlan:
     objects: sets its threshold); size (`size_mm` or `contrast`); seed.
     """
 
-    networks: int = 3
+    networks: int = 6
     start_steps: int = 60
     steps: int = 60
     batch: int = 8

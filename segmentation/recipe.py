@@ -103,6 +103,7 @@ class Recipe:
 
 # The paper does not say so, but the authors' code starts its encoder from ImageNet, its library's default: the option
 # `--encoder-weights imagenet` does the same.
+STARTER = "starter"  # the network that comes with raytwin, see `weights_io`; and what is trained from it
 RECIPES: MappingProxyType[str, Recipe] = MappingProxyType(
     {
         "raytwin": Recipe(

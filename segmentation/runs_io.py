@@ -24,9 +24,9 @@ from typing import Any
 from ..errors import FileFormatError, InputError
 from ..files import sha256_of_file, whole_file
 from ._torch import load_torch
-from .recipe import OWN_MODULE, Recipe, recipe_from_mapping
+from .recipe import OWN_MODULE, STARTER, Recipe, recipe_from_mapping
 from .training import EpochResult, TrainingState
-from .weights_io import STARTER, STARTER_PATH, read_safetensors, write_safetensors
+from .weights_io import STARTER_PATH, read_safetensors, write_safetensors
 
 FORMAT = "raytwin-runs"
 WEIGHTS_FORMAT = "raytwin-weights"

@@ -16,7 +16,6 @@ from ..files import whole_file
 from ._torch import load_torch
 from .recipe import Recipe, recipe_from_mapping
 
-STARTER = "starter"
 STARTER_PATH = Path(__file__).parents[1] / "data" / "starter" / "starter.safetensors"
 _KEY = "raytwin_recipe"
 

@@ -118,7 +118,7 @@ def campaign() -> Schema:
     from raytwin.campaign import sweep_file
     from raytwin.observers import DETECTORS, IMAGES
     from raytwin.pod.links import LINKS
-    from raytwin.segmentation.recipe import RECIPES
+    from raytwin.segmentation.recipe import RECIPES, STARTER
 
     setting = table({"low": TEXT, "high": TEXT}, required=("low", "high"))
     grid = {}
@@ -126,7 +126,7 @@ def campaign() -> Schema:
         value = several(TEXT if word == "filter" else NUMBER)
         grid |= {f"{side}{word}": value for side in ("", "low_", "high_") if side or word != "kv"}
     shares = {"type": "array", "items": SHARE}
-    training = of_fields(sweep_file.Training, {"recipe": choice(RECIPES), "start_shares": shares})
+    training = of_fields(sweep_file.Training, {"recipe": choice((STARTER, *RECIPES)), "start_shares": shares})
     training.pop("start")
     training |= {"start_low": TEXT, "start_high": TEXT}
     requirement = of_fields(sweep_file.Requirement, {})

@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     task.add_argument("--task-low", metavar="SETTING", help="setting at the low kV (default: the shortest exposure)")
     task.add_argument("--task-high", metavar="SETTING", help="setting at the high kV")
-    task.add_argument("--task-networks", type=int, help="networks of each kind (default 3)")
+    task.add_argument("--task-networks", type=int, help="networks of each kind (default 6)")
     task.add_argument("--task-start-steps", type=int, help="training steps of the network that all start from (60)")
     task.add_argument("--task-steps", type=int, help="training steps of each network after that (60)")
     task.add_argument("--task-crop-px", type=int, help="side of the squares they learn from, 0: whole images (64)")

@@ -34,7 +34,7 @@ class Single:
     def of(fits: Sequence[CurveFit]) -> "Single":
         """From the fits of all its variants."""
         best = max(fits, key=lambda fit: fit.log_evidence)
-        mean = float(log_mean_exp(np.array([fit.log_evidence for fit in fits])))
+        mean = log_mean_exp([fit.log_evidence for fit in fits])
         return Single(fits=fits, best=replace(best, share=mean - best.log_evidence), log_evidence=mean)
 
 

@@ -29,7 +29,8 @@ from .unknown import LOG_DENSITY, Beyond, beyond
 
 UNKNOWN = "unknown_effect"
 _WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
-_PAIRS_FROM = 6  # effects, the likeliest, that are the first of a pair
+# the likeliest effects that are the first of a pair: with six the same are named (notebook, ablation)
+_PAIRS_FROM = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

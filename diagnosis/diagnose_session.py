@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..generator.line.twin import Twin
 from .checks.preparation import calibrated_twin, mislabelled, prepare_session
 from .checks.readings import Suspect
-from .inference.inference import UNKNOWN, Hypothesis, Priors
+from .inference.inference import UNKNOWN, Hypothesis
 from .judgement.answer import EXPLAINED, Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
@@ -24,7 +24,6 @@ def diagnose(
     twin: Twin | None = None,
     rng: np.random.Generator,
     without: Sequence[str] = (),
-    priors: Priors | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnose a session.
@@ -36,7 +35,6 @@ def diagnose(
             expected: the gap is what they leave. One that the session shows at another strength is named with that strength.
         rng: source of randomness.
         without: effects to leave out of the catalogue.
-        priors: probabilities of the kinds of hypothesis before looking.
         progress: called with the name of each stage.
 
     Raises:
@@ -44,7 +42,7 @@ def diagnose(
     """
     # thousands of small matrices: threads would wait for each other longer than they work
     with threadpool_limits(limits=1, user_api="blas"):
-        return _diagnosed(acquisition, twin, rng, without, priors, progress)
+        return _diagnosed(acquisition, twin, rng, without, progress)
 
 
 def _diagnosed(
@@ -52,14 +50,13 @@ def _diagnosed(
     twin: Twin | None,
     rng: np.random.Generator,
     without: Sequence[str],
-    priors: Priors | None,
     progress: Callable[[str], None] | None,
 ) -> Diagnosis:
     session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
     unseen = unseen_in_squares() if session.factor > 1 else {}
     try:
         problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
-        result = judge(problem, session.twin, rng=rng, priors=priors, progress=progress)
+        result = judge(problem, session.twin, rng=rng, progress=progress)
     except InputError as error:
         if session.suspects:
             raise mislabelled(acquisition, session.suspects) from error

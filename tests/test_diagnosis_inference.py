@@ -18,7 +18,7 @@ from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
 from raytwin.diagnosis.inference.search import _in_turn, _Slopes, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
-from raytwin.diagnosis.inference.unknown import CHANCE, beyond
+from raytwin.diagnosis.inference.unknown import beyond
 from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
 from raytwin.diagnosis.judgement.strengths import _outright
@@ -791,7 +791,7 @@ def test_a_law_that_leaves_a_rest_elsewhere_is_named_with_the_place_of_the_rest(
     assert found[0].rest in {f"group {number}" for number in range(24, 30)}
 
 
-def test_one_family_that_is_off_by_a_little_is_chance_and_several_are_an_unknown_effect(setup):
+def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unknown_one(setup):
     rng, factors, chosen = setup
     residual = noise(rng, factors)
     few = residual.copy()
@@ -800,14 +800,9 @@ def test_one_family_that_is_off_by_a_little_is_chance_and_several_are_an_unknown
     many = residual.copy()
     many[GROUPS % 2 == 0] += 2.5 * rng.standard_normal(int(np.count_nonzero(GROUPS % 2 == 0)))
     assert weigh(many, factors, chosen)[0].effects == (UNKNOWN,)
-    # what is off by much in all its probes is no chance
     much = residual.copy()
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
-    found = beyond(seen(much, factors), GROUPS, NAMES)
-    assert found.place == "group 7"
-    assert found.by_chance < found.log_evidence - 3.0
-    # never less than where nothing may be off, but for how often something is
-    assert beyond(seen(residual, factors), GROUPS, NAMES).allowed > np.log1p(-CHANCE.frequency) - 1e-9
+    assert beyond(seen(much, factors), GROUPS, NAMES).place == "group 7"
 
 
 # ---- effects in some series only

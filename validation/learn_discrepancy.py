@@ -3,7 +3,7 @@
 Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at each
 level of discrepancy, with and without a rest, tells how often each occurs and how long rests are (empirical Bayes, by expectation
 and maximisation); the same of what looks most like it once it is left out of the catalogue. The answers themselves are told beside
-it, and in how many sessions without an effect one family of probes is off.
+it.
 
     python validation/learn_discrepancy.py --line usual --families --json build/discrepancy/usual.json
     python validation/learn_discrepancy.py --learn build/discrepancy/*.json
@@ -27,7 +27,7 @@ from raytwin.diagnosis.inference.curve_fits import CurveFit
 from raytwin.diagnosis.inference.discrepancy import LEVELS
 from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
 from raytwin.diagnosis.inference.observed import Observed
-from raytwin.diagnosis.inference.unknown import LOG_DENSITY, beyond
+from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
 
@@ -51,8 +51,7 @@ def row_of(weighed: Weighed, planted: str) -> dict:
     parts = {"parts": problem.parts, "part_names": problem.part_names}
     row = {"planted": planted, **told(weighed.hypotheses)}
     if planted == "none":
-        found = beyond(observed, problem.parts, problem.part_names)
-        return row | {"by_chance": found.by_chance}
+        return row
     own = [fit for fit in weighed.fits if fit.curve.effect == planted]
     others = [fit for fit in weighed.fits if fit.curve.effect != planted]
     if own:
@@ -157,8 +156,6 @@ def learn(paths: list[Path]) -> None:
     print(f"# a wrong name {len(wrong)}; once left out unknown or none ", end="")
     left = [row["left_out"]["verdict"] for row in single if "left_out" in row]
     print(f"{sum(word in (UNKNOWN, 'no_gap') for word in left)} of {len(left)}")
-    off = [row["by_chance"] > _CLEAR for row in rows if "by_chance" in row]
-    print(f"# without an effect: one family off in {sum(off)} of {len(off)}")
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from ...generator.line.spectral_signal import OpenBeam, SpectralModel
 from .readings import FloatArray, Label, Reading
 
 INHERENT = PRIORS["inherent_filtration_mm_Al"]  # of a tube, beyond what is declared
+_OPEN = 0.03  # -log T below which a pixel sees the open field
 DEEPEST = 4.0  # -log T beyond which nothing is compared
 
 
@@ -112,13 +113,15 @@ class LabelModel:
         return np.asarray(depth.reshape(next(iter(maps.values())).shape), dtype=np.float64)
 
 
-def measured_depth(item: Reading, depth: FloatArray, open_DN: float | None) -> FloatArray | None:
-    """-log of the picture over the open field: seen beside the object, or as given."""
-    if item.picture is None:
-        return None
-    beside = depth < 0.03
-    if beside.sum() >= max(16, 0.02 * depth.size):
-        open_DN = float(np.median(item.picture[beside]))
-    if open_DN is None or not open_DN > 0:
+def open_field(picture: FloatArray, depth: FloatArray, good: NDArray[np.bool_] | None = None) -> float | None:
+    """Median of a picture beside its object, in the good pixels; None: it covers nearly all of the field."""
+    beside = depth < _OPEN if good is None else (depth < _OPEN) & good
+    return float(np.median(picture[beside])) if beside.sum() >= max(16, 0.02 * depth.size) else None
+
+
+def measured_depth(item: Reading, depth: FloatArray) -> FloatArray | None:
+    """-log of the picture over the open field beside the object; None: none is seen."""
+    open_DN = None if item.picture is None else open_field(item.picture, depth)
+    if item.picture is None or open_DN is None or not open_DN > 0:
         return None
     return np.asarray(-np.log(np.maximum(item.picture / open_DN, 1e-6)), dtype=np.float64)

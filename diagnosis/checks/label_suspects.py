@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acquisition.setting import text_from_filters
-from .label_model import DEEPEST, LabelModel, measured_depth
+from .label_model import DEEPEST, LabelModel, measured_depth, open_field
 from .readings import FloatArray, Label, Reading, Suspect
 
 LEAST_EVIDENCE = 10.0
@@ -90,28 +90,25 @@ class _Feature:
     covariance: Callable[[Sequence[int], Sequence[Label]], FloatArray]
 
     def log_evidence(self, labels: Sequence[Label]) -> float:
-        residual, factor = self._whitened(labels)
-        return float(-0.5 * residual @ residual - np.sum(np.log(np.diag(factor))))
-
-    def _whitened(self, labels: Sequence[Label]) -> tuple[FloatArray, FloatArray]:
         from scipy.linalg import cholesky, solve_triangular
 
-        own = [labels[index] for index in self.members]
-        residual = self.values - np.array(
-            [self.expected(index, label) for index, label in zip(self.members, own, strict=True)]
-        )
-        factor = cholesky(self.covariance(self.members, own) + np.diag(self.own_sd**2), lower=True)
-        return np.asarray(solve_triangular(factor, residual, lower=True), dtype=np.float64), factor
+        residual, covariance = self._residual(labels)
+        factor = cholesky(covariance, lower=True)
+        whitened = np.asarray(solve_triangular(factor, residual, lower=True), dtype=np.float64)
+        return float(-0.5 * whitened @ whitened - np.sum(np.log(np.diag(factor))))
 
     def left_out(self, labels: Sequence[Label]) -> dict[int, float]:
         """|z| of each member given all others."""
-        own = [labels[index] for index in self.members]
-        residual = self.values - np.array(
-            [self.expected(index, label) for index, label in zip(self.members, own, strict=True)]
-        )
-        inverse = np.linalg.inv(self.covariance(self.members, own) + np.diag(self.own_sd**2))
+        residual, covariance = self._residual(labels)
+        inverse = np.linalg.inv(covariance)
         z = np.abs(inverse @ residual) / np.sqrt(np.diag(inverse))
         return dict(zip(self.members, z.tolist(), strict=True))
+
+    def _residual(self, labels: Sequence[Label]) -> tuple[FloatArray, FloatArray]:
+        """Values less what labels let expect (member,), and the covariance of that (member, member)."""
+        own = [labels[index] for index in self.members]
+        expected = [self.expected(index, label) for index, label in zip(self.members, own, strict=True)]
+        return self.values - np.array(expected), self.covariance(self.members, own) + np.diag(self.own_sd**2)
 
 
 def _same(keys: Sequence[object]) -> FloatArray:
@@ -142,12 +139,10 @@ def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
             depth = maps.depth(item.series.scene, item.label)
             if depth is None or item.picture is None:
                 continue
-            beside = (depth < 0.03) & maps.good
-            if beside.sum() >= max(16, 0.02 * depth.size):
-                open_DN = float(np.median(item.picture[beside]))
-                if open_DN > 0:
-                    sd = math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
-                    levels[index] = (math.log(open_DN), sd)
+            open_DN = open_field(item.picture, depth, maps.good)
+            if open_DN is not None and open_DN > 0:
+                sd = math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
+                levels[index] = (math.log(open_DN), sd)
 
     def level_covariance(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
         _, later = beams(members, labels)
@@ -217,7 +212,7 @@ def _attenuation(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
         if item.series.kind != "object":
             continue
         depth = maps.depth(item.series.scene, item.label)
-        measured = None if depth is None else measured_depth(item, depth, None)
+        measured = None if depth is None else measured_depth(item, depth)
         if depth is None or measured is None:
             continue
         covered = (depth > 0.05) & (depth < DEEPEST) & maps.good

@@ -158,7 +158,7 @@ def _scales_of_map(item: Reading, maps: LabelModel, inherent_mm_Al: float) -> li
     depth = maps.depth(item.series.scene, item.label, inherent_mm_Al=inherent_mm_Al)
     if depth is None:
         return []
-    measured = measured_depth(item, depth, None)
+    measured = measured_depth(item, depth)
     covered = (depth > 0.05) & (depth < 2.5) & maps.good
     if measured is None or covered.sum() < 100:
         return []

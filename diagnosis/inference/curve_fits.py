@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -246,7 +245,6 @@ def interval_under(strengths: NDArray[np.float64], log_likelihood: NDArray[np.fl
     return math.exp(middle), math.exp(low), math.exp(high)
 
 
-def log_mean_exp(values: NDArray[np.float64], axis: int | tuple[int, ...] | None = None) -> Any:
-    top = np.max(values, axis=axis, keepdims=True)
-    mean = np.log(np.mean(np.exp(values - top), axis=axis, keepdims=True)) + top
-    return mean.item() if axis is None else np.squeeze(mean, axis=axis)
+def log_mean_exp(values: Sequence[float]) -> float:
+    """Log of the mean of what has these logarithms."""
+    return float(logsumexp(values)) - math.log(len(values))

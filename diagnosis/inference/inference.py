@@ -4,8 +4,7 @@ Probes are residuals r (probe,) against the twin, in units of their own standard
 integrated out exactly (they are linear with Gaussian priors): r ~ N(m, C), C = I + F F^T, F (probe, factor) the
 responses to the nuisances times their prior standard deviations.
 
-    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.standing`); now and then one family of
-              probes is off by a little (`unknown.Chance`)
+    none      m = 0, or what the twin's own effects do, known but for their laws (`Observed.standing`)
     effect    m = m_e(s), s the strength, log-uniform over its plausible range; its law is off by a level and may leave a rest in
               any families of probes (`discrepancy`), over which the evidence is averaged; what it does by chance is extra covariance
     pair      m = m_e(s) + m_f(t), each law off by a level of its own
@@ -30,7 +29,8 @@ from .unknown import LOG_DENSITY, Beyond, beyond
 
 UNKNOWN = "unknown_effect"
 _WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
-_PAIRS_FROM = 6  # effects, the likeliest, that are the first of a pair
+# the likeliest effects that are the first of a pair: with six the same are named (notebook, ablation)
+_PAIRS_FROM = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,10 +210,10 @@ class _Rests:
 
     def no_effect(self, rests: bool) -> Hypothesis:
         """What the twin has and nothing else; with `rests` the laws of that may leave a rest."""
-        plain = Hypothesis(effects=(), probability=0.0, log_evidence=self.none.allowed)
+        plain = Hypothesis(effects=(), probability=0.0, log_evidence=0.0)
         if not (rests and self._observed.given):
             return plain
-        return self._weighed(replace(plain, log_evidence=0.0), [], self.none.log_evidence, self.none)
+        return self._weighed(plain, [], self.none.log_evidence, self.none)
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
         """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
@@ -222,7 +222,7 @@ class _Rests:
 
     def _weighed(self, hypothesis: Hypothesis, points: Sequence[Point], evidence: float, found: Beyond) -> Hypothesis:
         """A hypothesis with log evidence `evidence` where there is a rest `found`, and without."""
-        plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind) + found.allowed
+        plain = hypothesis.log_evidence + math.log1p(-LEVELS.rest_of_kind)
         with_rest = evidence + math.log(LEVELS.rest_of_kind) + log_rest(self.ratio(points, found)) - LOG_DENSITY
         return replace(
             hypothesis,
@@ -245,7 +245,7 @@ class _Rests:
         """Log evidence over none of an effect that is only like one of the catalogue's."""
         any_strength = self._any_strength(single.best.curve.effect)
         full = [fit for fit in single.fits if len(fit.by_level) > 1]
-        plain = log_mean_exp(np.array([fit.of_another(any_strength=any_strength) for fit in full]))
+        plain = log_mean_exp([fit.of_another(any_strength=any_strength) for fit in full])
         points = [single.best.at_level(LEVELS.levels[-1])]
         evidence, found = self.beside(points, another=True)
         evidence += log_rest(self.ratio(points, found), another=True) - LOG_DENSITY

@@ -16,7 +16,7 @@ from .curve_fits import CurveFit, fit_curve, log_integral, log_mean_exp, refined
 from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
 from .observed import Observed, Point
 
-_IN_FULL = 10  # pairs, the likeliest at first sight, that are settled
+_IN_FULL = 3  # pairs, the likeliest at first sight, that are settled: with ten the same are named (notebook, ablation)
 _TURNS, _SETTLED = 6, 0.1  # in which two settle, and gain of log evidence that ends them
 _CARRIED = LEVELS.up_to(FARTHEST_LEVEL)
 _VARIANTS = 2  # of an effect beside another, the likeliest at first sight, that are fitted with all levels
@@ -34,7 +34,7 @@ class Single:
     def of(fits: Sequence[CurveFit]) -> "Single":
         """From the fits of all its variants."""
         best = max(fits, key=lambda fit: fit.log_evidence)
-        mean = float(log_mean_exp(np.array([fit.log_evidence for fit in fits])))
+        mean = log_mean_exp([fit.log_evidence for fit in fits])
         return Single(fits=fits, best=replace(best, share=mean - best.log_evidence), log_evidence=mean)
 
 

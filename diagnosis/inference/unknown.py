@@ -1,14 +1,11 @@
 """What no catalogue holds: more variance in some families of probes than anything known gives them.
 
-In how many families an unknown effect shows is not known: every number of them is as likely as another. A single family that is
-off by a little is what sessions without any effect show now and then (`Chance`).
+In how many families an unknown effect shows is not known: every number of them is as likely as another.
 """
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,44 +18,16 @@ _SWEEPS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Chance:
-    """One family of probes that is off where there is no effect: how often, and by how much at most.
-
-    Fields: frequency; largest: root of the sum of the extra variances of all its probes, standard deviations. The least of `SIZES`,
-    noise that is known to an eighth, may be in a family of any number of probes.
-    """
-
-    frequency: float
-    largest: float
-
-
-def _learnt() -> Chance:
-    """As `validation/learn_discrepancy.py` left it."""
-    table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
-    return Chance(**table["chance"])
-
-
-CHANCE = _learnt()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Beyond:
     """What a residual shows beyond what may vary.
 
-    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; by_chance: log
-    evidence over none of one family that is off by as much as chance does at most; length: root of the sum of the extra variances of
-    all probes, in standard deviations of the first probes.
+    Fields: log_evidence over none of an unknown effect; place: family of probes in which it is seen most; length: root of the sum of
+    the extra variances of all probes, in standard deviations of the first probes.
     """
 
     log_evidence: float
     place: str
     length: float
-    by_chance: float
-
-    @property
-    def allowed(self) -> float:
-        """Log evidence of no effect, one family off now and then, over that of none ever off."""
-        return float(np.logaddexp(math.log1p(-CHANCE.frequency), math.log(CHANCE.frequency) + self.by_chance))
 
 
 def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> Beyond:
@@ -111,16 +80,11 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
         place = int(np.unravel_index(int(np.argmax(own)), own.shape)[0])
     else:
         place = int(np.argmax(tau2 * sizes))
-    largest = np.maximum(CHANCE.largest / np.sqrt(np.maximum(sizes, 1)), SIZES[0])
-    possible = [own[g, largest[g] >= SIZES] for g in range(len(members)) if sizes[g]]
-    by_chance = float(np.logaddexp.reduce([np.logaddexp.reduce(one) - math.log(len(one)) for one in possible]))
     units = observed.units
     length = math.sqrt(
         sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
     )
-    return Beyond(
-        log_evidence=best - base, place=str(names[place]), length=length, by_chance=by_chance - math.log(count)
-    )
+    return Beyond(log_evidence=best - base, place=str(names[place]), length=length)
 
 
 def _price(shown: int, count: int) -> float:

@@ -14,7 +14,7 @@ from ..advice.plan import WORTH_IT, best_repeat, repeat_text
 from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
-from ..inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
 from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
@@ -41,12 +41,11 @@ def judge(
     twin: Twin,
     *,
     rng: np.random.Generator,
-    priors: Priors | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """The answer to an assembled problem."""
     tell = progress or (lambda stage: None)
-    weighed = weigh_problem(problem, priors=priors, tell=tell)
+    weighed = weigh_problem(problem, tell=tell)
     problem = weighed.problem
     nuisances = LocalNuisances(problem.factors, problem.blocks)
     verdict = verdict_of(weighed.hypotheses)
@@ -99,9 +98,7 @@ class Weighed:
     fits: Sequence[CurveFit]
 
 
-def weigh_problem(
-    problem: Problem, *, priors: Priors | None = None, tell: Callable[[str], None] = lambda stage: None
-) -> Weighed:
+def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stage: None) -> Weighed:
     """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
     whitening = Whitening(problem.factors, problem.blocks)
@@ -131,7 +128,6 @@ def weigh_problem(
             seen,
             parts=problem.parts,
             part_names=problem.part_names,
-            priors=priors,
             of_catalogue=len(EFFECTS),
             rests=rests,
         )
@@ -260,7 +256,7 @@ def _causes(
         # of what is named, as it stands in the explanation that leads
         best = next(item for item in (verdict.leading, *verdict.hypotheses) if effect in item.effects)
         curve = best.variants[effect]
-        variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+        variant = problem.variant_of(curve)
         causes.append(
             Cause(
                 effect=effect,

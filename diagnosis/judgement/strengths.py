@@ -47,8 +47,7 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
 
 
 def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
-    curve = hypothesis.variants[effect]
-    variant = next(item for item in problem.variants if item.effect == curve.effect and item.name == curve.variant)
+    variant = problem.variant_of(hypothesis.variants[effect])
     return with_conditions(variant.applied(strength), problem.conditions)
 
 

@@ -6,9 +6,7 @@ Files:
     frame_scalars       noise, times and patterns of measured frames
     model_scalars       the same by the forward model
     line_scalars        what noise of rows and columns adds to scalars
-    line_scalars        what noise of lines adds to them
     scalar_context      pixels, times and numbers that both refer to
-    line_scalars        what noise of rows and columns adds to them
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     lasting             pixels whose level lasts from frame to frame
     registration        displacement of a scene against its thickness maps

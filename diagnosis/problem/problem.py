@@ -91,6 +91,10 @@ class Problem:
         responses = np.where(np.isin(self.series_of, series), both[1].responses, 0.0)
         return replace(self, curves=(*self.curves, own.curve(responses)), variants=(*self.variants, own))
 
+    def variant_of(self, curve: Curve) -> Variant:
+        """The variant whose curve it is."""
+        return next(item for item in self.variants if (item.effect, item.name) == (curve.effect, curve.variant))
+
     def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
         """The residual (probe,) of the base less those of its own effects that are among these."""
         left = self.residual.copy()

@@ -118,7 +118,7 @@ def object_materials(
             told.append(f"{name}: too few objects have product around them")
             continue
         material = _fit(line, name, product, used, dilations)
-        if material.scatter > _WIDEST:
+        if material.scatter > _WIDEST or material.a <= 0:
             told.append(
                 f"{name}: contrasts scatter by {100 * material.scatter:.0f} % about what the path lengths say; masks, path lengths"
                 " and images do not belong together"

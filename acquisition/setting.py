@@ -149,7 +149,7 @@ class Setting:
         Example:
             >>> from raytwin.acquisition.setting import Setting
             >>> Setting(kV=40, power_W=20, exposure_ms=20).stated_load_mAs()
-            10.0
+            0.01
         """
         load = self.tube_load_mAs
         if load is None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from raytwin.acquisition.setting import filters_from_text, setting_from_text
+from raytwin.acquisition.setting import Setting, filters_from_text, setting_from_text
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.frames._spread import noise_pattern
@@ -595,3 +595,12 @@ def test_light_goes_as_the_load_of_the_tube(series_line):
     )
     np.testing.assert_allclose(strong.signal_DN, 2.5 * weak.signal_DN, rtol=1e-9)
     np.testing.assert_allclose(strong.quantum_variance_DN2, 2.5 * weak.quantum_variance_DN2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("documented", [LineModel, Setting.stated_load_mAs])
+def test_examples_of_docstrings_run(documented):
+    import doctest
+
+    (test,) = doctest.DocTestFinder(recurse=False).find(documented, documented.__name__, globs={})
+    found = doctest.DocTestRunner().run(test)
+    assert found.attempted > 0 and found.failed == 0

@@ -92,10 +92,11 @@ class LineModel:
         cache: scenes and beams that were projected; lines that share it share them.
 
     Example:
-        >>> from raytwin.generator import LineModel, SeriesRequest, read_any_twin
+        >>> import raytwin as rt
+        >>> from raytwin.generator import LineModel, SeriesRequest
         >>> from raytwin.acquisition.setting import setting_from_text
         >>> setting = setting_from_text("kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1")
-        >>> line = LineModel(read_any_twin("virtual_lab"))
+        >>> line = LineModel(rt.read_twin("virtual_lab"))
         >>> flat = line.expect(SeriesRequest(kind="flat", setting=setting, frames=10, exposure_ms=20.0))
         >>> flat.mean_DN.ndim
         2

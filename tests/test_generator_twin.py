@@ -167,6 +167,8 @@ DAMAGES = {
     "no format": (lambda file: file.attrs.pop("format"), "no format"),
     "a missing map": (lambda file: file["maps"].pop("dark_DN"), "damaged file"),
     "no levels": (lambda file: file.pop("levels"), "damaged file"),
+    "a list for names": (lambda file: file.attrs.modify("provenance", "[]"), "damaged file"),
+    "names for texts": (lambda file: file.attrs.modify("warnings", "{}"), "damaged file"),
     "spoiled text": (lambda file: file.attrs.modify("evidence", "{"), "damaged file"),
     "a missing estimate": (lambda file: file["noise"].attrs.pop("psf_sigma_px"), "psf_sigma_px"),
     "a wrong interval": (lambda file: file["noise"].attrs.modify("dark_DN", [3.0, 4.0, 5.0]), "low <= value"),

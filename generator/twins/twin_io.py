@@ -66,6 +66,22 @@ def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
+def _object(value: Any) -> dict[str, Any]:
+    """Names with values, of their JSON."""
+    found = json.loads(_text(value))
+    if not isinstance(found, dict):
+        raise ValueError(f"{type(found).__name__} where names with values belong")
+    return found
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    """Texts, of their JSON."""
+    found = json.loads(_text(value))
+    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        raise ValueError(f"{type(found).__name__} where a list of texts belongs")
+    return tuple(found)
+
+
 def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
     """Write a twin, whole or of a tube alone; the file appears whole or not at all."""
     import h5py
@@ -234,9 +250,9 @@ def _tube_from_file(file: Any, path: object) -> TubeTwin:
         instrument=_instrument_from_file(file, path),
         spectral=_spectral_from_group(file["spectral"], path),
         output_known=bool(file.attrs["output_known"]),
-        evidence=json.loads(_text(file.attrs["evidence"])),
-        warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
-        provenance=json.loads(_text(file.attrs["provenance"])),
+        evidence=_object(file.attrs["evidence"]),
+        warnings=_texts(file.attrs["warnings"]),
+        provenance=_object(file.attrs["provenance"]),
     )
 
 
@@ -259,7 +275,7 @@ def _twin_from_file(file: Any, path: object) -> Twin:
                 source_detector_mm=_optional_float(group, "source_detector_mm"),
                 saturation_DN=_optional_float(group, "saturation_DN"),
                 flat_shape=_array(group, "flat_shape", np.float32),
-                series=tuple(json.loads(_text(group.attrs["series"]))),
+                series=_texts(group.attrs["series"]),
                 role=_text(group.attrs["role"]),
             )
         )
@@ -295,9 +311,9 @@ def _twin_from_file(file: Any, path: object) -> Twin:
         dark_DN=_required(_get_estimate(noise, "dark_DN"), "dark_DN", path),
         levels=tuple(levels),
         spectral=spectral,
-        evidence=json.loads(_text(file.attrs["evidence"])),
-        warnings=tuple(json.loads(_text(file.attrs["warnings"]))),
-        provenance=json.loads(_text(file.attrs["provenance"])),
+        evidence=_object(file.attrs["evidence"]),
+        warnings=_texts(file.attrs["warnings"]),
+        provenance=_object(file.attrs["provenance"]),
         effects=_effects_from_text(_text(file.attrs["effects"])) if "effects" in file.attrs else (),
     )
 
@@ -320,11 +336,11 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
 def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
     attributes = group.attrs
     spectral = SpectralPosterior(
-        names=tuple(json.loads(_text(attributes["names"]))),
+        names=_texts(attributes["names"]),
         samples=_array(group, "samples", np.float64),
         best=_array(group, "best", np.float64),
-        prior=json.loads(_text(attributes["prior"])),
-        undetermined=tuple(json.loads(_text(attributes["undetermined"]))),
+        prior=_object(attributes["prior"]),
+        undetermined=_texts(attributes["undetermined"]),
         anode=_text(attributes["anode"]),
         anode_angle_deg=float(attributes["anode_angle_deg"]),
         model=_text(attributes["model"]),
@@ -338,7 +354,7 @@ def _spectral_from_group(group: Any, path: object) -> SpectralPosterior:
         gain_discrepancy=float(attributes["gain_discrepancy"]),
         kerma_discrepancy=_optional_float(group, "kerma_discrepancy"),
         calibrated_kV=(float(attributes["calibrated_kV"][0]), float(attributes["calibrated_kV"][1])),
-        calibrated_filters=tuple(json.loads(_text(attributes["calibrated_filters"]))),
+        calibrated_filters=_texts(attributes["calibrated_filters"]),
     )
     wide = len(spectral.names)
     samples, best = spectral.samples, spectral.best

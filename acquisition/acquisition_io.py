@@ -317,6 +317,8 @@ def _each(
     made = []
     for name in group:
         try:
+            if isinstance(name, bytes):  # h5py's way to hand out what is no text
+                raise FileFormatError(path, received=f"a name that is no text, {name!r}", expected="names in UTF-8")
             with reading(f"{path}, {name}"):
                 made.append((name, make(group, name, path=path)))
         except FileFormatError as error:

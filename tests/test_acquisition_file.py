@@ -225,6 +225,13 @@ def test_no_file_a_folder_text_and_a_truncated_file_are_told_apart(tmp_path):
         assert "truncated" in fails(tmp_path / "cut.h5")
 
 
+def test_a_series_whose_name_is_no_text_is_named(path):
+    small(path)
+    with h5py.File(path, "a") as file:
+        file["series"].move("flat", b"fl\xff")
+    assert r"a name that is no text, b'fl\xff'" in fails(path)
+
+
 def test_another_format_or_version_is_named(path):
     small(path)
     with h5py.File(path, "a") as file:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from ..diagnosis.model.changes import ATTENUATION_SD
 from ..errors import InputError
 
 if TYPE_CHECKING:
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 _FEWEST = 8  # objects: two numbers and their scatter are asked of two contrasts of each
 _PRIOR_SD = 0.3  # of a and b: bones are tabulated from 1.18 to 1.92 g/cm3 (ICRU 44 and 46), 25 % about their middle
 _STEP = 0.1  # of a and b, for slopes: contrast is nearly straight in them
-_TURNS = 3
-_WIDEST = 0.5  # scatter of contrasts between objects beyond which images and path lengths do not belong together
+_TURNS = 3  # of Gauss and Newton: the second changes contrasts of bones by 1e-3 of the first
+_WIDEST = 0.5  # scatter of contrasts from object to object; a choice: beyond it one of twenty is off by a factor of two
 _Z95 = 1.959964
 
 
@@ -32,7 +33,8 @@ class ObjectMaterial:
 
     Fields: material; product: the material around them; objects: how many were looked at; a, b: mm of material and of product for
     each mm of the object, with `covariance` (2, 2); scatter: of contrasts from object to object, relative; contrast_percent: change
-    of the mean contrast at the low and at the high voltage against the library's, each (value, low, high) of 95 %.
+    of the mean contrast at the low and at the high voltage against the library's, each (value, low, high) of 95 %. Covariance and
+    intervals hold noise, scatter, and what is not known of the twin.
     """
 
     material: str
@@ -78,6 +80,8 @@ def object_materials(
     scenes: Sequence["KnownScene"],
     measured: Mapping[str, NDArray[np.floating]],
     *,
+    draws: Sequence["KnownScenes"],
+    steps: Sequence["KnownScenes"],
     product: str,
     dilations: int,
 ) -> tuple[list[ObjectMaterial], list[str]]:
@@ -87,6 +91,8 @@ def object_materials(
         line: the twin's pictures at the settings of the images.
         scenes: objects of known thickness; those without a measured image are not looked at.
         measured: image of a scene -> mean -ln(I / I0) (2, row, column), low voltage first.
+        draws: the same of draws from the posterior of the spectrum.
+        steps: the same with one of the twin's effects a standard deviation stronger, each.
         product: material around the objects.
         dilations: width of the ring around an object that its contrast is taken against, px.
     """
@@ -117,11 +123,12 @@ def object_materials(
         if len(used) < _FEWEST:
             told.append(f"{name}: too few objects have product around them")
             continue
-        material = _fit(line, name, product, used, dilations)
+        common = _of_the_twin(line, [scene for scene, _ in used[:_FEWEST]], draws, steps, dilations)
+        material = _fit(line, name, product, used, dilations, common)
         if material.scatter > _WIDEST or material.a <= 0:
             told.append(
-                f"{name}: contrasts scatter by {100 * material.scatter:.0f} % about what the path lengths say; masks, path lengths"
-                " and images do not belong together"
+                f"{name}: contrasts scatter by {100 * material.scatter:.0f} % about what the path lengths say, as of"
+                f" {material.a:.2g} mm for each mm; masks, path lengths and images do not belong together"
             )
         else:
             found.append(material)
@@ -151,12 +158,43 @@ def _contrast(image: NDArray[np.floating], scene: "KnownScene", dilations: int) 
     return _Contrast(value, noise * (1.0 / np.count_nonzero(inside) + 1.0 / np.count_nonzero(ring)))
 
 
+def _expected(line: "KnownScenes", scenes: Sequence["KnownScene"], dilations: int) -> NDArray[np.float64]:
+    """Contrasts (object, 2) in pictures without noise; NaN where there is no ring."""
+    rows = []
+    for scene in scenes:
+        images = line.expected(scene.thickness_mm)
+        contrast = _contrast(np.stack([image.log_image for image in images]), scene, dilations)
+        rows.append(np.full(2, np.nan) if contrast is None else contrast.value)
+    return np.array(rows)
+
+
+def _of_the_twin(
+    line: "KnownScenes",
+    scenes: Sequence["KnownScene"],
+    draws: Sequence["KnownScenes"],
+    steps: Sequence["KnownScenes"],
+    dilations: int,
+) -> NDArray[np.float64]:
+    """Covariance (2, 2) of the relative error that contrasts of all objects share, as spectrum, effects and tables are not known."""
+    usual = _expected(line, scenes, dilations)
+
+    def outer(other: "KnownScenes") -> NDArray[np.float64]:
+        change = np.nanmean(_expected(other, scenes, dilations) - usual, axis=0) / np.nanmean(usual, axis=0)
+        return np.outer(change, change)
+
+    total = np.full((2, 2), ATTENUATION_SD**2)
+    if draws:
+        total = total + np.mean([outer(one) for one in draws], axis=0)
+    return np.asarray(total + sum((outer(one) for one in steps), np.zeros((2, 2))))
+
+
 def _fit(
     line: "KnownScenes",
     material: str,
     product: str,
     used: Sequence[tuple["KnownScene", _Contrast]],
     dilations: int,
+    common: NDArray[np.float64],
 ) -> ObjectMaterial:
     own = ObjectMaterial(
         material=material,
@@ -170,13 +208,7 @@ def _fit(
     )
 
     def expected(a: float, b: float) -> NDArray[np.float64]:
-        """Contrasts (object, 2)."""
-        rows = []
-        for scene, _ in used:
-            images = line.expected(replace(own, a=a, b=b).scene(scene).thickness_mm)
-            contrast = _contrast(np.stack([image.log_image for image in images]), scene, dilations)
-            rows.append(np.full(2, np.nan) if contrast is None else contrast.value)
-        return np.array(rows)
+        return _expected(line, [replace(own, a=a, b=b).scene(scene) for scene, _ in used], dilations)
 
     seen = np.array([one.value for _, one in used])
     noise = np.array([one.noise for _, one in used])
@@ -186,14 +218,17 @@ def _fit(
     )
     at, there = np.array([1.0, 0.0]), library
     usable = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(noise).all(axis=1)
-    scatter, covariance = 0.0, np.eye(2)
+    scatter, covariance, gain = 0.0, np.eye(2), np.eye(2)
     for turn in range(_TURNS):
         if turn:
             there = expected(*at)
-        scatter, change, covariance = _step((seen - there)[usable], slopes[usable], there[usable], noise[usable], at)
+        scatter, change, covariance, gain = _step(
+            (seen - there)[usable], slopes[usable], there[usable], noise[usable], at
+        )
         at = at + change
     mean_slope = slopes[usable].mean(axis=0)
     mean = np.abs(library[usable].mean(axis=0))
+    covariance = covariance + gain @ common @ gain.T
     percents = []
     for channel in range(2):
         value = 100.0 * float(mean_slope[channel] @ (at - [1.0, 0.0])) / float(mean[channel])
@@ -216,8 +251,10 @@ def _step(
     there: NDArray[np.float64],
     noise: NDArray[np.float64],
     at: NDArray[np.float64],
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Scatter between objects, change of (a, b), its covariance: what is left of each object is N(0, noise + scatter^2 p p').
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Scatter between objects, change of (a, b), its covariance, and by how much it follows a relative error of all contrasts (2, 2).
+
+    What is left of each object is N(0, noise + scatter^2 p p').
 
     Args:
         left: (object, 2) contrast not explained.
@@ -229,7 +266,7 @@ def _step(
     prior = np.eye(2) / _PRIOR_SD**2
     towards = prior @ (np.array([1.0, 0.0]) - at)
 
-    def solved(log_scatter: float) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    def solved(log_scatter: float) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         covariances = (
             np.einsum("ij,jk->ijk", noise, np.eye(2))
             + math.exp(2.0 * log_scatter) * there[:, :, None] * there[:, None, :]
@@ -247,8 +284,8 @@ def _step(
             + float(np.linalg.slogdet(information)[1])
             + float(away @ prior @ away)
         )
-        return fit, change, np.asarray(np.linalg.inv(information))
+        inverse = np.asarray(np.linalg.inv(information))
+        return fit, change, inverse, inverse @ np.einsum("nki,nkl,nl->il", slopes, weights, there)
 
     best = minimize_scalar(lambda value: solved(value)[0], bounds=(math.log(1e-4), 0.0), method="bounded")
-    _, change, covariance = solved(float(best.x))
-    return math.exp(float(best.x)), change, covariance
+    return math.exp(float(best.x)), *solved(float(best.x))[1:]

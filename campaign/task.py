@@ -37,6 +37,7 @@ from ..acquisition.pairs import ObjectPair, dataset_from_acquisition, object_pai
 from ..acquisition.setting import Setting, setting_from_text
 from ..errors import FileFormatError, FitError, InputError
 from ..files import sha256_of_file, whole_file
+from ..generator.effects import effect_of
 from ._plain import plain
 from .trial import curve_of_table, detect_on_file, scene_of, thresholds_from_images, train_on_file, write_split
 
@@ -59,6 +60,7 @@ TRIALS = (
 )
 _FEWEST_TO_LEARN = 8  # measured images with a foreign object, below which networks of their own are not trained
 _WORKERS = 2  # processes that share the networks of a kind; the weights do not depend on their number
+_DRAWN = 16  # spectra: a standard deviation of so many is known to a sixth
 _START_AVERAGED = 16  # the common start learns from images of as many frames: noisy ones teach a new network nothing
 
 
@@ -498,11 +500,18 @@ class _KnownSource:
             for number, row in enumerate(dataset.rows):
                 if row.split in ("train", "val") and row.foreign_object:
                     images.setdefault(scene_of(row.image), []).append(dataset.images(number))
-        line = KnownScenes(twin, low=self.low, high=self.high, product_material=self.material)
+
+        def line_of(other: "Twin") -> KnownScenes:
+            return KnownScenes(other, low=self.low, high=self.high, product_material=self.material)
+
+        line = line_of(twin)
+        draws = _drawn_twins(twin, np.random.default_rng([self.plan.seed, 3]))
         found, told = object_materials(
             line,
             self.library,
             {name: np.mean(frames, axis=0) for name, frames in images.items()},
+            draws=[line_of(other) for other in draws],
+            steps=[line_of(other) for other in _stepped_twins(twin)],
             product=self.material,
             dilations=dilations_for_pixel(line.geometry.pixel_mm),
         )
@@ -677,6 +686,25 @@ class _ReferenceSource:
         chosen.unlink()
         write_split(whole, path, part)
         return summary.warnings
+
+
+def _drawn_twins(twin: "Twin", rng: np.random.Generator) -> list["Twin"]:
+    """The twin with other spectra that its calibration allows."""
+    spectral = twin.spectral
+    if spectral is None:
+        return []
+    chosen = rng.choice(len(spectral.samples), min(_DRAWN, len(spectral.samples)), replace=False)
+    return [replace(twin, spectral=replace(spectral, best=spectral.samples[number])) for number in chosen]
+
+
+def _stepped_twins(twin: "Twin") -> list["Twin"]:
+    """The twin with each of its effects one standard deviation stronger."""
+    stepped = []
+    for number, item in enumerate(twin.effects):
+        strength = effect_of(item).values(item.parameters)["strength"] * (1.0 + item.sd)
+        stronger = replace(item, parameters={**item.parameters, "strength": strength})
+        stepped.append(replace(twin, effects=(*twin.effects[:number], stronger, *twin.effects[number + 1 :])))
+    return stepped
 
 
 _Source = _KnownSource | _DescribedSource | _ReferenceSource

@@ -1,5 +1,6 @@
 """The twin and its file, predictions, generation and the paper's recipe, on a twin whose parameters are set by hand."""
 
+import dataclasses
 import math
 from dataclasses import fields, replace
 
@@ -13,6 +14,7 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import filters_from_text
 from raytwin.errors import FileFormatError, InputError
 from raytwin.generator.datasets.generate import ChannelModel, generate_dataset
+from raytwin.generator.line.measured_flats import measured_flats
 from raytwin.generator.line.spectral_signal import OpenBeam, SpectralModel
 from raytwin.generator.line.twin import (
     DetectorMaps,
@@ -563,3 +565,21 @@ def test_noise_from_scratch_and_prediction_agree(twin):
         rng=rng,
     )
     assert noise.std() == pytest.approx(prediction.sd_DN.value, rel=5 * math.sqrt(2.5 / 2 / noise.size))
+
+
+@pytest.mark.parametrize("rows", [[{"used": True}], [{"used": True, "series": "a", "signal_DN": "dim"}], [3], 5])
+def test_flats_of_a_twin_that_cannot_be_read_are_one_line(series_line, rows):
+    damaged = dataclasses.replace(series_line, evidence={"photon_transfer": rows})
+    with pytest.raises(InputError, match=r"photon_transfer.*calibrate again"):
+        measured_flats(damaged)
+
+
+def test_only_flats_that_were_used_and_have_light_are_measured_flats(series_line):
+    rows = [
+        {"used": True, "series": "a", "signal_DN": 900.0, "kV": 40, "exposure_ms": 20, "load_mAs": 0.02},
+        {"used": False, "series": "b", "signal_DN": 900.0},
+        {"used": True, "series": "c", "signal_DN": 0.0},
+    ]
+    (flat,) = measured_flats(dataclasses.replace(series_line, evidence={"photon_transfer": rows}))
+    assert (flat.series, flat.signal_DN, flat.kV, flat.load_mAs) == ("a", 900.0, 40.0, 0.02)
+    assert measured_flats(dataclasses.replace(series_line, evidence={})) == ()

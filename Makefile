@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 ROOMS := acquisition calibration campaign diagnosis generator lab materials observers pod reports segmentation spectra
 READY := $(VENV)/.ready
 
-.PHONY: demo table discrepancy docs wheel-check bounds-check lock stories test test-slow test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
+.PHONY: demo table discrepancy docs wheel-check bounds-check lock stories test test-slow test-gpu test-page validation validation-input validation-generator validation-prediction validation-simulators starter blind-check benchmark benchmark-memory check format clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -116,6 +116,10 @@ stories: $(READY)
 	for story in scatter drift_and_lag spectrum tie; do \
 	mkdir -p build/stories/$$story && \
 	(cd build/stories/$$story && PATH=$(CURDIR)/$(BIN):$$PATH sh $(CURDIR)/docs/stories/$$story.sh) || exit 1; done
+
+# kernels, training, ensembles and detection on a CUDA device, against the processor; skipped where there is none
+test-gpu: $(READY)
+	CUBLAS_WORKSPACE_CONFIG=:4096:8 $(BIN)/python -m pytest -q -m gpu tests/test_gpu.py
 
 # the starter network again, from data/starter/starter.toml; about an hour on one core; a stopped run goes on
 starter: $(READY)

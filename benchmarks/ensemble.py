@@ -108,6 +108,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--turns", type=int, default=2)
+    parser.add_argument("--device", default="cpu", help="cpu (default) or cuda")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     recipe = dataclasses.replace(starter_recipe(), batch=BATCH, steps=given.steps)
@@ -126,6 +127,7 @@ def main() -> None:
                         networks=networks,
                         workers=workers,
                         start_from="starter",
+                        device=given.device,
                     )
                 )
 
@@ -133,9 +135,10 @@ def main() -> None:
             for turn in range(given.turns):
                 found["one"].append(train(f"one_{turn}", 1, 1))
                 found["processes"].append(train(f"processes_{turn}", given.networks, given.workers))
-                one, several = batched_step(recipe, given.networks, steps=3)
-                found["one_step"].append(one)
-                found["batched_step"].append(several)
+                if given.device == "cpu":
+                    one, several = batched_step(recipe, given.networks, steps=3)
+                    found["one_step"].append(one)
+                    found["batched_step"].append(several)
 
     def ratio(much: str, little: str, kind: str) -> float:
         return round(sum(item[kind] for item in found[much]) / sum(item[kind] for item in found[little]), 2)
@@ -148,7 +151,9 @@ def main() -> None:
             name: [{kind: round(one[kind], 2) for kind in kinds} for one in rows] for name, rows in found.items()
         },
         "processes_over_one": {kind: ratio("processes", "one", kind) for kind in kinds},
-        "batched_over_one": {kind: ratio("batched_step", "one_step", kind) for kind in kinds},
+        "batched_over_one": {kind: ratio("batched_step", "one_step", kind) for kind in kinds}
+        if found["one_step"]
+        else None,
     }
     print(json.dumps(answer, indent=1))
 

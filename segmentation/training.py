@@ -105,7 +105,9 @@ def iterate_training(
 ) -> Iterator[TrainingState]:
     """Train one network, giving its state after every epoch; the best weights are those of the lowest validation loss.
 
-    The same arguments give the same weights on the same processor, torch and number of threads, resumed or not.
+    The same arguments give the same weights on the same processor, torch and number of threads, resumed or not. A GPU adds
+    in an order of its own: weights agree there but for what grows from last bits, unless torch is told to use deterministic
+    algorithms (`torch.use_deterministic_algorithms(True)`).
 
     Args:
         train, validation: labelled images.
@@ -193,9 +195,11 @@ def _train_epoch(
     first_step: int,
     steps: int,
 ) -> float:
+    """One pass; returns the mean loss."""
+    torch = load_torch()
     loss_function = LOSSES[recipe.loss]
     network.train()
-    total = 0.0
+    losses = []
     batches = _batches(len(train), recipe.batch, generator)
     for step, numbers in enumerate(batches, start=first_step):
         rate = learning_rate_at(step, recipe=recipe, steps=steps)
@@ -208,8 +212,9 @@ def _train_epoch(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        total += float(loss.detach())
-    return total / len(batches)
+        losses.append(loss.detach())
+    # read once an epoch: so a GPU works on while the next batch is made
+    return float(sum(torch.stack(losses).tolist()) / len(batches))
 
 
 def _augmented(

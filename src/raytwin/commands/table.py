@@ -17,6 +17,7 @@ EXAMPLE = """examples:
   raytwin table -o table --workers 2                          # ten networks an exposure, some hours on two cores
   raytwin table -o quick --networks 3 --exposures-ms 100,20 --test-products 120 --boneless 30
   raytwin table -o papers --start random --steps 600          # DeepLabV3Plus from random weights
+  raytwin table -o table --networks 30 --device cuda --workers 10   # ten processes share the GPU
 """
 
 
@@ -44,8 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alarm-share", type=float, help="rate of false alarms that thresholds are set for (0.05)")
     parser.add_argument("--without-published", action="store_true", help="without images generated as published")
     parser.add_argument(
-        "--workers", type=int, default=1, help="processes that train, a core each (1); same bytes for any number"
+        "--workers",
+        type=int,
+        default=1,
+        help="processes that train, a core each (1); same bytes for any number on a processor",
     )
+    parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
     parser.add_argument("--seed", type=int, help="seed of everything (1)")
     parser.add_argument("--json", action="store_true", help="print the table as JSON")
 
@@ -62,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise InputError("--workers", received=arguments.workers, expected="1 or more")
     plan = plan_of(**_plan_words(arguments))
-    choose_device("cpu")  # says at once how to install torch where it is missing
+    device = choose_device(arguments.device)  # says at once how to install torch where it is missing
     started = time.monotonic()
 
     def page(result: Any) -> None:
@@ -74,6 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         run=main,
         version=__version__,
         workers=arguments.workers,
+        device=device,
         tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}"),
         each=page,
     )

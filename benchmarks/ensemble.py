@@ -3,9 +3,9 @@
 The starter's network on the same stored images, each way in the same run: one network; ten in two processes, as
 `raytwin train --workers 2` trains them; one batched step of ten against a step of one. Ratios of seconds by the clock, and
 of processor seconds, which other work on the machine disturbs less. With w idle cores the clock's ratio is the processor's
-over w.
+over w. On a GPU (`--device cuda`) the processes share it, and the batched step is left out.
 
-    OMP_NUM_THREADS=1 python benchmarks/ensemble.py [--networks 10] [--workers 2] [--steps 60]
+    OMP_NUM_THREADS=1 python benchmarks/ensemble.py [--networks 10] [--workers 2] [--steps 60] [--device cuda]
 """
 
 import argparse

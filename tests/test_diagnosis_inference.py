@@ -779,6 +779,36 @@ def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_act
     assert weigh(residual, np.zeros((PROBES, 1)), wide)[0].effects == ("effect0", "effect1")
 
 
+def test_what_a_curve_moves_in_a_series_is_what_it_would_move_there_alone_whatever_nuisances_series_share():
+    rng = np.random.default_rng(11)
+    (curve,) = independent((300, 1.0))
+    common = 3.0 * rng.standard_normal((PROBES, 2))  # moves all series together
+    observed = seen(noise(rng, common), common)
+    squares = observed.squares_by_series(curve, 20.0)
+    covariance = np.eye(PROBES) + common @ common.T
+    alone = np.where(GROUPS == 4, curve.response(20.0), 0.0)
+    assert squares[4] == pytest.approx(alone @ np.linalg.solve(covariance, alone), rel=1e-9)
+    assert np.all(squares[:15] > 0)
+    assert not squares[15:].any()
+
+
+def test_what_a_law_leaves_is_its_own_beside_a_nuisance_of_series_that_it_does_not_move():
+    # the level of all series is hardly known: what moves some of them tells of the others, too
+    rng = np.random.default_rng(8)
+    acting = GROUPS >= 18
+    level = 50.0 * np.ones((PROBES, 1))
+    strong = one_node("effect0", np.where(acting, rng.choice((-1.0, 1.0), PROBES), 0.0) / 15.0, high=5000.0)
+    weak = one_node("effect1", np.where(acting, 1.0, 0.0) / 15.0, low=0.01, high=100.0)
+    others = [replace(one, high=5000.0) for one in independent(*[(10, 1.0)] * 8)]
+    law = 1.0 + 0.2 * rng.standard_normal(PROBES)
+    residual = 600.0 * strong.response(1.0) * law + 60.0 * weak.response(1.0) + noise(rng, level)
+    assert weigh(residual, level, [strong, weak, *others])[0].effects == ("effect0",)
+    # where the first does not act it leaves nothing
+    elsewhere = replace(weak, responses=weak.responses - 1.0 / 15.0)
+    residual = 600.0 * strong.response(1.0) * law + 60.0 * elsewhere.response(1.0) + noise(rng, level)
+    assert weigh(residual, level, [strong, elsewhere, *others])[0].effects == ("effect0", "effect1")
+
+
 def test_a_law_that_leaves_a_rest_elsewhere_is_named_with_the_place_of_the_rest():
     rng = np.random.default_rng(9)
     (one,) = independent((300, 1.0))

@@ -161,11 +161,20 @@ class Observed:
         return math.sqrt(max(squares, 0.0))
 
     def squares_by_series(self, curve: Curve, strength: float) -> NDArray[np.float64]:
-        """How far a curve (in these units) moves the probes of each series, as `length`, squared (series,)."""
-        squares = np.sum(self.nuisances.solve_all(self._moved(curve, strength)) ** 2, axis=0)
+        """The square of `length` in each series (series,), were the curve (in these units) to move that series and no other.
+
+        So a nuisance that series share brings nothing into series that the curve does not move.
+        """
+        moved = self._moved(curve, strength)
+        squares = np.sum(moved**2, axis=0)
         if curve.jitter is not None:
             squares = squares + strength**2 * curve.jitter
-        return np.asarray(np.bincount(self.series, weights=squares), dtype=np.float64)
+        found = np.bincount(self.series, weights=squares)
+        for row in moved:
+            alone = np.zeros((len(found), len(row)))
+            alone[self.series, np.arange(len(row))] = row
+            found -= np.sum(self.nuisances.project(alone) ** 2, axis=1)
+        return np.maximum(found, 0.0)
 
     @staticmethod
     def _moved(curve: Curve, strength: float) -> NDArray[np.float64]:

@@ -133,13 +133,13 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
 
     The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
     """
-    squares = {effect: observed.squares_by_series(fit.curve, fit.best) for effect, fit in pair.fits.items()}
-    strong, weak = sorted(squares, key=lambda effect: -float(np.sum(squares[effect])))
+    weak, strong = sorted(pair.fits, key=lambda effect: observed.length(pair.fits[effect].curve, pair.fits[effect].best))
     first = pair.fits[strong]
+    squares = observed.squares_by_series(first.curve, first.best)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     return strong, left_in_place(
-        observed, pair.fits[weak], squares[strong], list(zip(shares, LEVELS.levels, strict=False))
+        observed, pair.fits[weak], squares, list(zip(shares, LEVELS.levels, strict=False))
     )
 
 
@@ -159,7 +159,7 @@ def left_in_place(
     # not move is left as it is to a standard deviation
     ratio = max(math.sqrt(float(np.sum(own**2 / (squares + 1.0))) / max(float(np.sum(own)), 1e-12)), 1e-12)
     ratios = ratio * second.strengths / second.best
-    least = ratio / max(math.sqrt(float(np.sum(own))), 1.0)  # a standard deviation
+    least = ratio / max(observed.length(second.curve, second.best), 1.0)  # a standard deviation
     density = sum(share * leak_density(ratios, level, least) for share, level in levels)
     low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
     top = float(second.log_likelihood.max())

@@ -133,14 +133,14 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
 
     The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
     """
-    weak, strong = sorted(pair.fits, key=lambda effect: observed.length(pair.fits[effect].curve, pair.fits[effect].best))
+    weak, strong = sorted(
+        pair.fits, key=lambda effect: observed.length(pair.fits[effect].curve, pair.fits[effect].best)
+    )
     first = pair.fits[strong]
     squares = observed.squares_by_series(first.curve, first.best)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
-    return strong, left_in_place(
-        observed, pair.fits[weak], squares, list(zip(shares, LEVELS.levels, strict=False))
-    )
+    return strong, left_in_place(observed, pair.fits[weak], squares, list(zip(shares, LEVELS.levels, strict=False)))
 
 
 def left_in_place(

@@ -16,6 +16,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -144,13 +145,12 @@ def main() -> None:
         "same_network": RECIPES["raytwin"],
         "starter_network": dataclasses.replace(starter_recipe(), batch=BATCH),
     }
-    work: dict[str, Callable[[], float]] = {"plain": lambda: plain_seconds(images, masks, device)}
+    work: dict[str, Callable[[], float]] = {"plain": partial(plain_seconds, images, masks, device)}
     for name, recipe in networks.items():
-        work[name] = lambda recipe=recipe: raytwin_seconds(images, masks, recipe, device)  # type: ignore[misc]
-        for mixed in (False, True) if device != "cpu" else ():
-            work[f"{name}_recorded{'_bf16' if mixed else ''}"] = lambda recipe=recipe, mixed=mixed: recorded_seconds(  # type: ignore[misc]
-                images, masks, recipe, mixed=mixed
-            )
+        work[name] = partial(raytwin_seconds, images, masks, recipe, device)
+        if device != "cpu":
+            work[f"{name}_recorded"] = partial(recorded_seconds, images, masks, recipe, mixed=False)
+            work[f"{name}_recorded_bf16"] = partial(recorded_seconds, images, masks, recipe, mixed=True)
     found: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(given.turns + 1):
         for name, one in work.items():

@@ -105,9 +105,9 @@ def iterate_training(
 ) -> Iterator[TrainingState]:
     """Train one network, giving its state after every epoch; the best weights are those of the lowest validation loss.
 
-    The same arguments give the same weights on the same processor, torch and number of threads, resumed or not. A GPU adds
-    in an order of its own: weights agree there but for what grows from last bits, unless torch is told to use deterministic
-    algorithms (`torch.use_deterministic_algorithms(True)`).
+    The same arguments give the same weights on the same processor, torch and number of threads, resumed or not. A GPU
+    adds in an order that changes: there the last bits differ from run to run, and what grows from them, unless torch is told to
+    use deterministic algorithms (`torch.use_deterministic_algorithms(True)`).
 
     Args:
         train, validation: labelled images.

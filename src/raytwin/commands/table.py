@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         default=1,
-        help="processes that train, a core each (1); same bytes for any number on a processor",
+        help="processes that train, a core each (1); on a processor any number gives the same bytes",
     )
     parser.add_argument("--device", default="auto", help="auto (default: a GPU where there is one), cpu, cuda, mps")
     parser.add_argument("--seed", type=int, help="seed of everything (1)")

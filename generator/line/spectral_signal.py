@@ -36,6 +36,7 @@ from ...spectra import (
     MAXIMUM_KV_OF_ANODE,
     MINIMUM_KV,
     MODELS,
+    checked_kV,
     detector_response,
     energy_grid_keV,
     light_per_keV,
@@ -79,11 +80,13 @@ OTHER_TABLES = ("chantler", "penelope")
 # parameters that say nothing of the tube: a dosimeter does not notice them
 _OF_DETECTOR = ("log_DN_per_keV", "log_swank", "scintillator_table", "escape_scale", *RESPONSE_PARAMETERS)
 _ABSORBER = "absorber_mm:"
-# nodes of the tube voltage error; between them linear, 3e-6 of the signal
-_KV_ERRORS: NDArray[np.float64] = np.linspace(-0.2, 0.2, 81)
+# tube voltages (node,), kV, between which the fluence is linear, half a per cent apart at most: 1e-4 of a signal at 40 kV
+# (behind 0.3 mm of copper 8e-4), a tenth of that from 90 kV on
+_NODES_KV: NDArray[np.float64] = np.concatenate(
+    [0.05 * np.arange(200, 600), 0.1 * np.arange(300, 600), 0.25 * np.arange(240, 1201)]
+)
 LARGEST_KV_ERROR = 0.2
 _USUAL_KV_ERROR = 0.06  # up to it sums end 7 % above the voltage
-_ALL_NODES = slice(None)
 _LOWEST_KEV = (
     5.0  # below, layers that nobody stated count as here: nothing passes a window, and no layer may let through more
 )
@@ -92,6 +95,8 @@ _TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of 
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
 _LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
+_Term = tuple[NDArray[np.float64], NDArray[np.float64]]  # error of the tube voltage, relative, and weight (draw,) each
+_DRAWS_KEPT = 4  # sets of draws whose moments a model remembers: a twin asks with the same ones again and again
 
 
 def attenuation_scale_name(material: str) -> str:
@@ -210,7 +215,7 @@ class SpectralModel:
         self.energies_keV = energy_grid_keV((1.01 + LARGEST_KV_ERROR) * self.highest_kV)
         self._mu: dict[str, NDArray[np.float64]] = {}
         self._departures: dict[tuple[str, str], NDArray[np.float64]] = {}
-        self._fluence: dict[float, NDArray[np.float64]] = {}
+        self._moments_kept: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._other_model: dict[float, NDArray[np.float64]] = {}
         self._responses = [
             _response_tables(layers, self.cover, self.counting, self.energies_keV.size)
@@ -272,33 +277,42 @@ class SpectralModel:
             self._depth[layer] = -np.log(np.maximum(passed, 1e-300))
         return self._depth[layer]
 
-    def fluence(self, kV: float, nodes: slice = _ALL_NODES) -> NDArray[np.float64]:
-        """Unfiltered fluence at the nodes of the kV error (node, energy), photons / keV / cm2 / mAs at 1 m.
+    def _fluence_at(self, kV: float, terms: Sequence[_Term], top: int) -> NDArray[np.float64]:
+        """Unfiltered fluence (draw, energy), photons / keV / cm2 / mAs at 1 m, on the first `top` energies.
 
-        Only the nodes asked for are sure to be filled: each may cost spectra that nobody has computed yet.
+        The sum over `terms` of a weight (draw,) times the fluence at an error (draw,) of the tube voltage. Beyond the tube's
+        table the voltage stands still; a kV outside it is refused.
         """
-        if kV not in self._fluence:
-            if kV > self.highest_kV:
-                raise InputError(
-                    "kV", received=f"{kV:g} kV", expected=f"at most {self.highest_kV:g} kV, this model's range"
-                )
-            self._fluence[kV] = np.full((_KV_ERRORS.size, self.energies_keV.size), np.nan)
-        table = self._fluence[kV]
-        # beyond the tube's table the nodes stand still; a kV outside it is refused at the node without error
-        lowest, highest = MINIMUM_KV, MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
-        if kV < lowest:
-            lowest = 0.0
-        for node in range(*nodes.indices(_KV_ERRORS.size)):
-            if np.isnan(table[node, 0]):
-                table[node] = tube_fluence_interpolated(
-                    min(max(kV * (1.0 + float(_KV_ERRORS[node])), lowest), highest),
+        if kV > self.highest_kV:
+            raise InputError(
+                "kV", received=f"{kV:g} kV", expected=f"at most {self.highest_kV:g} kV, this model's range"
+            )
+        checked_kV(kV, anode=self.anode)
+        highest = MAXIMUM_KV_OF_ANODE.get(self.anode, MAXIMUM_KV)
+        found = [
+            (*_brackets(_NODES_KV, np.clip(kV * (1.0 + _within(error)), MINIMUM_KV, highest)), weight)
+            for error, weight in terms
+        ]
+        first = min(int(below.min()) for below, _, _ in found)
+        shares = np.zeros((len(found[0][0]), max(int(below.max()) for below, _, _ in found) + 2 - first))
+        rows = np.arange(len(shares))
+        for below, share, weight in found:
+            shares[rows, below - first] += weight * (1.0 - share)
+            shares[rows, below - first + 1] += weight * share
+        # each node may cost spectra that nobody has computed yet
+        used = np.flatnonzero(np.any(shares != 0.0, axis=0))
+        kept = _kept_fluence(self.anode, self.anode_angle_deg, self.model, self.energies_keV.size)
+        for node in used:
+            if np.isnan(kept[first + node, 0]):
+                kept[first + node] = tube_fluence_interpolated(
+                    float(_NODES_KV[first + node]),
                     energies_keV=self.energies_keV,
                     anode=self.anode,
                     anode_angle_deg=self.anode_angle_deg,
                     model=self.model,
                     for_sums=True,
                 )
-        return table
+        return np.asarray(shares[:, used] @ kept[first + used, :top])
 
     def _towards_other_model(self, kV: float) -> NDArray[np.float64]:
         """Logarithm of the other of SpekPy's models over this one (energy,), held constant beyond the end point."""
@@ -334,37 +348,9 @@ class SpectralModel:
     def weights(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """Photons of the beam (draw, energy) a bin, mAs and mm2 of pixel at 1 m, for samples (draw, parameter)."""
         behind = self._behind_the_anode(samples, beam)
-        kV_error = self._kV_error(samples, beam.kV)
-        variance = self._column(samples, "kV_variance")
-        shares = _node_shares(_KV_ERRORS, kV_error)
-        if np.any(variance):
-            # spectra at the voltage and a step to both sides are shares of the same nodes
-            shares += variance[:, None] * _second_difference_shares(kV_error)
-        behind *= self._fluence_of_nodes(beam.kV, shares, behind.shape[1])
+        kV_error, variance = self._kV_error(samples, beam.kV), self._column(samples, "kV_variance")
+        behind *= self._fluence_at(beam.kV, _varying(kV_error, variance), behind.shape[1])
         return np.maximum(behind, 0.0, out=behind)
-
-    def _fluence_of_nodes(self, kV: float, shares: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-        """Unfiltered fluence (draw, energy) as shares (draw, node) of the nodes of the voltage error, on the first `top` energies."""
-        used = np.flatnonzero(np.any(shares != 0.0, axis=0))
-        span = slice(int(used[0]), int(used[-1]) + 1)
-        return np.asarray(shares[:, span] @ self.fluence(kV, span)[span, :top])
-
-    def _fluence_at(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-        """Unfiltered fluence (draw, energy) at errors (draw,) of the tube voltage, on the first `top` energies."""
-        return self._fluence_of_nodes(kV, _node_shares(_KV_ERRORS, kV_error), top)
-
-    def _second_difference(self, kV: float, kV_error: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-        """Half of kV^2 d2 Phi / d kV2 (draw, energy), over a step on both sides."""
-        return self._fluence_of_nodes(kV, _second_difference_shares(kV_error), top)
-
-    def _varying_fluence(
-        self, kV: float, kV_error: NDArray[np.float64], variance: NDArray[np.float64], top: int
-    ) -> NDArray[np.float64]:
-        """The same (draw, energy) where the voltage varies by a relative variance (draw, 1)."""
-        if not np.any(variance):
-            return self._fluence_at(kV, kV_error, top)
-        shares = _node_shares(_KV_ERRORS, kV_error) + variance * _second_difference_shares(kV_error)
-        return self._fluence_of_nodes(kV, shares, top)
 
     def _behind_the_anode(self, samples: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What all but the tube voltage makes of the fluence (draw, energy): output, layers, models; a bin, mAs and mm2."""
@@ -461,7 +447,7 @@ class SpectralModel:
             photons = photons * np.exp(-crossed @ depths)
         else:
             photons = np.repeat(photons, len(stacks), axis=0)
-        return self.signal_of_photons(np.repeat(parameters[None, :], len(stacks), axis=0), photons)
+        return self.signal_of_photons(parameters[None, :], photons)
 
     def moment_weights(self, parameters: NDArray[np.float64], beam: OpenBeam) -> NDArray[np.float64]:
         """What each energy of an open beam adds to signal (DN), quantum variance (DN^2) and photons absorbed.
@@ -472,13 +458,7 @@ class SpectralModel:
         """
         samples = parameters[None, :]
         photons = self.weights(samples, beam)[0]
-        first, second = self.deposit_tables(samples)[:2, 0, : len(photons)]
-        other = bool(self._column(samples, ALTERNATIVE_SCINTILLATOR)[0] > 0.5)
-        log_thickness = self._column(samples, "log_scintillator_thickness")
-        share = _interpolate(_LOG_THICKNESS, self._responses[int(other)][2, :, : len(photons)], log_thickness)[0]
-        powers = self._response_powers(samples, len(photons))
-        if powers is not None:
-            share = share * powers[2][0]
+        first, second, share = self._moments(samples)[:, 0, : len(photons)]
         log_gamma = float(self._column(samples, "log_DN_per_keV")[0])
         log_swank = float(self._column(samples, "log_swank")[0])
         return np.stack(
@@ -532,41 +512,41 @@ class SpectralModel:
         second = first if light is None else first * light
         return first, second if swank is None else second / swank, share
 
-    def _moment_sums(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sums over energy of photons (draw, energy) times each of `_moments` (3, draw)."""
-        top = photons.shape[1]
-        log_thickness = self._column(samples, "log_scintillator_thickness")
+    def _moments(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What a photon of each energy leaves in each draw's scintillator (3, draw, energy): deposit, its square, share stopped.
+
+        Those of the last sets of draws are kept.
+        """
+        for known, moments in self._moments_kept:
+            if np.array_equal(known, samples):
+                return moments
+        bins = self.energies_keV.size
         other = self._column(samples, ALTERNATIVE_SCINTILLATOR) > 0.5
-        powers = self._response_powers(samples, top)
-        sums = np.empty((3, len(samples)))
+        log_thickness = self._column(samples, "log_scintillator_thickness")
+        moments = np.empty((3, len(samples), bins))
+        moments[:2] = self.deposit_tables(samples)[:2]
         for chosen, tables in zip((~other, other), self._responses, strict=False):
-            if not chosen.any():
-                continue
-            part, thickness = photons if chosen.all() else photons[chosen], log_thickness[chosen]
-            if powers is None:
-                every = _sums_interpolated(_LOG_THICKNESS, tables[:, :, :top], thickness, part)
-            else:
-                every = np.empty((7, len(part)))
-                for rows, power in (((0, 3, 5), powers[0]), ((1, 4, 6), powers[1]), ((2,), powers[2])):
-                    weight = part * (power if chosen.all() else power[chosen])
-                    every[list(rows)] = _sums_interpolated(
-                        _LOG_THICKNESS, tables[list(rows), :, :top], thickness, weight
-                    )
-            by_table = self._column(samples, "scintillator_table")[chosen]
-            by_escape = self._column(samples, "escape_scale")[chosen]
-            sums[:2, chosen] = every[:2] + by_table * every[3:5] + by_escape * every[5:7]
-            sums[2, chosen] = every[2]
-        return sums
+            if chosen.any():
+                moments[2, chosen] = _interpolate(_LOG_THICKNESS, tables[2], log_thickness[chosen])
+        powers = self._response_powers(samples, bins)
+        if powers is not None:
+            moments[2] *= powers[2]
+        self._moments_kept = [(samples.copy(), moments), *self._moments_kept[: _DRAWS_KEPT - 1]]
+        return moments
 
     def signal_of_photons(self, samples: NDArray[np.float64], photons: NDArray[np.float64]) -> BeamSignal:
         """What photons (draw, energy), as `weights` gives them, leave behind an object or without one.
 
         Args:
-            samples: (draw, parameter) in the order of `names`: scintillator and gains.
+            samples: (draw, parameter) in the order of `names`: scintillator and gains; one for all of the photons, or each its own.
             photons: (draw, energy) on the first of `energies_keV`, a bin, mAs and mm2 of pixel at 1 m.
         """
         top = photons.shape[1]
-        first, second, absorbed = self._moment_sums(samples, photons)
+        moments = self._moments(samples)[:, :, :top]
+        if len(samples) == 1:
+            first, second, absorbed = moments[:, 0] @ photons.T
+        else:
+            first, second, absorbed = np.einsum("qde,de->qd", moments, photons)
         log_gamma = self._column(samples, "log_DN_per_keV")
         gamma = np.exp(log_gamma)
         excess = np.exp(log_gamma - self._column(samples, "log_swank"))
@@ -624,10 +604,10 @@ class SpectralModel:
         behind = self._behind_the_anode(samples, beam)
         top = behind.shape[1]
         kV_error, variance = self._kV_error(samples, beam.kV), self._column(samples, "kV_variance")[:, None]
-        photons = behind * self._fluence_at(beam.kV, kV_error, top)
+        photons = behind * self._fluence_at(beam.kV, [(kV_error, np.ones(len(samples)))], top)
         varied = np.zeros_like(photons)
         if "kV_variance" in names or np.any(variance):
-            varied = behind * self._second_difference(beam.kV, kV_error, top)
+            varied = behind * self._fluence_at(beam.kV, _second_difference(kV_error, np.ones(len(samples))), top)
             photons = np.maximum(photons + variance * varied, 0.0)
         tables = (self.deposit_tables(samples) if deposits is None else deposits)[:, :, :top]
         first, second = tables[:2]
@@ -670,7 +650,7 @@ class SpectralModel:
             elif name in {"kV_tilt", "kV_variance"}:
                 if name == "kV_tilt":
                     above, below = (
-                        self._varying_fluence(beam.kV, kV_error + step, variance, top)
+                        self._fluence_at(beam.kV, _varying(kV_error + step, variance[:, 0]), top)
                         for step in (_TILT_STEP, -_TILT_STEP)
                     )
                     moved_photons = behind * (above - below)
@@ -799,21 +779,27 @@ def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDAr
     return below, share
 
 
-def _node_shares(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares (draw, node) of the nodes in a linear interpolation at positions `at` (draw,)."""
-    below, share = _brackets(nodes, at)
-    shares = np.zeros((len(at), len(nodes)))
-    rows = np.arange(len(at))
-    shares[rows, below] = 1.0 - share
-    shares[rows, below + 1] = share
-    return shares
+def _within(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.clip(kV_error, -LARGEST_KV_ERROR, LARGEST_KV_ERROR)
 
 
-def _second_difference_shares(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares (draw, node) of the fluence's nodes in half of its second derivative by the logarithm of the voltage."""
-    inside = np.clip(kV_error, _KV_ERRORS[0] + KV_STEP, _KV_ERRORS[-1] - KV_STEP)
-    below, middle, above = (_node_shares(_KV_ERRORS, inside + step) for step in (-KV_STEP, 0.0, KV_STEP))
-    return np.asarray((above + below - 2.0 * middle) / (2.0 * KV_STEP**2))
+def _second_difference(kV_error: NDArray[np.float64], weight: NDArray[np.float64]) -> list[_Term]:
+    """Terms of a weight (draw,) times kV^2 / 2 d2 Phi / d kV2, over a step to both sides."""
+    inside = np.clip(kV_error, KV_STEP - LARGEST_KV_ERROR, LARGEST_KV_ERROR - KV_STEP)
+    each = weight / (2.0 * KV_STEP**2)
+    return [(inside - KV_STEP, each), (inside, -2.0 * each), (inside + KV_STEP, each)]
+
+
+def _varying(kV_error: NDArray[np.float64], variance: NDArray[np.float64]) -> list[_Term]:
+    """Terms of the fluence at errors (draw,) of a voltage that varies about them by relative variances (draw,)."""
+    mean = (kV_error, np.ones(len(kV_error)))
+    return [mean, *_second_difference(kV_error, variance)] if np.any(variance) else [mean]
+
+
+@lru_cache(maxsize=16)
+def _kept_fluence(anode: str, anode_angle_deg: float, model: str, bins: int) -> NDArray[np.float64]:
+    """A tube's fluence at `_NODES_KV` (node, energy) on the first bins of the grid; NaN where nobody has computed it yet."""
+    return np.full((_NODES_KV.size, bins), np.nan)
 
 
 def _interpolate(
@@ -829,19 +815,6 @@ def _interpolate(
     weights[rows, below - lowest] = 1.0 - share
     weights[rows, below - lowest + 1] = share
     return np.asarray(weights @ table[lowest:highest])
-
-
-def _sums_interpolated(
-    nodes: NDArray[np.float64], tables: NDArray[np.float64], at: NDArray[np.float64], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """sum over energy of weight (draw, energy) times each of `tables` (table, node, energy) at `at`: (table, draw)."""
-    below, share = _brackets(nodes, at)
-    lowest = int(below.min())
-    used = tables[:, lowest : int(below.max()) + 2]  # the nodes in use: draws lie close together
-    every = (weight @ used.reshape(-1, used.shape[2]).T).reshape(len(at), used.shape[0], used.shape[1])
-    rows = np.arange(len(at))
-    column = below - lowest
-    return np.asarray((every[rows, :, column] * (1.0 - share)[:, None] + every[rows, :, column + 1] * share[:, None]).T)
 
 
 def gain_behind_object(

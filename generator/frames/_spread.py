@@ -183,11 +183,12 @@ def spread_maps(
     from scipy.fft import dctn
 
     fine = state.picture
-    # a tail holds a share of light that reaches further up than the calibrated spread
-    narrowest = (
-        0.0 if state.tails or spread.tail_share > 0 else spread.sigma_px * min(spread.aspect, 1 / spread.aspect) ** 0.5
+    nothing = np.zeros((1, 1))
+    along = (
+        optical_transfer(state, spread, fine_frequencies(shape[0])[:, None], nothing),
+        optical_transfer(state, spread, nothing, fine_frequencies(shape[1])[None, :]),
     )
-    cosines = [kept_cosines(length, narrowest, 1e-3 if draft else 1e-5) for length in shape]
+    cosines = [kept_cosines(one.ravel(), 1e-3 if draft else 1e-5) for one in along]
     rest = signal_DN if fine is None else None if signal_DN is fine.signal_DN else signal_DN - fine.signal_DN
     blurred: NDArray[np.floating] = np.zeros(shape)
     if spread.separable and not (state.object_transfers or state.tails or state.optical_transfers):

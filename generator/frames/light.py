@@ -273,8 +273,8 @@ def _drawn(
 
 def _kept(twin: Twin, request: SeriesRequest, state: LineState, acting: Acting, cache: ModelCache) -> Kept:
     """Keeps what belongs to the spread of light, which is alike behind all scenes, whenever it began to be so."""
-    if not (state.tails or state.optical_transfers or state.power_transfers):
-        return lambda name, make: make()
+    if not (state.tails or state.optical_transfers or state.power_transfers or state.object_transfers):
+        return lambda name, make: cache.made("spread", (twin,), name, make)
     key = (
         None if state.parameters is None else state.parameters.tobytes(),
         None if request.setting is None else (request.setting.kV, request.setting.filters),

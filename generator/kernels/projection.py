@@ -173,7 +173,7 @@ def _project(
     result: NDArray[np.float32],
 ) -> None:
     """Fill result (k, pixel): the kernel takes two or more materials, MOMENTS weights and TOGETHER energies a step."""
-    from ._projection_kernel import MOMENTS, TOGETHER, sum_exponentials
+    from ._projection_kernel import FEW_TERMS, MOMENTS, TOGETHER, sum_exponentials, sum_exponentials_alone
 
     used = np.any(weight > 0, axis=0)
     mu, weight = mu[:, used], weight[:, used]
@@ -184,11 +184,13 @@ def _project(
     depth = np.pad(mu * math.log2(math.e), ((0, 0), (0, missing))).astype(np.float32)
     # weights of any unit fit single precision as shares of their sum; the sum comes back in double precision
     share = np.pad(weight / np.where(scale > 0, scale, 1.0)[:, None], ((0, 0), (0, missing)))
+    few = thickness.shape[1] * depth.shape[1] < FEW_TERMS
+    summed = sum_exponentials_alone if few else sum_exponentials
     for start in range(0, len(weight), MOMENTS):
         stop = min(start + MOMENTS, len(weight))
         padded = np.zeros((MOMENTS, depth.shape[1]), dtype=np.float32)
         padded[: stop - start] = share[start:stop]
         ones = np.ones(stop - start, dtype=np.float32)
-        sum_exponentials(thickness, depth, padded, ones, result[start:stop])
+        summed(thickness, depth, padded, ones, result[start:stop])
         for k in range(start, stop):
             result[k] *= np.float32(scale[k])

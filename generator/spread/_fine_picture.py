@@ -222,12 +222,10 @@ def fine_frequencies(length: int) -> FloatArray:
     return np.asarray(np.arange(FINE * length) / (2.0 * length))
 
 
-def kept_cosines(length: int, psf_sigma_px: float, least: float = 1e-5) -> int:
-    """Number of cosines of `length` pixels' cells along an axis that a Gaussian spread leaves above `least`."""
-    if psf_sigma_px <= 0:
-        return FINE * length
-    highest = np.sqrt(np.log(1.0 / least) / 2.0) / (np.pi * psf_sigma_px)
-    return int(min(FINE * length, max(np.ceil(2.0 * length * highest), length + 1)))
+def kept_cosines(along: FloatArray, least: float = 1e-5) -> int:
+    """Number of cosines that a transfer function along an axis (`fine_frequencies`,) leaves above `least`; those of pixels at least."""
+    last = int(np.flatnonzero(np.abs(along) > least)[-1])
+    return min(along.size, max(last, along.size // FINE) + 1)
 
 
 @lru_cache(maxsize=32)

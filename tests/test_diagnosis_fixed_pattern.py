@@ -9,7 +9,13 @@ from scipy.ndimage import gaussian_filter
 
 from raytwin.diagnosis.model.calibrated_maps import CalibratedMaps
 from raytwin.diagnosis.model.defects import new_outliers
-from raytwin.diagnosis.probes.fixed_pattern import count_outliers, lines_of, pattern_noise, pattern_statistics
+from raytwin.diagnosis.probes.fixed_pattern import (
+    NO_PATTERN,
+    count_outliers,
+    pattern_noise,
+    pattern_of,
+    pattern_statistics,
+)
 from raytwin.diagnosis.probes.noise_correlation import correlation_sum
 
 SHAPE = (96, 128)
@@ -83,10 +89,20 @@ def test_a_seam_of_two_narrow_columns_shows_in_columns_alone():
     # second differences -40, 40, 40, -40 among 126
     assert seen.columns_DN2 == pytest.approx(4.0 * 1600.0 / 6.0 / 126.0, rel=0.02)
     assert seen.rows_DN2 < 1e-6
-    rows, columns = lines_of(seam.astype(np.float32))
-    assert columns == pytest.approx(seen.columns_DN2, rel=0.02)
-    assert rows == pytest.approx(0.0, abs=1e-9)
-    assert lines_of(np.zeros((1, 1), np.float32)) == (0.0, 0.0)
+
+
+def test_a_picture_that_moved_is_expected_with_what_is_measured_of_it():
+    row, column = np.indices(SHAPE)
+    strip = np.where(np.abs(column + 0.5 * row - 80.0) < 12.0, -150.0, 0.0)
+    seen, told = found_in(strip), pattern_of(strip.astype(np.float32))
+    assert told.pixel_DN2 == pytest.approx(seen.pixel_DN2, rel=0.02)
+    assert told.blocks_DN2 == pytest.approx(seen.blocks_DN2, rel=0.1)  # a surface through means, not through medians
+    assert told.rows_DN2 == pytest.approx(seen.rows_DN2, rel=0.02, abs=1e-6)
+    assert told.columns_DN2 == pytest.approx(seen.columns_DN2, rel=0.05)
+    assert pattern_of(np.zeros((1, 1), np.float32)) == NO_PATTERN
+    slope = 100.0 * (column / SHAPE[1]) ** 2 + 50.0 * row / SHAPE[0]
+    smooth = pattern_of(slope.astype(np.float32))
+    assert max(smooth.pixel_DN2, smooth.blocks_DN2) < 1e-6
 
 
 def test_a_line_whose_pixels_all_stand_out_is_a_line_and_a_dead_one_a_defect():

@@ -42,6 +42,11 @@ class Levels:
         return replace(self, levels=self.levels[:kept], of_kind=self.of_kind[:kept], of_another=self.of_another[:kept])
 
 
+def only(level: float) -> Levels:
+    """One level, of which laws of any kind are off."""
+    return replace(LEVELS, levels=(level,), of_kind=(1.0,), of_another=(1.0,))
+
+
 def log_frequency(level: float, *, another: bool = False) -> float:
     """Log of how often laws of an effect's kind (or of `another` kind) are off by a level."""
     frequencies = LEVELS.of_another if another else LEVELS.of_kind
@@ -67,7 +72,6 @@ LEVELS = _learnt()
 # beyond it a law does not carry the probes: what is off by more than half of itself explains anything
 FARTHEST_LEVEL = 0.4
 USUAL_LEVEL = 0.1  # of refinement, of laws that a twin has, and of what is fitted on half of a session
-USUAL = replace(LEVELS, levels=(USUAL_LEVEL,), of_kind=(1.0,), of_another=(1.0,))
 PROBE_SHARE = 0.5  # of a level that is each probe's own
 ELSEWHERE_SHARE = 0.1  # of a level, times the rms of what the law foretells in a place, in each probe of the place
 EXACT_LAW_ERROR = 0.03  # relative error of probes that a strength is defined by

@@ -23,7 +23,7 @@ from .refine_tasks import Task, tasks_of
 from .search import curve_of, searched
 from .seen import Blocks, Responder, Seen, Whitener
 
-REFINED_FROM = 6.0  # separation from none, its law taken as exact, from which the grid's coarseness matters
+REFINED_FROM = 3.0  # separation from none, its law taken as exact, from which the grid's coarseness may decide
 _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 

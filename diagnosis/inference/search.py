@@ -14,7 +14,7 @@ from .curve_fits import CurveFit
 from .seen import Seen
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
-_ROUNDS = 5
+_ROUNDS = 10
 _ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges
@@ -28,8 +28,16 @@ def searched(variant: Variant, fit: CurveFit, seen: Seen) -> tuple[Variant, NDAr
     refined = EFFECTS[variant.effect].grid.refined
     inner = [item for item in variant.fitted if refined and item.name in variant.parameters]
     some = seen.where_told(fit)
-    found: _Found | None = _Search(variant, fit.curve, some).run(fit.best, _in_turn(inner))
-    if found is not None and some is not seen:
+    cut = some is not seen
+    found = _Search(variant, fit.curve, some).run(fit.best, _in_turn(inner))
+    while inner and found is not None and (closer := some.more_exact()) is not None:
+        # a law that is more exact than usual is brought nearer than one that is off could tell
+        nearer = _Search(found.variant, fit.curve, closer).run(found.strength, [inner], slopes=found.slopes)
+        if nearer is None or some.evidence(nearer.fit.curve) < some.evidence(found.fit.curve) + _ENOUGH:
+            break
+        some, found = closer, nearer
+    seen = replace(seen, level=some.level)
+    if found is not None and cut:
         # where some series want it others may pull it a little further
         found = _Search(found.variant, fit.curve, seen).run(found.strength, [inner] if inner else [], rounds=1)
     return None if found is None else _centred(found, fit.curve, seen)
@@ -71,11 +79,12 @@ def curve_of(item: Variant, responses: NDArray[np.float64], like: Curve) -> Curv
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Where a search ends: the variant, its strength, and what the probes say of it."""
+    """Where a search ends: the variant, its strength, what the probes say of it, and how its response changes there, if known."""
 
     variant: Variant
     strength: float
     fit: CurveFit
+    slopes: "_Slopes | None" = None
 
 
 class _Search:
@@ -88,16 +97,22 @@ class _Search:
         # one strength tells the others where the response grows in proportion
         self._in_proportion = len(EFFECTS[variant.effect].grid.shares) == 1
 
-    def run(self, strength: float, parts: Sequence[Sequence[Parameter]], *, rounds: int | None = None) -> _Found | None:
-        """Parts of the inner parameters, one after the other, from a strength; None: it cannot be asked."""
+    def run(
+        self,
+        strength: float,
+        parts: Sequence[Sequence[Parameter]],
+        *,
+        rounds: int = _ROUNDS,
+        slopes: "_Slopes | None" = None,
+    ) -> _Found | None:
+        """Parts of the inner parameters, one after the other, from a strength (slopes: for the first); None: it cannot be asked."""
         fit = self._tried(self._start, strength)
         if fit is None:
             return None
         here = _Found(self._start, fit.best, fit)
-        most = rounds or (_ROUNDS if self._in_proportion else 2 * _ROUNDS)
-        for part in parts:
-            slopes: _Slopes | None = None
-            for _ in range(most):
+        for number, part in enumerate(parts):
+            slopes = None if number else slopes
+            for _ in range(rounds):
                 learnt = slopes is not None
                 slopes = slopes or _slopes_at(here.fit, here.variant, part, self._seen)
                 before = here
@@ -109,7 +124,7 @@ class _Search:
                     slopes = None
                 else:
                     break
-        return here
+        return replace(here, slopes=slopes)
 
     def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "_Slopes") -> _Found:
         """The best along a step towards where the probes want some parameters; the start itself where none is better."""

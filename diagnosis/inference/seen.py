@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit, fit_curve
-from .discrepancy import USUAL, USUAL_LEVEL
+from .discrepancy import LEVELS, USUAL_LEVEL, only
 from .observed import Observed, Point
 
 _TELLS = 0.8  # share of what tells an effect, its law off as usual, that the series of a search hold
@@ -65,7 +65,7 @@ class Seen:
     """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
 
     Fields: observed; respond: the forward model; whitener of its responses; blocks of series (None: all are asked); wanted: which of
-    all probes these are (None: all).
+    all probes these are (None: all); level: by which laws are taken to be off.
     """
 
     observed: Observed
@@ -73,6 +73,7 @@ class Seen:
     whitener: Whitener
     blocks: Blocks | None = None
     wanted: NDArray[np.bool_] | None = None
+    level: float = USUAL_LEVEL
 
     def beside(self, point: Point) -> "Seen":
         """The same once another effect stands there."""
@@ -90,8 +91,8 @@ class Seen:
         return replace(self, observed=self.observed.of_probes(kept), blocks=None, wanted=kept)
 
     def widened(self, curve: Curve, strength: float) -> tuple[Observed, NDArray[np.float64]]:
-        """What is seen where a curve's law (in these units) is off as usual at a strength, and its units in these (probe,)."""
-        wide = self.observed.widened(curve, strength, USUAL_LEVEL) or self.observed
+        """What is seen where a curve's law (in these units) is off at a strength, and its units in these (probe,)."""
+        wide = self.observed.widened(curve, strength, self.level) or self.observed
         return wide, wide.units / self.observed.units
 
     def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
@@ -114,5 +115,14 @@ class Seen:
         return self.fit_scaled(self.observed.scaled(self.cut(curve)))
 
     def fit_scaled(self, curve: Curve) -> CurveFit:
-        """A curve in these units, fitted with its law off as usual."""
-        return fit_curve(self.observed, curve, levels=USUAL)
+        """A curve in these units, fitted with its law off by the level."""
+        return fit_curve(self.observed, curve, levels=only(self.level))
+
+    def more_exact(self) -> "Seen | None":
+        """The same with laws off by the next lower level; None: they are exact."""
+        lower = [level for level in LEVELS.levels if level < self.level]
+        return replace(self, level=lower[-1]) if lower else None
+
+    def evidence(self, curve: Curve) -> float:
+        """Log evidence of a curve in these units, its law off by any level."""
+        return fit_curve(self.observed, curve).log_evidence

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
 from ..inference.curve_fits import fit_curve
-from ..inference.discrepancy import USUAL
+from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
@@ -184,5 +184,5 @@ def strengths_on(
             others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
             rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
             own = rest.scaled(replace(curve.of_probes(fit), spread=None))
-            strengths[effect] = fit_curve(rest, own, levels=USUAL).best
+            strengths[effect] = fit_curve(rest, own, levels=only(USUAL_LEVEL)).best
     return strengths

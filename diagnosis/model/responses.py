@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
-from ..probes.fixed_pattern import lines_of, pattern_noise
+from ..probes.fixed_pattern import pattern_noise, pattern_of
 from ..probes.line_scalars import bent_share
 from ..probes.model_scalars import expected_scalars
-from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED_COLUMNS, FIXED_ROWS
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED, FIXED_BLOCKS, FIXED_COLUMNS, FIXED_ROWS
 from ..probes.registration import Placement
 from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
@@ -178,7 +178,7 @@ class SessionModel:
         if item.request.beam_on and bool(np.any(absorbed.gain)):
             moved = moved - np.asarray(one.expected.signal_DN, dtype=np.float32) * absorbed.gain
         if not item.calibrates:
-            values = _with_lines(
+            values = _with_patterns(
                 values,
                 absorbed.lines,
                 moved,
@@ -265,7 +265,9 @@ def session_model(
                 expected=expected,
                 context=context,
                 scalars_alone=alone,
-                scalars=_with_lines(alone, lines, NOWHERE, item=item, context=context, maps=maps, signals_DN=signals_DN)
+                scalars=_with_patterns(
+                    alone, lines, NOWHERE, item=item, context=context, maps=maps, signals_DN=signals_DN
+                )
                 | (_NO_DISPLACEMENT if tells else {}),
                 placement=placed.placements.get(item.name),
                 tells_displacement=tells,
@@ -331,7 +333,7 @@ def _lines_of_noise(model: ExpectedSeries) -> tuple[float, float]:
     return rows + (1.0 - flicker.column_share) * of_light, columns + flicker.column_share * of_light
 
 
-def _with_lines(
+def _with_patterns(
     values: Mapping[str, float],
     lines: Lines,
     moved: Map,
@@ -341,7 +343,7 @@ def _with_lines(
     maps: CalibratedMaps,
     signals_DN: Mapping[str, float],
 ) -> dict[str, float]:
-    """Scalars with what line noise leaves in dark and gain map, and what the picture that moved shows of lines.
+    """Scalars with what line noise leaves in dark and gain map, and what the picture that moved shows of pixels, blocks and lines.
 
     Args:
         values: scalar probes without that, by name.
@@ -352,18 +354,25 @@ def _with_lines(
         maps: dark and gain map.
         signals_DN: mean signals by name of series.
     """
-    noise = context.pattern_noise
-    if noise.rows_DN2 is None or noise.columns_DN2 is None or FIXED_ROWS not in values:
+    if FIXED not in values:
         return dict(values)
-    added = np.array(lines_of(moved))
+    noise, shown = context.pattern_noise, pattern_of(moved)
+    result = dict(values)
+    for name, one, own in (
+        (FIXED, shown.pixel_DN2, noise.pixel_DN2),
+        (FIXED_BLOCKS, shown.blocks_DN2, noise.blocks_DN2),
+    ):
+        if name in values and one and own:
+            result[name] = math.hypot(values[name], math.sqrt(one / own))
+    if noise.rows_DN2 is None or noise.columns_DN2 is None:
+        return result
+    added = np.array([shown.rows_DN2, shown.columns_DN2])
     weights = {} if "offset" in item.series.corrected else maps.darks.weights[exposure_of(item)]
     for name, weight in weights.items():
         added += weight**2 * np.array(lines[name]) / maps.darks.frames[name]
     for name, share in maps.shares.items():
         there = share * signals_DN[item.name] / max(signals_DN[name], 1e-9)
         added += there**2 * np.array(lines[name]) / maps.frames[name]
-    of_noise = zip((FIXED_ROWS, FIXED_COLUMNS), added, (noise.rows_DN2, noise.columns_DN2), strict=True)
-    return {
-        **values,
-        **{name: 0.5 * math.log(math.exp(2.0 * values[name]) + float(one) / own) for name, one, own in of_noise},
-    }
+    for name, one, own in zip((FIXED_ROWS, FIXED_COLUMNS), added, (noise.rows_DN2, noise.columns_DN2), strict=True):
+        result[name] = 0.5 * math.log(math.exp(2.0 * values[name]) + float(one) / own)
+    return result

@@ -5,6 +5,7 @@ readout lines) show in the means of rows or columns far above what single pixels
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,6 +21,7 @@ from .noise_correlation import autocovariance, correlation_sum
 
 OUTLIER_SD = 7.0
 _LEAST_BLOCKS, _LEAST_LINES = 8, 16
+_LEAST_SURFACE = 5 * BLOCK_PX  # side of a panel, px, through which a cubic surface can be laid
 _NEIGHBOURS_PX = 5  # side of the square that a pixel's neighbours are in
 _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 standard deviations are 5
 _LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
@@ -148,7 +150,7 @@ def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
 def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Cubic surface (row, column) through the medians of blocks: what map probes hold, and what is no pixel's own."""
     rows, columns = residual.shape
-    if min(rows, columns) < 5 * BLOCK_PX:
+    if min(rows, columns) < _LEAST_SURFACE:
         return np.zeros(residual.shape)
     whole = residual[: rows - rows % BLOCK_PX, : columns - columns % BLOCK_PX]
     inside = mask[: whole.shape[0], : whole.shape[1]]
@@ -161,14 +163,23 @@ def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArr
         return np.zeros(residual.shape)
     medians = np.nanmedian(filled[known], axis=-1)
 
-    def terms(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    at_blocks, at_pixels = _cubic_terms(rows, columns)
+    solved = np.linalg.lstsq(at_blocks[known], medians, rcond=None)[0]
+    return np.asarray(at_pixels @ solved)
+
+
+@lru_cache(maxsize=4)
+def _cubic_terms(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Terms of the cubic surface at the middles of blocks (block row, block column, term) and at pixels (row, column, term)."""
+
+    def terms(places: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        y, x = np.meshgrid(
+            *(2.0 * at / length - 1.0 for at, length in zip(places, (rows, columns), strict=True)), indexing="ij"
+        )
         return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, x**3, y**3], axis=-1)
 
-    centre = 0.5 * (BLOCK_PX - 1)
-    block_y, block_x = (np.asarray(index * BLOCK_PX + centre, dtype=np.float64) for index in np.nonzero(known))
-    solved = np.linalg.lstsq(terms(2.0 * block_y / rows - 1.0, 2.0 * block_x / columns - 1.0), medians, rcond=None)[0]
-    y, x = np.meshgrid(2.0 * np.arange(rows) / rows - 1.0, 2.0 * np.arange(columns) / columns - 1.0, indexing="ij")
-    return np.asarray(terms(y, x) @ solved)
+    middles = [np.arange(length // BLOCK_PX) * BLOCK_PX + 0.5 * (BLOCK_PX - 1) for length in (rows, columns)]
+    return terms(middles), terms([np.arange(float(length)) for length in (rows, columns)])
 
 
 def pattern_statistics(
@@ -220,13 +231,38 @@ def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: 
     return float(np.mean(bent**2)) / 6.0 if bent.size >= _LEAST_LINES else None
 
 
-def lines_of(change_DN: NDArray[np.floating]) -> tuple[float, float]:
-    """What a change of the mean frame (row, column) leaves from row to row and from column to column, DN^2, as in `Pattern`."""
+def pattern_of(change_DN: NDArray[np.floating]) -> Pattern:
+    """What a change of the mean frame (row, column or 1, 1), DN, leaves in the variances of a `Pattern`."""
     if change_DN.size == 1:
-        return 0.0, 0.0
-    bent = (np.diff(change_DN.mean(axis=axis, dtype=np.float64), n=2) for axis in (1, 0))
+        return NO_PATTERN
+    change = change_DN.astype(np.float64)
+    bent = (np.diff(change.mean(axis=axis), n=2) for axis in (1, 0))
     rows, columns = (float(np.mean(one**2)) / 6.0 if one.size else 0.0 for one in bent)
-    return rows, columns
+    if min(change.shape) >= _LEAST_SURFACE:
+        to_surface, at_pixels = _to_surface(*change.shape)
+        change = change - at_pixels @ (to_surface @ _block_means(change).ravel())
+    across = np.diff(_block_means(change), axis=1)
+    return Pattern(
+        pixel_DN2=float(np.mean(np.diff(change, axis=1) ** 2)) / 2.0,
+        blocks_DN2=float(np.mean(across**2)) / 2.0 if across.size else 0.0,
+        rows_DN2=rows,
+        columns_DN2=columns,
+    )
+
+
+@lru_cache(maxsize=4)
+def _to_surface(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What makes of means of blocks the cubic surface's factors (term, block), and its terms at pixels (row, column, term)."""
+    at_blocks, at_pixels = _cubic_terms(rows, columns)
+    return np.linalg.pinv(at_blocks.reshape(-1, at_blocks.shape[2])), at_pixels
+
+
+def _block_means(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means of whole blocks of an image (block row, block column)."""
+    rows, columns = (side - side % BLOCK_PX for side in image.shape)
+    return np.asarray(
+        image[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX).mean(axis=(1, 3))
+    )
 
 
 def count_outliers(

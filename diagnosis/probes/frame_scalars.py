@@ -10,7 +10,18 @@ from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2, SeriesSummary
 from .fixed_pattern import Pattern
 from .lasting import LEAST_FRAMES
-from .probes import FIXED_COLUMNS, FIXED_ROWS, FLOORS, LASTING, OUTLIERS, OUTLIERS_ANYWHERE, REPEATED_FRAMES, Scalar
+from .probes import (
+    FIXED,
+    FIXED_BLOCKS,
+    FIXED_COLUMNS,
+    FIXED_ROWS,
+    FLOORS,
+    LASTING,
+    OUTLIERS,
+    OUTLIERS_ANYWHERE,
+    REPEATED_FRAMES,
+    Scalar,
+)
 from .scalar_context import ScalarContext, afterglow_bins, time_templates
 
 _LEAST_FREEDOM = 5.0  # of a variance whose logarithm is still near enough a Gaussian number
@@ -206,8 +217,8 @@ class _Found:
         expected, least = self.context.pattern_noise, LEAST_NOISE_DN2 / self.summary.frames
         rows, columns = self.context.good.shape
         for name, found_DN2, noise_DN2, pixels in (
-            ("fixed_pattern", pattern.pixel_DN2, expected.pixel_DN2, 1),
-            ("fixed_pattern blocks", pattern.blocks_DN2, expected.blocks_DN2, BLOCK_PX**2),
+            (FIXED, pattern.pixel_DN2, expected.pixel_DN2, 1),
+            (FIXED_BLOCKS, pattern.blocks_DN2, expected.blocks_DN2, BLOCK_PX**2),
         ):
             if found_DN2 is not None and noise_DN2 is not None:
                 value = math.sqrt(max(found_DN2, least / pixels) / noise_DN2)

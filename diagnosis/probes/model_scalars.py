@@ -16,6 +16,8 @@ from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
 from .probes import (
+    FIXED,
+    FIXED_BLOCKS,
     FIXED_COLUMNS,
     FIXED_ROWS,
     LASTING,
@@ -142,12 +144,12 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     neighbours = 1.0 - autocovariance(expected, 0, 1)
     lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
     noise = context.pattern_noise
-    values["fixed_pattern"] = math.sqrt(
+    values[FIXED] = math.sqrt(
         max(1.0 + (sum(one.pixel_DN2 for one in changed) + added * neighbours) / noise.pixel_DN2, 1e-3)
     )
     if noise.blocks_DN2 is not None:
         of_blocks = (sum(one.blocks_DN2 or 0.0 for one in changed) + lasting / BLOCK_PX**2) / noise.blocks_DN2
-        values["fixed_pattern blocks"] = math.sqrt(max(1.0 + of_blocks, 1e-3))
+        values[FIXED_BLOCKS] = math.sqrt(max(1.0 + of_blocks, 1e-3))
     if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
         # lines that change leave their mean
         of_rows, of_columns = (

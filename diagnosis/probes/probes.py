@@ -10,6 +10,7 @@ frames, lines, blocks, the common factor, codes, fixed pattern and outliers.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+FIXED, FIXED_BLOCKS = "fixed_pattern", "fixed_pattern blocks"
 FIXED_ROWS, FIXED_COLUMNS = "fixed_pattern rows", "fixed_pattern columns"
 OUTLIERS, OUTLIERS_ANYWHERE = "outliers", "outliers in any series"
 REPEATED_FRAMES = "repeated frames"

@@ -1,7 +1,7 @@
 """Part of the beam behind an absorber that nobody declared: a foil, a mesh, a collimator that has moved.
 
 Behind it N(E) -> N(E) exp(-tau ((1 - h) + h mu_Al(E) / mu_Al(45 keV))), tau = -ln(1 - s): grey (h = 0) or a sheet of aluminium
-(h = 1). A straight border, its penumbra a Gaussian's integral.
+(h = 1). It ends at a straight border, its penumbra a Gaussian's integral, or lies between two: a strip, a corner.
 """
 
 import math
@@ -22,16 +22,21 @@ _DEPTHS = (
     1.0,
 )  # of sheets that are projected, ln(1 / passed) at the stated energy; between them slopes are quadratic
 _MOST = 0.999
+_OUTSIDE = -1.2  # of a border: half a diagonal and three of the widest penumbras from the middle
 
 
 def _coverage(context: LineContext, parameters: Mapping[str, float], rotation_deg: float) -> FloatArray:
     """Share of the pixel's beam that is behind the absorber (row, column), 0 to 1."""
     from scipy.special import ndtr
 
-    angle = math.radians(parameters["direction_deg"] - rotation_deg)
     row, column = ((np.arange(side) - 0.5 * (side - 1)) / max(side - 1, 1) for side in context.shape)
-    across = row[:, None] * math.cos(angle) + column[None, :] * math.sin(angle)
-    return np.asarray(ndtr((across - parameters["border"]) / parameters["penumbra"]), dtype=np.float64)
+    first = parameters["direction_deg"]
+    covered = np.ones(context.shape)
+    for direction_deg, border in ((first, "border"), (first + parameters["turn_deg"], "second_border")):
+        angle = math.radians(direction_deg - rotation_deg)
+        across = row[:, None] * math.cos(angle) + column[None, :] * math.sin(angle)
+        covered *= ndtr((across - parameters[border]) / parameters["penumbra"])
+    return covered
 
 
 def _lagrange(depth: float) -> FloatArray:
@@ -111,6 +116,24 @@ GREY_ABSORBER = Effect(
             log=False,
         ),
         Parameter(
+            name="turn_deg",
+            unit="deg",
+            low=45.0,
+            high=315.0,
+            default=180.0,
+            source="from the first border's direction to the second's: 180 for a strip, 90 or 270 for a corner",
+            log=False,
+        ),
+        Parameter(
+            name="second_border",
+            unit="",
+            low=_OUTSIDE,
+            high=0.45,
+            default=_OUTSIDE,
+            source="where the second border crosses its own direction, as the first; outside the field there is none",
+            log=False,
+        ),
+        Parameter(
             name="penumbra",
             unit="",
             low=0.004,
@@ -139,12 +162,24 @@ GREY_ABSORBER = Effect(
     isolated_by="flats with the absorber's side of the beam uncovered, and with the panel turned by 180 degrees",
     shows=Shows(series=LIT_SERIES, axis="position"),
     absorbed="maps of beams",
-    # a wide penumbra tells from afar which way its border lies; it narrows as the border is found
+    # a wide penumbra tells from afar which way a border lies; it narrows as the border is found
     grid=Grid(
         shares=(0.5,),
         variants=tuple(
-            {"direction_deg": angle, "border": 0.0, "penumbra": 0.12, "sheet_share": 0.5}
-            for angle in (0.0, 90.0, 180.0, 270.0)
+            {
+                "direction_deg": angle,
+                "border": border,
+                "turn_deg": turn,
+                "second_border": second,
+                "penumbra": 0.12,
+                "sheet_share": 0.5,
+            }
+            for turn, border, second, angles in (
+                (180.0, 0.0, _OUTSIDE, (0.0, 90.0, 180.0, 270.0)),
+                (180.0, -0.15, -0.15, (0.0, 45.0, 90.0, 135.0)),
+                (90.0, 0.0, 0.0, (0.0, 90.0, 180.0, 270.0)),
+            )
+            for angle in angles
         ),
     ),
 )

@@ -1,7 +1,7 @@
 """Veiling glare: light that travels far inside the detector. It knows nothing of gap or thickness.
 
 h = (1 - r) delta + r exp(-R / L) / (2 pi L R),    transfer function (1 - r) + r / sqrt(1 + (2 pi L f)^2)
-(`order` 1/2; other shapes: _light_spread.py)
+(`order` 1/2; other shapes: _light_spread.py). A share of r may be spread evenly over the whole panel, as by a cover or a housing.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,8 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
         spread = spread_transfer(
             f_row, f_column, reach_px=length_px, order=parameters["order"], usual_order=_USUAL_ORDER
         )
-        return np.asarray((1.0 - share) + share * spread)
+        even = (f_row == 0.0) & (f_column == 0.0)
+        return np.asarray((1.0 - share) + share * np.where(even, 1.0, (1.0 - parameters["even_share"]) * spread))
 
     return replace(state, optical_transfers=(*state.optical_transfers, transfer))
 
@@ -34,7 +35,7 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
 VEILING_GLARE = Effect(
     id="veiling_glare",
     title="veiling glare in the detector",
-    law=r"H(f) = (1 - s) + \frac{s}{\sqrt{1 + (2\pi L f)^2}}",
+    law=r"H(f) = (1 - s) + \frac{s\,(1 - e)}{\sqrt{1 + (2\pi L f)^2}},\quad H(0) = 1",
     parameters=(
         Parameter(
             name="strength",
@@ -56,6 +57,16 @@ VEILING_GLARE = Effect(
             log=True,
         ),
         order_parameter(_USUAL_ORDER),
+        Parameter(
+            name="even_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="share of the glare that reaches all of the panel alike: light that a cover or a housing scatters back",
+            log=False,
+            sought_last=True,
+        ),
     ),
     stage="optics",
     reference="Seibert, Nalcioglu, Roeck (1984), doi:10.1118/1.595527",
@@ -66,5 +77,5 @@ VEILING_GLARE = Effect(
     shows=Shows(series=LIT_SERIES, axis="sharpness", like_thinner=True),
     either_onset=True,
     absorbed="noise",
-    grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5})),
+    grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5}, {"length_mm": 4.5, "even_share": 0.5})),
 )

@@ -223,7 +223,7 @@ def fine_frequencies(length: int) -> FloatArray:
 
 
 def kept_cosines(along: FloatArray, least: float = 1e-5) -> int:
-    """Number of cosines that a transfer function along an axis (`fine_frequencies`,) leaves above `least`; those of pixels at least."""
+    """Number of cosines that a transfer function along an axis (`fine_frequencies`,) leaves above `least`, one a pixel at least."""
     last = int(np.flatnonzero(np.abs(along) > least)[-1])
     return min(along.size, max(last, along.size // FINE) + 1)
 

@@ -41,7 +41,7 @@ WIDE = 0.15  # half width of an a90's interval, as a share of it, above which a 
 
 
 def _table_line(**changes: Any) -> LabLine:
-    """The demo's line with a test set that is large enough for intervals of some +-15 %."""
+    """The demo's line with a test set that is large enough for intervals within +-10 %."""
     usual: dict[str, Any] = {
         "size": (96, 128),
         "pixel_mm": 0.45,
@@ -51,8 +51,8 @@ def _table_line(**changes: Any) -> LabLine:
         "bones_across_mm": (1.0, 6.0),  # 20 ms needs contrasts above those of ribs
         "calibration_frames": 16,
         "products": 120,
-        "test_products": 320,
-        "boneless": 80,
+        "test_products": 1000,
+        "boneless": 250,
         "exposures_ms": PAPER_EXPOSURES_MS,
         "lab_exposures_ms": PAPER_EXPOSURES_MS,
         "generated": 240,

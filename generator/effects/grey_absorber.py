@@ -84,8 +84,8 @@ def _cover(state: LineState, parameters: Mapping[str, float], context: LineConte
 GREY_ABSORBER = Effect(
     id="grey_absorber",
     title="part of the beam behind an absorber that nobody declared",
-    law=r"N(E) \to N(E)\,\bigl(1 - c(u)\,c(v)\,(1 - e^{-\tau\,(1 - h + h\,\mu_\mathrm{Al}(E)/\mu_\mathrm{Al}(45\,\mathrm{keV}))})\bigr),"
-    r"\quad s = 1 - e^{-\tau}",
+    law=r"N(E) \to N(E)\,\bigl(1 - c(u)\,c(v)\,"
+    r"(1 - e^{-\tau\,(1 - h + h\,\mu_\mathrm{Al}(E)/\mu_\mathrm{Al}(45\,\mathrm{keV}))})\bigr),\quad s = 1 - e^{-\tau}",
     parameters=(
         Parameter(
             name="strength",

@@ -172,7 +172,7 @@ def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArr
 def _cubic_terms(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Terms of the cubic surface at the middles of blocks (block row, block column, term) and at pixels (row, column, term)."""
 
-    def terms(places: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def terms(places: Sequence[NDArray[np.floating]]) -> NDArray[np.float64]:
         y, x = np.meshgrid(
             *(2.0 * at / length - 1.0 for at, length in zip(places, (rows, columns), strict=True)), indexing="ij"
         )
@@ -254,7 +254,7 @@ def pattern_of(change_DN: NDArray[np.floating]) -> Pattern:
 def _to_surface(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What makes of means of blocks the cubic surface's factors (term, block), and its terms at pixels (row, column, term)."""
     at_blocks, at_pixels = _cubic_terms(rows, columns)
-    return np.linalg.pinv(at_blocks.reshape(-1, at_blocks.shape[2])), at_pixels
+    return np.asarray(np.linalg.pinv(at_blocks.reshape(-1, at_blocks.shape[2])), dtype=np.float64), at_pixels
 
 
 def _block_means(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -410,3 +410,17 @@ def test_one_session_in_twenty_without_a_gap_shows_a_place_at_the_most(alike):
     shown = np.mean(np.max(np.abs(probes), axis=1) > _threshold(60))
     assert shown < 0.062  # of 4000, three standard deviations above 0.05
     assert alike or shown > 0.038
+
+
+def test_an_exact_law_is_brought_nearer_than_one_that_may_be_off():
+    x = np.linspace(0.0, 3.0, PROBES)
+
+    def law(parameters, strength):
+        return 4000.0 * strength * np.exp(-((x - np.log(parameters["length_mm"])) ** 2) * (1.0 + parameters["order"]))
+
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    residual = law({"length_mm": 4.0, "order": 1.7}, 2.0) + np.random.default_rng(2).standard_normal(PROBES)
+    found = refined(variants, law, residual)[0][0]
+    left = [float(np.sum((residual - law(found.parameters, strength)) ** 2)) for strength in np.linspace(1.9, 2.1, 401)]
+    assert min(left) < 2.0 * PROBES  # of 1e8: a tenth of it off, the search would end at 9e6
+    assert found.parameters["order"] == pytest.approx(1.7, rel=0.01)

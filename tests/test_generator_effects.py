@@ -485,6 +485,39 @@ def test_glare_fills_opaque_shadows_whatever_the_gap_and_leaves_flats_alone(seri
     assert centres[0] == pytest.approx(0.04 * outside, rel=0.05)
 
 
+def test_glare_of_the_whole_panel_adds_the_mean_everywhere(series_line):
+    asked = request("object", thickness_mm=disc())
+    flat = expect(series_line, request()).signal_DN  # the pixels' own gains act on what they receive
+    bare = expect(series_line, asked).signal_DN / flat
+    lit = expect(series_line, asked, applied("veiling_glare", 4.0, even_share=1.0)).signal_DN / flat
+    np.testing.assert_allclose(lit, 0.96 * bare + 0.04 * bare.mean(), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "covers"),
+    [
+        (180.0, lambda row, column: np.abs(row) < 0.2),
+        (90.0, lambda row, column: (row > -0.2) & (column > -0.2)),
+        (270.0, lambda row, column: (row > -0.2) & (column < 0.2)),
+    ],
+)
+def test_an_absorber_lies_between_its_two_borders(series_line, turn_deg, covers):
+    effect = applied(
+        "grey_absorber",
+        10.0,
+        direction_deg=0.0,
+        border=-0.2,
+        turn_deg=turn_deg,
+        second_border=-0.2,
+        penumbra=0.004,
+    )
+    asked = request(after_calibration=True)
+    passed = expect(series_line, asked, effect).signal_DN / expect(series_line, asked).signal_DN
+    row, column = np.meshgrid(*(np.linspace(-0.5, 0.5, side) for side in SHAPE), indexing="ij")
+    away = (np.abs(np.abs(row) - 0.2) > 0.1) & (np.abs(np.abs(column) - 0.2) > 0.1)
+    np.testing.assert_allclose(passed[away], np.where(covers(row, column), 0.9, 1.0)[away], atol=2e-3)
+
+
 def test_a_smaller_disc_lets_more_glare_into_its_middle(series_line):
     effect = applied("veiling_glare", 4.0, length_mm=2.0)
     small, large = (

@@ -44,6 +44,14 @@ def test_projection_is_the_sum_over_energies(materials, moments):
     assert np.max(np.abs(result / exact(thickness, mu, weights) - 1.0)) < TOLERANCE
 
 
+def test_threads_share_many_pixels_and_change_nothing():
+    thickness = np.random.default_rng(5).uniform(0.0, [[[60.0]], [[6.0]]], size=(2, 200, 100))
+    mu, weights = coefficients(2), spectrum()
+    whole = project_polychromatic(thickness, mu, weights)
+    assert np.max(np.abs(whole / exact(thickness, mu, weights) - 1.0)) < TOLERANCE
+    np.testing.assert_array_equal(project_polychromatic(thickness[:, :3], mu, weights), whole[:, :3])
+
+
 @pytest.mark.parametrize(
     ("materials", "backend"),
     [(1, "torch"), (2, "torch"), (3, "torch"), pytest.param(2, "torch_compiled", marks=pytest.mark.slow)],

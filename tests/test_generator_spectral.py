@@ -123,6 +123,16 @@ def test_a_voltage_that_varies_is_the_mean_over_its_voltages(model):
     assert varying.rate_DN_per_mAs[0] * varying.gain_DN[0] == pytest.approx(square, rel=1e-6)
 
 
+def test_draws_that_were_changed_are_other_draws(model):
+    beam = OpenBeam(kV=60.0, filters=())
+    samples = np.concatenate([parameters(model), parameters(model, log_scintillator_thickness=0.2)])
+    before = model.signal(samples, beam).rate_DN_per_mAs
+    samples[1] = samples[0]
+    after = model.signal(samples, beam).rate_DN_per_mAs
+    assert before[1] > 1.01 * before[0]
+    assert after[1] == after[0] == before[0]
+
+
 def test_light_counts_once_in_the_signal_and_twice_in_its_square(model):
     beam = OpenBeam(kV=30.0, filters=filters_from_text("Al:2"))
     plain, lighter = (model.signal(parameters(model, light_exponent=value), beam) for value in (0.0, 0.3))

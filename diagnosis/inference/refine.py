@@ -23,7 +23,7 @@ from .refine_tasks import Task, tasks_of
 from .search import curve_of, searched
 from .seen import Blocks, Responder, Seen, Whitener
 
-REFINED_FROM = 3.0  # separation from none, its law taken as exact, from which the grid's coarseness may decide
+SEEN_FROM = 3.0  # standard deviations from none at which an effect shows: a session can test it, and it is refined
 _STARTS = 2
 _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the other onset is refined as well
 
@@ -118,7 +118,7 @@ class _Refinement:
     def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""
         fits = [seen.fit(curve) for curve in self._curves if curve.effect == effect]
-        return [fit for fit in fits if _separation(fit, seen) >= REFINED_FROM]
+        return [fit for fit in fits if _separation(fit, seen) >= SEEN_FROM]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from .curve_fits import CurveFit
 from .seen import Seen
 
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
-_ROUNDS = 10
+_ROUNDS = 10  # of a search, at the most: it ends where nothing is gained
 _ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges

@@ -18,7 +18,7 @@ from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
 from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
-from ..inference.refine import refine
+from ..inference.refine import SEEN_FROM, refine
 from ..inference.whitening import Whitening
 from ..model.curves import Curve
 from ..problem.known_effects import with_found
@@ -31,7 +31,6 @@ EXPLAINED_FROM = 0.6  # probability of an effect (over all hypotheses) from whic
 _WORST_PLACES = 30
 _MUCH = 0.5  # of the gap that an effect removes to be listed, though an unknown one is likelier
 _WORTH_LISTING = 0.02  # probability of an effect that is neither named nor tied
-SEEN_FROM = 3.0  # standard deviations that an effect must be able to reach for the session to test it
 STRAINED_FROM = 5.0  # prior standard deviations
 _OF_RENDERING = ("rough edge", "edges,", "outline of", "gain map", "texture")  # nuisances that nobody can look up
 

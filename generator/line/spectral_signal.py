@@ -780,6 +780,7 @@ def _brackets(nodes: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDAr
 
 
 def _within(kV_error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Errors of the tube voltage (draw,), none larger than LARGEST_KV_ERROR."""
     return np.clip(kV_error, -LARGEST_KV_ERROR, LARGEST_KV_ERROR)
 
 

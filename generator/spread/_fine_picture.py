@@ -222,7 +222,7 @@ def fine_frequencies(length: int) -> FloatArray:
     return np.asarray(np.arange(FINE * length) / (2.0 * length))
 
 
-def kept_cosines(along: FloatArray, least: float = 1e-5) -> int:
+def kept_cosines(along: FloatArray, least: float) -> int:
     """Number of cosines that a transfer function along an axis (`fine_frequencies`,) leaves above `least`, one a pixel at least."""
     last = int(np.flatnonzero(np.abs(along) > least)[-1])
     return min(along.size, max(last, along.size // FINE) + 1)

@@ -52,13 +52,13 @@ def _table_line(**changes: Any) -> LabLine:
         "calibration_frames": 16,
         "products": 120,
         "test_products": 1000,
-        "boneless": 250,
         "exposures_ms": PAPER_EXPOSURES_MS,
         "lab_exposures_ms": PAPER_EXPOSURES_MS,
         "generated": 240,
         "seed": 1,
     }
-    return LabLine(**{**usual, **changes})
+    chosen = {**usual, **changes}
+    return LabLine(**{"boneless": chosen["test_products"] // 4, **chosen})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,11 +91,11 @@ class TablePlan:
             raise InputError("alarm share", received=self.alarm_share, expected="a share between 0 and 1")
         if not self.margin > 0:
             raise InputError("margin", received=self.margin, expected="a contrast above 0")
-        if self.line.boneless is None or self.line.boneless < 4:
+        if self.line.boneless is None or not 4 <= self.line.boneless < self.line.test_products:
             raise InputError(
                 "boneless",
                 received=self.line.boneless,
-                expected="4 products without bone or more: they set the thresholds",
+                expected=f"4 products without bone or more, which set the thresholds, and fewer than all {self.line.test_products}",
             )
 
 

@@ -289,6 +289,7 @@ def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
         (["--exposures-ms", "50,x"], "--exposures-ms: got '50,x'"),
         (["--exposures-ms", "1000"], "--exposures-ms: got (1000.0,)"),
         (["--boneless", "2"], "--boneless: got 2"),
+        (["--test-products", "100", "--boneless", "100"], "--boneless: got 100"),
         (["--networks", "0"], "--networks: got 0"),
         (["--alarm-share", "1"], "alarm share: got 1.0"),
         (["--margin", "0"], "--margin: got 0.0"),

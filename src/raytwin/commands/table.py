@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--products", type=int, help="products to learn from (120)")
     parser.add_argument("--generated", type=int, help="training pairs generated for each exposure (240)")
     parser.add_argument("--test-products", type=int, help="products to test on (1000)")
-    parser.add_argument("--boneless", type=int, help="those among them without bone (250)")
+    parser.add_argument("--boneless", type=int, help="those among them without bone (a quarter)")
     parser.add_argument("--size", metavar="ROWSxCOLUMNS", help="detector, pixels (96x128)")
     parser.add_argument("--margin", type=float, help="of equivalence, in contrast (0.02)")
     parser.add_argument("--alarm-share", type=float, help="rate of false alarms that thresholds are set for (0.05)")

@@ -11,12 +11,13 @@ from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effe
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
+from raytwin.diagnosis.inference.inner_parameters import with_inner_open
 from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
 from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
-from raytwin.diagnosis.inference.search import _in_turn, _Slopes, searched
+from raytwin.diagnosis.inference.search import Slopes, _in_turn, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
 from raytwin.diagnosis.inference.unknown import beyond
 from raytwin.diagnosis.inference.whitening import Whitening
@@ -25,6 +26,7 @@ from raytwin.diagnosis.judgement.strengths import _outright
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
+from raytwin.generator.effects import Parameter
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)
@@ -508,7 +510,7 @@ def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
         by_level = {"by_level": none, "at_any_strength": none}
         return CurveFit(curve=curve, **by_level, log_evidence=0.0, level=0.0, strengths=at, log_likelihood=none)
 
-    known = _Slopes(("width", "order"), true + 0.3 * rng.standard_normal(true.shape), 1.0)
+    known = Slopes(("width", "order"), true + 0.3 * rng.standard_normal(true.shape), 1.0)
     learnt = known.learnt(fit(start, 1.0), fit(ahead, 2.0), step)
     taken = np.array([0.4, -0.2])
     # of twice the strength twice the change, along the step; across it nothing is learnt
@@ -653,6 +655,61 @@ def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
     assert max(found[0].strengths) == pytest.approx(9.0, rel=0.03)
     assert any(max(strengths) > 10.0 for strengths in asked)
     assert searched(variant, fit, replace(what, respond=lambda variants, wanted=None: {})) is None
+
+
+def test_an_interval_holds_what_inner_parameters_leave_open():
+    """A shape stands for a strength: s (a + t b), t even from -1 to 1, b nearly along a; refinement finds s and t together."""
+    rng = np.random.default_rng(44)
+    a = rng.standard_normal(PROBES)
+    b = 0.4 * a + 0.02 * rng.standard_normal(PROBES)
+    shape = Parameter(name="shape", unit="", low=-1.0, high=1.0, default=0.0, source="test", log=False)
+
+    def respond(variants, wanted=None):
+        return {
+            number: np.outer(item.strengths, a + item.parameters["shape"] * b) for number, item in enumerate(variants)
+        }
+
+    held, held_as_found = 0, 0
+    for _ in range(100):
+        truth, at = float(np.exp(rng.uniform(0.0, 1.0))), float(rng.uniform(-1.0, 1.0))
+        residual = truth * (a + at * b) + rng.standard_normal(PROBES)
+        first, second = np.linalg.lstsq(np.stack([a, b], axis=1), residual, rcond=None)[0]
+        known = float(np.clip(second / first, -1.0, 1.0))
+        curve = one_node("veiling_glare", a + known * b, low=0.1, high=20.0)
+        variant = Variant(
+            effect="veiling_glare",
+            name="",
+            parameters={"shape": known},
+            sign=1.0,
+            since="always",
+            low=0.1,
+            high=20.0,
+            strengths=(1.0,),
+            fitted=(shape,),
+            refined_from="grid",
+        )
+        observed = seen(residual)
+        fit = fit_curve(observed, curve, exact=True)
+        found = Hypothesis(
+            effects=("veiling_glare",),
+            probability=1.0,
+            log_evidence=0.0,
+            strengths={"veiling_glare": interval_of([fit])},
+            variants={"veiling_glare": curve},
+            levels={"veiling_glare": 0.0},
+        )
+        opened = with_inner_open(
+            found,
+            variants={("veiling_glare", ""): variant},
+            observed=observed,
+            respond=respond,
+            whitener=SimpleNamespace(apply=np.asarray),
+        )
+        (_, low, high), (_, low_as_found, high_as_found) = (one.strengths["veiling_glare"] for one in (opened, found))
+        held += low < truth < high
+        held_as_found += low_as_found < truth < high_as_found
+    assert held >= 90
+    assert held_as_found < 60  # 2 of 3 would be held with the shape known
 
 
 @pytest.mark.parametrize(("strength", "told"), [(0.1, "weaker"), (3.0, ""), (9.0, "stronger")])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.probes.lasting import BY_CHANCE, LEAST_FRAMES, chances, lasting_pixels
+from raytwin.diagnosis.probes.lasting import BY_CHANCE, LEAST_FRAMES, chance_in_flat, chances, lasting_pixels
+from raytwin.generator.frames.defects import Jumping
 from raytwin.generator.line.line_state import TelegraphPixels
 
 
@@ -58,6 +59,29 @@ def test_of_pixels_that_jump_as_many_last_and_stand_out_as_expected(height, stay
         spread = np.sqrt(chance * (1.0 - chance) * (1.0 / jumping + 1.0 / 4000) + 1e-6)
         assert abs(np.count_nonzero(seen) / jumping - chance) < 4.0 * spread + 0.02
     assert known > 0.1
+
+
+def test_pixels_that_jump_by_different_heights_last_and_stand_out_of_darks_and_flats_as_frames_that_are_drawn():
+    """Frames of two darks and a flat of the generator's own pixels: 6 % of 40 000, heights of 2 to 8 read noises."""
+    law = TelegraphPixels(share=0.06, amplitude_reads=4.0, stay_exposures=6.0, seed=3, differ=4.0)
+    rng, shape, read_DN, flat_DN = np.random.default_rng(11), (200, 200), 5.0, 9.0
+
+    def drawn(count, noise_DN):
+        jumping = Jumping(law, shape, rng)
+        return np.stack([jumping.added_to(noise_DN * rng.standard_normal(shape), read_DN, rng) for _ in range(count)])
+
+    darks, flat = [drawn(20, read_DN), drawn(30, read_DN)], drawn(30, flat_DN)
+    lasting = found_in(darks[0]) | found_in(darks[1])
+    limit_DN = 7.0 * flat_DN / np.sqrt(30)
+    out = (flat.mean(axis=0) > limit_DN) & ~lasting
+    described = (20, 1), (30, 1)
+    known = chances(law, described)[0]
+    in_flat = chance_in_flat(law, described, 30, 1, limit_DN / read_DN)
+    jumping = law.share * lasting.size
+    for seen, chance in ((lasting, known), (out, in_flat)):
+        spread = np.sqrt(chance * (1.0 - chance) * (1.0 / jumping + 1.0 / 4000))
+        assert abs(np.count_nonzero(seen) / jumping - chance) < 4.0 * spread
+    assert known > 0.3 and in_flat > 0.005
 
 
 @pytest.mark.parametrize("columns", [3, 18])

@@ -53,9 +53,10 @@ def twin(dark_DN=7.0):
     return SimpleNamespace(maps=maps, levels=())
 
 
-def maps_of(kept, means_DN, expected):
+def maps_of(kept, means_DN, expected, copies=0):
+    """Dark and gain map; copies: frames of each series that are copies of others."""
     looks = {
-        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames)
+        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames - copies)
         for item in kept
         if item.name in means_DN
     }
@@ -124,6 +125,8 @@ def test_the_gain_map_weighs_flats_by_signal_to_noise_and_shows_what_the_model_d
     # as of one flat of all the quanta: 20 frames of 4000
     assert maps.gain_quantum == pytest.approx(1.0 / (20 * 4000.0))
     assert maps.gain_white == 0.0
+    # a fifth of them copies: as many quanta fewer
+    assert maps_of([dark, *flats], means, expected, copies=4).gain_quantum == pytest.approx(1.0 / (16 * 4000.0))
     assert [tuple(place) for place in np.argwhere(~maps.good)] == [(3, 4)]
 
 
@@ -231,6 +234,11 @@ def test_an_effect_that_began_earlier_stands_for_a_later_one_unless_what_came_be
     assert lag["always"].whenever_it_began(later) == lag["calibration"].whenever_it_began(later) is not None
     first = request("flat", previous=(request("flat", after=False),))
     assert lag["always"].whenever_it_began(first) is None
+    # what fades in hours remembers what lag has long forgotten
+    late = replace(later, long_ago=(request("flat", after=False),))
+    assert lag["always"].whenever_it_began(late) is not None
+    assert changed("burn_in", strength=0.01).whenever_it_began(later) is not None
+    assert changed("burn_in", strength=0.01).whenever_it_began(late) is None
     # a heel looks otherwise where calibration has seen it
     assert changed("heel", strength=0.01).whenever_it_began(later) is None
 

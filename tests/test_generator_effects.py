@@ -1259,23 +1259,27 @@ def test_crosstalk_blurs_an_edge_as_quanta_that_move_one_by_one_and_leaves_noise
     )
 
 
-def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps(series_line):
+@pytest.mark.parametrize("lasting", [0.0, 0.4])
+def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps(series_line, lasting):
     """Traps are filled and emptied step by step, a hundred steps an exposure."""
-    strength, fade_s, fills = 4.0, 12.0, 30.0
+    strength, fade_s, fills = 4.0, np.array([12.0, np.inf])[:, None, None], 30.0
+    shares = np.array([1.0 - lasting, lasting])[:, None, None]
     shadow, flat = request(**BEHIND, frames=40), request(frames=20, start_s=4.0)
-    asked = request(frames=12, start_s=9.0, previous=(shadow, flat))
-    effect = applied("burn_in", strength, fade_s=fade_s, fills_after_exposures=fills)
+    # what comes long before is remembered as what comes just before
+    asked = request(frames=12, start_s=9.0, long_ago=(shadow,), previous=(flat,))
+    effect = applied("burn_in", strength, fade_s=12.0, fills_after_exposures=fills, lasting_share=lasting)
     found, plain = expect(series_line, asked, effect), expect(series_line, asked)
     step_s = asked.interval_s(series_line.instrument.readout_ms)
     highest = 2.0**series_line.instrument.bits - 1 - series_line.dark_DN.value
     most = strength / 100.0 / (1.0 - math.exp(-100.0 / fills))
-    full, clock_s, gain = np.zeros(SHAPE), 0.0, []
+    full, clock_s, gain = np.zeros((2, *SHAPE)), 0.0, []
     for series in (shadow, flat, asked):
-        light = expect(series_line, replace(series, frames=1, previous=())).signal_DN / (fills * highest)
-        full = full * math.exp(-(series.start_s - clock_s) / fade_s)
+        bare = replace(series, frames=1, previous=(), long_ago=())
+        light = expect(series_line, bare).signal_DN / (fills * highest)
+        full = full * np.exp(-(series.start_s - clock_s) / fade_s)
         gain = []
         for _ in range(series.frames):
-            gain.append(1.0 + most * full)
+            gain.append(1.0 + most * (shares * full).sum(axis=0))
             for _ in range(100):
                 full = full + (light * (1.0 - full) - full * step_s / fade_s) / 100.0
         clock_s = series.start_s + series.frames * step_s
@@ -1288,6 +1292,11 @@ def test_a_gain_that_remembers_exposure_is_that_of_traps_followed_in_small_steps
     np.testing.assert_allclose(found.quantum_variance_DN2, known**2 * plain.quantum_variance_DN2, rtol=1e-9)
     # where the object stood the later flat is darker
     assert known[20, 20] < known[1, 1] - 1e-4
+    frames = LineModel(series_line, effects=effect).sample(replace(asked, frames=400), rng=np.random.default_rng(5))
+    plain_frames = LineModel(series_line, effects=()).sample(replace(asked, frames=400), rng=np.random.default_rng(5))
+    risen = np.mean([one.mean() for one in frames]) / np.mean([one.mean() for one in plain_frames]) - 1.0
+    expected = expect(series_line, replace(asked, frames=400), effect).mean_DN.mean() / plain.mean_DN.mean() - 1.0
+    assert risen == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("dead_ns", [5_000.0, 40_000.0])

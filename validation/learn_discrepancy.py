@@ -55,14 +55,19 @@ def row_of(weighed: Weighed, planted: str) -> dict:
     own = [fit for fit in weighed.fits if fit.curve.effect == planted]
     others = [fit for fit in weighed.fits if fit.curve.effect != planted]
     if own:
-        best = max(own, key=lambda fit: fit.log_evidence)
-        row["kind"] = told_by_law(observed, best, parts)
+        row["kind"] = told_by_law(observed, _likest(own), parts)
     if others:
-        likest = max(others, key=lambda fit: fit.log_evidence)
+        likest = _likest(others)
         row["another"] = told_by_law(observed, likest, parts, another=True)
         row["likest"] = likest.curve.effect
         row["left_out"] = told(weigh_hypotheses([(observed, others)], **parts))
     return row
+
+
+def _likest(fits: list[CurveFit]) -> CurveFit:
+    """The likeliest of those that were fitted with all levels."""
+    full = [fit for fit in fits if len(fit.by_level) == len(LEVELS.levels)]
+    return max(full, key=lambda fit: fit.log_evidence)
 
 
 def told_by_law(observed: Observed, fit: CurveFit, parts: dict, *, another: bool = False) -> dict:
@@ -144,7 +149,9 @@ def learn(paths: list[Path]) -> None:
     """Print the table of `diagnosis/inference/discrepancy.toml`, and the scores of the sessions that it comes from."""
     rows = [row for path in paths for row in json.loads(path.read_text())]
     # where another law tells more than the planted one's, frames do not show that: calibration took it in, or it acts otherwise
+    # and a law that leaves more than it takes away is none of that kind
     seen = [row for row in rows if "kind" in row and _most(row["kind"]) > _most(row.get("another"))]
+    seen = [row for row in seen if row["kind"]["ratio"] < 1.0]
     kind = frequencies([row["kind"] for row in seen], about_nothing)
     another = frequencies([row["another"] for row in rows if "another" in row], of_logarithm)
     print(f"levels = {list(LEVELS.levels)}\nof_kind = {kind['levels']}\nof_another = {another['levels']}")

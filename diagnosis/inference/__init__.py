@@ -14,5 +14,6 @@ Files:
     refine            inner parameters fitted: the loop
     refine_tasks      which effects are fitted, in which order
     search            one fit: slopes and steps
+    inner_parameters  strengths with reach and shape of laws left open
     seen              which residual and series a fit asks
 """

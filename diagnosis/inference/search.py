@@ -84,7 +84,7 @@ class _Found:
     variant: Variant
     strength: float
     fit: CurveFit
-    slopes: "_Slopes | None" = None
+    slopes: "Slopes | None" = None
 
 
 class _Search:
@@ -103,7 +103,7 @@ class _Search:
         parts: Sequence[Sequence[Parameter]],
         *,
         rounds: int = _ROUNDS,
-        slopes: "_Slopes | None" = None,
+        slopes: "Slopes | None" = None,
     ) -> _Found | None:
         """Parts of the inner parameters, one after the other, from a strength (slopes: for the first); None: it cannot be asked."""
         fit = self._tried(self._start, strength)
@@ -114,7 +114,9 @@ class _Search:
             slopes = None if number else slopes
             for _ in range(rounds):
                 learnt = slopes is not None
-                slopes = slopes or _slopes_at(here.fit, here.variant, part, self._seen)
+                slopes = slopes or slopes_of(
+                    here.fit.curve, here.variant, part, _plausible(here.fit, here.variant), self._seen
+                )
                 before = here
                 here = self._stepped(before, part, slopes)
                 gained, evidence = here.fit.log_evidence - before.fit.log_evidence, before.fit.log_evidence
@@ -126,7 +128,7 @@ class _Search:
                     break
         return replace(here, slopes=slopes)
 
-    def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "_Slopes") -> _Found:
+    def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "Slopes") -> _Found:
         """The best along a step towards where the probes want some parameters; the start itself where none is better."""
         # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
         # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
@@ -176,7 +178,7 @@ def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Slopes:
+class Slopes:
     """How a response changes with inner parameters: rows (parameter, probe) for each half of a parameter's range, at one strength."""
 
     names: tuple[str, ...]
@@ -187,7 +189,7 @@ class _Slopes:
         """The rows at another strength, to which they are taken to be in proportion."""
         return self.rows * (strength / self.strength)
 
-    def learnt(self, before: CurveFit, after: CurveFit, step: Mapping[str, float]) -> "_Slopes":
+    def learnt(self, before: CurveFit, after: CurveFit, step: Mapping[str, float]) -> "Slopes":
         """With what a step has shown, along that step.
 
         Source: Broyden (1965), doi:10.1090/S0025-5718-1965-0198670-6.
@@ -196,16 +198,15 @@ class _Slopes:
         taken = np.array([step[name] for name in self.names])
         rows, length = self.at(strength), float(taken @ taken)
         if length == 0.0:  # at the ends of their ranges: better by its strength alone
-            return _Slopes(self.names, rows, strength)
+            return Slopes(self.names, rows, strength)
         change = np.asarray(after.curve.response(strength)) - np.asarray(before.curve.response(strength))
         rows = rows + np.outer(taken, change - taken @ rows) / length
-        return _Slopes(self.names, rows, strength)
+        return Slopes(self.names, rows, strength)
 
 
-def _slopes_at(here: CurveFit, variant: Variant, inner: Sequence[Parameter], seen: Seen) -> _Slopes:
-    """What small steps of the inner parameters do to the response; those that cannot be asked are left out."""
-    strength = _plausible(here, variant)
-    at = np.asarray(here.curve.response(strength))
+def slopes_of(curve: Curve, variant: Variant, inner: Sequence[Parameter], strength: float, seen: Seen) -> Slopes:
+    """What small steps of the inner parameters do to a curve's response; those that cannot be asked are left out."""
+    at = np.asarray(curve.response(strength))
     steps, asked = [], []
     for item in inner:
         value = variant.parameters[item.name]
@@ -214,9 +215,16 @@ def _slopes_at(here: CurveFit, variant: Variant, inner: Sequence[Parameter], see
         asked.append(replace(variant, parameters=moved, strengths=(strength,)))
     answer = seen.ask(asked)
     rows = [(answer[number][0] - at) / steps[number] for number in sorted(answer)]
-    return _Slopes(
+    return Slopes(
         tuple(inner[number].name for number in sorted(answer)), np.reshape(rows, (len(rows), at.size)), strength
     )
+
+
+def from_middle(item: Parameter, value: float) -> float:
+    """How far a parameter's value lies from the middle of its range, in halves of it; a direction has no middle."""
+    if _turns(item):
+        return 0.0
+    return _way(item, math.sqrt(item.low * item.high) if item.log else 0.5 * (item.low + item.high), value)
 
 
 def _plausible(here: CurveFit, variant: Variant) -> float:
@@ -224,7 +232,7 @@ def _plausible(here: CurveFit, variant: Variant) -> float:
     return min(max(here.best, variant.low), variant.high)
 
 
-def _newton(here: CurveFit, variant: Variant, slopes: _Slopes, seen: Seen) -> dict[str, float]:
+def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> dict[str, float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them.
 
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
@@ -245,11 +253,16 @@ def _newton(here: CurveFit, variant: Variant, slopes: _Slopes, seen: Seen) -> di
     return {name: float(step) for name, step in zip(slopes.names, solved[1:], strict=True)}
 
 
+def _turns(item: Parameter) -> bool:
+    """Whether a parameter is a direction of all round."""
+    return item.name.endswith("_deg") and item.high - item.low >= 360.0
+
+
 def _way(item: Parameter, value: float, moved: float) -> float:
     """The step that moves a parameter's value so far, in halves of its range."""
     if item.log:
         return 2.0 * math.log(moved / value) / math.log(item.high / item.low)
-    if item.name.endswith("_deg") and item.high - item.low >= 360.0:
+    if _turns(item):
         return ((moved - value + 180.0) % 360.0 - 180.0) / 180.0
     return 2.0 * (moved - value) / (item.high - item.low)
 
@@ -258,7 +271,7 @@ def _moved(item: Parameter, value: float, step: float) -> float:
     """A parameter's value moved by `step` times half of its range, within the range."""
     if item.log:
         moved = value * math.exp(step * math.log(item.high / item.low) / 2.0)
-    elif item.name.endswith("_deg") and item.high - item.low >= 360.0:
+    elif _turns(item):
         return (value + 180.0 * step) % 360.0
     else:
         moved = value + step * (item.high - item.low) / 2.0

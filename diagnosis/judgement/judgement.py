@@ -15,6 +15,7 @@ from ..inference.curve_fits import CurveFit, fit_effects
 from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
 from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
+from ..inference.inner_parameters import with_inner_open
 from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
@@ -152,6 +153,13 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
         seen = [(one, fit_effects(one, whitened)) for one in levels]
     hypotheses = weigh(seen, rests=True)
+    by_name = {(item.effect, item.name): item for item in problem.variants}
+    hypotheses = tuple(
+        with_inner_open(item, variants=by_name, observed=observed, respond=problem.respond, whitener=whitening)
+        if item.probability > _WORTH_LISTING
+        else item
+        for item in hypotheses
+    )
     problem = problem.released()
     own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     return Weighed(

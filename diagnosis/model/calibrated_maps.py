@@ -70,6 +70,12 @@ class CalibratedMaps:
     good: NDArray[np.bool_]
     frames: Mapping[str, int]
 
+    @property
+    def read_DN2(self) -> float | None:
+        """Variance of a pixel of the calibrating darks' frames, DN^2; None: there are none."""
+        known = [mean_over(white_DN2, self.good) for white_DN2 in self.darks.white_DN2.values()]
+        return sum(known) / len(known) if known else None
+
     def dark_noise(self, item: SessionSeries, signal_DN: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variance, DN^2, that noise of the calibrating darks gives a pixel of a corrected mean frame, through the gain map as well.
 
@@ -136,7 +142,7 @@ def calibrated_maps(
     for item in flats:
         model = expected[item.name]
         share = shares[item.name] / mean_over(model.signal_DN, good)
-        weight = share**2 / item.series.n_frames
+        weight = share**2 / looks[item.name].frames
         quantum += weight * mean_over(model.quantum_variance_DN2, good)
         white += weight * mean_over(model.white_variance_DN2, good)
         for name, part in under.weights_under(item).items():

@@ -119,7 +119,8 @@ class Change:
         ):
             return None
         effect = self.effects[0]
-        if effect.since == "always" and any(not item.after_calibration for item in request.previous):
+        long_ago = request.long_ago if EFFECTS[effect.id].remembers_all else ()
+        if effect.since == "always" and any(not item.after_calibration for item in (*long_ago, *request.previous)):
             return None  # what was exposed before calibration ended remembers when it began
         return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
 

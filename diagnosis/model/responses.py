@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
-from ..probes.fixed_pattern import pattern_noise, pattern_of
+from ..probes.fixed_pattern import OUTLIER_SD, pattern_noise, pattern_of
 from ..probes.line_scalars import bent_share
 from ..probes.model_scalars import expected_scalars
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED, FIXED_BLOCKS, FIXED_COLUMNS, FIXED_ROWS
@@ -17,9 +17,10 @@ from ..probes.registration import Placement
 from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
 from ..session.session import SessionSeries
-from ..session.summaries import CODES_FRAMES, SeriesSummary
+from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries, counted_copies
 from .calibrated_maps import CalibratedMaps, exposure_of
+from .changes import DUST_LIMIT
 from .defects import counting_series
 from .forward_model import Change, ForwardModel
 from .placing import PlacedSeries
@@ -254,7 +255,7 @@ def session_model(
                 (other.series.n_frames, other.request.exposures_per_frame)
                 for other in sorted(darks, key=lambda other: other.name != item.name)
             )
-            if item.name == counting or item.name in {dark.name for dark in darks}
+            if item.name == counting or item.series.kind in ("dark", "flat")
             else (),
         )
         alone = expected_scalars(expected, context)
@@ -298,6 +299,11 @@ def _context(
     lit_DN = np.asarray(signal_DN if lit else 0.0)
     squared = float(lit_DN) ** 2
     noise_of_maps = maps.gain_quantum * squared, maps.gain_white * squared + float(maps.dark_noise(item, lit_DN))
+    noise = pattern_noise(
+        expected, clean, seen.looks[item.name].frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
+    )
+    read_DN2 = mean_over(expected.white_variance_DN2, clean) if maps.read_DN2 is None else maps.read_DN2
+    stands_out_DN = max(OUTLIER_SD * math.sqrt(noise.pixel_DN2), DUST_LIMIT * max(signal_DN, 0.0))
     return ScalarContext(
         kind=kind,
         frames=frames,
@@ -309,14 +315,13 @@ def _context(
         calibrates=item.calibrates,
         codes_usable=kind in ("dark", "flat")
         and 0 < code_range < _CODES_SHARE * clean.sum() * min(frames, CODES_FRAMES),
-        pattern_noise=pattern_noise(
-            expected, clean, frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
-        ),
+        pattern_noise=noise,
         quantum_DN2=mean_over(expected.quantum_variance_DN2, clean),
         dark_DN=mean_over(expected.dark_DN, clean),
         counts_all_outliers=counts_all,
         repeatable=repeatable,
         later_darks=later_darks,
+        stands_out_reads=stands_out_DN / math.sqrt(max(read_DN2, LEAST_NOISE_DN2)),
         gain=maps.gain if lit and "gain" not in item.series.corrected else None,
         averaged=item.request.exposures_per_frame,
         whole_lines=int(clean.sum()) > _WHOLE_LINES * in_use,

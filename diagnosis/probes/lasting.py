@@ -7,6 +7,7 @@ Source: von Neumann, Ann. Math. Statist. 12 (1941) 367-395, doi:10.1214/aoms/117
 """
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +21,7 @@ _NOISIER, _MEMORY_SD = 1e-4, 2.326  # chance of such a variance; standard deviat
 _MOST = 0.15  # share of the pixels; more of them are a picture that fades, not pixels that jump
 _AROUND_PX, _MOST_AROUND = 5, 0.35  # the same of a square around one: of 10 % by chance one square in 500
 _DRAWN = 4000  # pixels of which chances are counted: 1 % of a share of one half
+_SEED = 0x7E1E
 _OUTLYING = 8.0  # standard deviations of its mean from which a pixel stands out, as in `model.defects`
 
 
@@ -69,33 +71,55 @@ def chances(law: TelegraphPixels | None, darks: tuple[tuple[int, int], ...]) -> 
         law: None: no pixel jumps.
         darks: frames of each dark, and exposures a frame.
     """
-    if law is None or law.share == 0.0:
+    if law is None or law.share == 0.0 or not darks:
         return 0.0, [0.0] * len(darks), 0.0
-    each = [
-        _chances_in_one(round(law.amplitude_reads, 2), round(law.stay_exposures, 2), frames, averaged)
-        for frames, averaged in darks
-    ]
-    in_none = math.prod(1.0 - lasts for lasts, _ in each)
-    out = [in_none / max(1.0 - lasts, 1e-9) * stands for lasts, stands in each]
-    quiet = math.prod(1.0 - lasts - stands for lasts, stands in each)
-    return 1.0 - in_none, out, in_none - quiet
+    lasts, out = _in_darks(_like(law), darks)
+    return float(lasts.mean()), [float((one & ~lasts).mean()) for one in out], float((out.any(axis=0) & ~lasts).mean())
 
 
-@lru_cache(maxsize=512)
-def _chances_in_one(amplitude_reads: float, stay_exposures: float, frames: int, averaged: int) -> tuple[float, float]:
-    """Chances that a pixel that jumps lasts in one dark, and that it does not but its mean stands out; counted in drawn pixels."""
-    rng = np.random.default_rng(0x7E1E)
+def chance_in_flat(
+    law: TelegraphPixels, darks: tuple[tuple[int, int], ...], frames: int, averaged: int, limit_reads: float
+) -> float:
+    """Chance of a pixel that jumps to last in no dark but to depart in a flat's mean by more than a limit, read noises."""
+    if not darks:
+        return 0.0
+    lasts, _ = _in_darks(_like(law), darks)
+    height_reads, levels = _levels(_like(law), frames, averaged, len(darks))
+    return float((~lasts & (height_reads * levels.mean(axis=0) / averaged > limit_reads)).mean())
+
+
+def _like(law: TelegraphPixels) -> TelegraphPixels:
+    """The same law for any share of the pixels, wherever they are."""
+    height, stay = round(law.amplitude_reads, 2), round(law.stay_exposures, 2)
+    return replace(law, share=1.0, seed=0, amplitude_reads=height, stay_exposures=stay)
+
+
+@lru_cache(maxsize=64)
+def _in_darks(law: TelegraphPixels, darks: tuple[tuple[int, int], ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether drawn pixels that jump last in any dark (pixel,), and stand out of each (dark, pixel)."""
+    lasts, stands = np.zeros(_DRAWN, dtype=bool), []
+    for number, (frames, averaged) in enumerate(darks):
+        height_reads, levels = _levels(law, frames, averaged, number)
+        noise = np.random.default_rng([_SEED, number]).standard_normal((frames, _DRAWN)) / math.sqrt(averaged)
+        value = height_reads / averaged * levels + noise
+        stands.append(np.abs(value.mean(axis=0)) > _OUTLYING / math.sqrt(frames * averaged))
+        if frames >= LEAST_FRAMES:
+            noisier, memory = _limits(frames)
+            stack, pair = value.var(axis=0, ddof=1), 0.5 * np.mean(np.diff(value, axis=0) ** 2, axis=0)
+            lasts |= (stack > noisier / averaged) & (pair < (1.0 - memory) * stack)
+    return lasts, np.array(stands)
+
+
+@lru_cache(maxsize=128)
+def _levels(
+    law: TelegraphPixels, frames: int, averaged: int, number: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Heights of drawn pixels, read noises (pixel,), and exposures of each frame in which they are up (frame, pixel)."""
+    height_reads, stay = law.of_pixels(_DRAWN, np.random.default_rng(_SEED))
+    rng = np.random.default_rng([_SEED, number, frames])
     up = rng.random(_DRAWN) < 0.5
     levels = np.zeros((frames, _DRAWN))
-    for number in range(frames * averaged):
-        levels[number // averaged] += up
-        up = up ^ (rng.random(_DRAWN) < 1.0 / stay_exposures)
-    noise = rng.standard_normal((frames, _DRAWN)) / math.sqrt(averaged)
-    value = amplitude_reads / averaged * levels + noise
-    out = np.abs(value.mean(axis=0)) > _OUTLYING / math.sqrt(frames * averaged)
-    if frames < LEAST_FRAMES:
-        return 0.0, float(out.mean())
-    noisier, memory = _limits(frames)
-    stack = value.var(axis=0, ddof=1)
-    lasts = (stack > noisier / averaged) & (0.5 * np.mean(np.diff(value, axis=0) ** 2, axis=0) < (1.0 - memory) * stack)
-    return float(lasts.mean()), float((out & ~lasts).mean())
+    for exposure in range(frames * averaged):
+        levels[exposure // averaged] += up
+        up = up ^ (rng.random(_DRAWN) < 1.0 / stay)
+    return height_reads, levels

@@ -10,7 +10,7 @@ from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
 from .fixed_pattern import NO_PATTERN, shares_of_pixels, shares_of_tiles
-from .lasting import BY_CHANCE, chances
+from .lasting import BY_CHANCE, chance_in_flat, chances
 from .line_scalars import LineNoise, bent_share
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
@@ -164,7 +164,7 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
             values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
-    seen = hot + _jumping(expected, context)[1] if context.kind == "dark" else bad - 0.5 * hot
+    seen = _jumping(expected, context)[1] + (hot if context.kind == "dark" else bad - 0.5 * hot)
     values[OUTLIERS] = math.sqrt(seen * context.areas.order.size + 0.375)
     # what bad pixels add is new in every frame
     values["memory of outliers"] = 0.0
@@ -172,12 +172,15 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
 
 
 def _jumping(expected: ExpectedSeries, context: ScalarContext) -> tuple[float, float, float]:
-    """Shares of the pixels that jump and last in a later dark, that stand out of this one, and of any, without lasting."""
-    law = expected.telegraph
-    if law is None or not context.later_darks:
+    """Shares of the pixels that jump and last in a later dark; that do not, but stand out of this dark or flat, and of any dark."""
+    law, darks = expected.telegraph, context.later_darks
+    if law is None or not darks:
         return 0.0, 0.0, 0.0
-    lasting, here, anywhere = chances(law, context.later_darks)
-    return law.share * lasting, law.share * here[0], law.share * anywhere
+    lasting, each, anywhere = chances(law, darks)
+    here = each[0]
+    if context.kind == "flat":
+        here = chance_in_flat(law, darks, context.frames, context.averaged, context.stands_out_reads)
+    return law.share * lasting, law.share * here, law.share * anywhere
 
 
 @lru_cache(maxsize=64)

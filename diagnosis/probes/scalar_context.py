@@ -79,8 +79,8 @@ class ScalarContext:
     of the panel's pixels in these frames, None where all are alike; averaged: exposures in a frame; whole_lines: good pixels fill
     rows and columns, so that noise of these is seen; repeatable: frames of all series that this one stands for, which may be copies
     of others; later_darks: frames, and exposures a frame, of all later darks, this one first if it is one, where pixels that stand
-    out of darks are counted; areas: the good pixels label by label; label_gain (label,): mean square of the gains of a label's pixels
-    over that of all good ones.
+    out of darks are counted; stands_out_reads: read noises by which a pixel of a flat's mean departs that stands out; areas: the good
+    pixels label by label; label_gain (label,): mean square of the gains of a label's pixels over that of all good ones.
     """
 
     kind: str
@@ -101,6 +101,7 @@ class ScalarContext:
     whole_lines: bool = True
     repeatable: int = 0
     later_darks: tuple[tuple[int, int], ...] = ()
+    stands_out_reads: float = math.inf
     areas: "Areas" = field(init=False)
     label_gain: NDArray[np.float64] = field(init=False)
 

@@ -250,10 +250,11 @@ def read_session(
             panel_rotation_deg=item.panel_rotation_deg,
             after_calibration=after,
             open_signal_DN=levels.get(item.name),
-            previous=tuple(replace(before, previous=()) for before in requests[-_REMEMBERED:]),
+            previous=tuple(requests[-_REMEMBERED:]),
+            long_ago=tuple(requests[:-_REMEMBERED]),
             pause_stated=clocked or item.kind == "afterglow",
         )
-        requests.append(request)
+        requests.append(replace(request, previous=(), long_ago=()))
         if item.name in silent:
             continue
         result.append(

@@ -1,9 +1,10 @@
 """Burn-in: light that a pixel has seen changes its gain for a while. A scintillator's traps fill, and it gives more light.
 
-y = x (1 + g q),    dq = (1 - q) dQ / Q_1 - q dt / tau,    g = s / (1 - exp(-Q_0 / Q_1)),    Q_0: 100 exposures at full scale
+y = x (1 + g [(1 - w) q + w p]),    dq = (1 - q) dQ / Q_1 - q dt / tau,    dp = (1 - p) dQ / Q_1,    g = s / (1 - exp(-Q_0 / Q_1))
 
-Q is the light that the pixel has had, q the share of its traps that are full. Where objects stood, the gain of the open field
-is another: their shadows are in later flats.
+Q is the light that the pixel has had, Q_0 that of 100 exposures at full scale; q is the share of its shallow traps that are full, p
+that of its deep ones, which stay full for days. Where objects stood, the gain of the open field is another: their shadows are in
+later flats.
 """
 
 import math
@@ -27,14 +28,22 @@ def _remember_light(state: LineState, parameters: Mapping[str, float], context: 
     full_DN = 2.0**bits - 1.0 - context.twin.dark_DN.value
     fills_after = parameters["fills_after_exposures"]
     most = parameters["strength"] / 100.0 / -math.expm1(-_EXPOSURES / fills_after)
-    law = GainMemory(most=most, filled_per_DN=1.0 / (fills_after * full_DN), fade_s=parameters["fade_s"])
+    law = GainMemory(
+        most=most,
+        filled_per_DN=1.0 / (fills_after * full_DN),
+        fade_s=parameters["fade_s"],
+        lasting_share=min(max(parameters["lasting_share"], 0.0), 1.0),
+    )
     return replace(state, gain_memory=law)
 
 
 BURN_IN = Effect(
     id="burn_in",
     title="gain that remembers exposure",
-    law=r"y = x\,(1 + g\,q),\quad \dot q = (1 - q)\,\dot Q/Q_1 - q/\tau,\quad g = s\,/\,(1 - e^{-Q_0/Q_1})",
+    law=(
+        r"y = x\,(1 + g\,[(1 - w)\,q + w\,p]),\quad \dot q = (1 - q)\,\dot Q/Q_1 - q/\tau,\quad "
+        r"\dot p = (1 - p)\,\dot Q/Q_1,\quad g = s\,/\,(1 - e^{-Q_0/Q_1})"
+    ),
     parameters=(
         Parameter(
             name="strength",
@@ -65,15 +74,27 @@ BURN_IN = Effect(
             log=True,
             sought_last=True,
         ),
+        Parameter(
+            name="lasting_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="share of traps so deep that they stay full for days",
+            log=False,
+        ),
     ),
     stage="response",
-    reference="hysteresis of CsI:Tl: Nagarkar et al. (2009), doi:10.1109/TNS.2009.2016198; traps of one kind",
+    reference="hysteresis of CsI:Tl: Nagarkar et al. (2009), doi:10.1109/TNS.2009.2016198; traps of two depths",
     after_calibration=False,
     change=_remember_light,
     isolated_by="a flat before and after objects, in one place",
     shows=Shows(series=EVERY_SERIES, axis="time"),
     either_onset=True,
+    remembers_all=True,
     absorbed="nothing",
-    grid=Grid(shares=(0.8,), variants=({"fade_s": 300.0}, {"fade_s": 10000.0})),
+    grid=Grid(
+        shares=(0.8,), variants=({"fade_s": 300.0, "lasting_share": 0.5}, {"fade_s": 10000.0, "lasting_share": 0.5})
+    ),
     images=InImages(left_out="what was exposed before an image is not known"),
 )

@@ -117,7 +117,9 @@ HEEL = Effect(
     grid=Grid(
         shares=(0.8,),
         variants=tuple(
-            {"direction_deg": direction, "offset": offset} for direction in (90.0, 270.0) for offset in (0.0, 0.4)
+            {"direction_deg": direction, "offset": offset}
+            for direction in (0.0, 90.0, 180.0, 270.0)
+            for offset in (0.0, 0.4)
         ),
     ),
     variation=Variation(random="sides"),

@@ -1,6 +1,7 @@
 """Random-telegraph pixels: a trap near the amplifier fills and empties, and the pixel's level jumps between two values.
 
-y_n = x_n + A sigma b_n, b_n 0 or 1; it stays for m exposures on average, P(b_n+1 != b_n) = 1 / m, and both are as frequent
+y_n = x_n + A sigma b_n, b_n 0 or 1; it stays for m exposures on average, P(b_n+1 != b_n) = 1 / m, and both are as frequent. Heights A
+and stays m of pixels differ.
 """
 
 from collections.abc import Mapping
@@ -19,6 +20,8 @@ def _let_pixels_jump(state: LineState, parameters: Mapping[str, float], context:
         raise InputError(
             "stay_exposures of random_telegraph", received=parameters["stay_exposures"], expected="1 exposure or more"
         )
+    if not parameters["differ"] >= 1.0:
+        raise InputError("differ of random_telegraph", received=parameters["differ"], expected="1 or more")
     return replace(
         state,
         telegraph=TelegraphPixels(
@@ -26,6 +29,7 @@ def _let_pixels_jump(state: LineState, parameters: Mapping[str, float], context:
             amplitude_reads=parameters["amplitude_reads"],
             stay_exposures=parameters["stay_exposures"],
             seed=int(parameters["pattern_seed"]),
+            differ=parameters["differ"],
         ),
     )
 
@@ -69,6 +73,15 @@ RANDOM_TELEGRAPH = Effect(
             log=True,
         ),
         Parameter(
+            name="differ",
+            unit="",
+            low=1.0,
+            high=10.0,
+            default=1.0,
+            source="ratio of largest to smallest height and of longest to shortest stay: traps lie at all depths and distances",
+            log=True,
+        ),
+        Parameter(
             name="pattern_seed",
             unit="",
             low=0.0,
@@ -90,7 +103,10 @@ RANDOM_TELEGRAPH = Effect(
     # how many are found hangs on their height and stay, which counts alone do not tell well
     grid=Grid(
         variants=tuple(
-            {"amplitude_reads": height, "stay_exposures": stay} for height in (4.0, 8.0) for stay in (4.0, 12.0)
+            {"amplitude_reads": height, "stay_exposures": stay, "differ": differ}
+            for height in (4.0, 8.0)
+            for stay in (4.0, 12.0)
+            for differ in (1.0, 4.0)
         ),
         refined=False,
     ),

@@ -77,16 +77,18 @@ class Jumping:
     """Pixels that jump, from exposure to exposure of a series: where they are follows from the effect's seed."""
 
     def __init__(self, pixels: TelegraphPixels, shape: tuple[int, int], rng: np.random.Generator) -> None:
-        self._law = pixels
-        self._where = np.random.default_rng([0x7E1E, pixels.seed]).random(shape) < pixels.share
-        self._up = rng.random(int(np.count_nonzero(self._where))) < 0.5
+        where = np.random.default_rng([0x7E1E, pixels.seed])
+        self._where = where.random(shape) < pixels.share
+        count = int(np.count_nonzero(self._where))
+        self._height_reads, self._stay = pixels.of_pixels(count, where)
+        self._up = rng.random(count) < 0.5
 
     def added_to(self, value: FloatArray, read_DN: FloatArray | float, rng: np.random.Generator) -> FloatArray:
         """One exposure (row, column), DN, with their levels added; they may have jumped when the next one asks."""
         out = np.array(value, dtype=np.float64)
-        height = self._law.amplitude_reads * np.broadcast_to(read_DN, out.shape)[self._where]
+        height = self._height_reads * np.broadcast_to(read_DN, out.shape)[self._where]
         out[self._where] += np.where(self._up, height, 0.0)
-        self._up = self._up ^ (rng.random(self._up.size) < 1.0 / self._law.stay_exposures)
+        self._up = self._up ^ (rng.random(self._up.size) < 1.0 / self._stay)
         return out
 
 

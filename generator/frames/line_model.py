@@ -5,7 +5,7 @@ One chain in the order of the real line (`line_state`): beam, projection, arriva
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -189,6 +189,16 @@ class LineModel:
             yield stored.copy()
         carried.time_s = request.start_s + chain.clock.exposures * chain.clock.interval_s
 
+    @property
+    def _asked_for(self) -> Hashable:
+        """What stands for the line beside the twin: effects and parameters by their values."""
+        effects = self.twin.effects if self.effects is None else self.effects
+        return (
+            tuple((item.id, item.since, *item.parameters.items(), *item.options.items()) for item in effects),
+            None if self.parameters is None else self.parameters.tobytes(),
+            self.use_measured_level,
+        )
+
     def _acting(self, request: SeriesRequest) -> Acting:
         """Effects that act on a series, in the order of their stages."""
         effects = self.twin.effects if self.effects is None else self.effects
@@ -264,7 +274,9 @@ class LineModel:
 
             traps = Traps(law, clock, before, lambda: _found(law, request, before, carried))
         if state.gain_memory is not None:
-            filled = filled_before(request, state.gain_memory, self._exposed, readout_ms)
+            filled = filled_before(
+                request, state.gain_memory, self._exposed, readout_ms, cache.carried(twin, self._asked_for)
+            )
             rising = RisingGain(state.gain_memory, clock, charge.mean, filled)
         return chain_of(state, panel, clock, lit=request.beam_on, traps=traps, rising=rising)
 

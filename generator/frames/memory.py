@@ -1,7 +1,7 @@
 """What earlier exposures leave behind: charge in traps that is read later (lag), and a gain that light has raised (burn-in)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +9,10 @@ import numpy as np
 from ..line.line_state import FloatArray, GainMemory, LagLaw, LineState
 from ..line.series_request import SeriesRequest
 from .light import Charge
+from .model_cache import Carried
 
 LAGS = 3
+_SLOWEST = 1e-9  # filling, share an exposure: where no light comes and nothing empties
 _FOLLOWED = 2  # pictures exposed before a series' own, the last ones, whose fading is followed one by one
 
 Exposed = Callable[[SeriesRequest], tuple[LineState, Charge]]  # the line's state for an earlier series, and its charge
@@ -111,46 +113,89 @@ def with_trapped(
     return signal, trend
 
 
-def filled_before(request: SeriesRequest, law: GainMemory, exposed: Exposed, readout_ms: float | None) -> FloatArray:
-    """Share of the traps (row, column) or (1, 1) that earlier exposures have left full at the begin of the series."""
-    filled: FloatArray = np.zeros((1, 1))
-    clock_s = 0.0
-    for earlier in request.previous:
-        if earlier.beam_on:
-            state, charge = exposed(earlier)
+@dataclass(frozen=True, slots=True)
+class Filled:
+    """Share of each kind of traps (row, column) or (1, 1) that is full, and when, s."""
+
+    shares: tuple[FloatArray, ...]
+    time_s: float = 0.0
+
+    @staticmethod
+    def nowhere(law: GainMemory) -> "Filled":
+        """No trap is."""
+        return Filled(tuple(np.zeros((1, 1)) for _ in law.kinds))
+
+    def at(self, law: GainMemory, time_s: float) -> tuple[FloatArray, ...]:
+        """Those that are still full at a time."""
+        pause_s = max(time_s - self.time_s, 0.0)
+        return tuple(
+            full * math.exp(-pause_s / fade_s) for full, (_, fade_s) in zip(self.shares, law.kinds, strict=True)
+        )
+
+    def after(
+        self, law: GainMemory, request: SeriesRequest, light_DN: FloatArray, readout_ms: float | None
+    ) -> "Filled":
+        """Once a series has brought this light with each of its exposures."""
+        interval_s, exposures = request.interval_s(readout_ms), request.frames * request.exposures_per_frame
+        shares = tuple(
+            steady + (full - steady) * np.exp(-exposures * pace)
+            for full, (steady, pace) in zip(
+                self.at(law, request.start_s), filling(law, light_DN, interval_s), strict=True
+            )
+        )
+        return Filled(shares, request.start_s + exposures * interval_s)
+
+
+def filled_before(
+    request: SeriesRequest, law: GainMemory, exposed: Exposed, readout_ms: float | None, carried: Carried
+) -> tuple[FloatArray, ...]:
+    """Share of each kind of traps (row, column) or (1, 1) that earlier exposures have left full at the begin of the series.
+
+    carried: what was found for the series asked before, which is taken up where that one's earlier exposures are this one's, too.
+    """
+    earlier = (*request.long_ago, *request.previous)
+    known = len(carried.steps) if carried.begins(earlier) else 0
+    filled = carried.value if known else Filled.nowhere(law)
+    for one in earlier[known:]:
+        if one.beam_on:
+            state, charge = exposed(one)
             if state.gain_memory is not None:  # else it had not set in
-                interval = earlier.interval_s(readout_ms)
-                exposures = earlier.frames * earlier.exposures_per_frame
-                filled = filled * math.exp(-max(earlier.start_s - clock_s, 0.0) / law.fade_s)
-                steady, pace = filling(law, charge.mean, interval)
-                filled = steady + (filled - steady) * np.exp(-exposures * pace)
-                clock_s = earlier.start_s + exposures * interval
-    return filled * math.exp(-max(request.start_s - clock_s, 0.0) / law.fade_s)
+                filled = filled.after(law, one, charge.mean, readout_ms)
+    carried.take(earlier, filled)
+    return filled.at(law, request.start_s)
 
 
-def filling(law: GainMemory, light_DN: FloatArray, interval_s: float) -> tuple[FloatArray, FloatArray]:
-    """Share of the traps that are full in the end under exposures of this light, and 1 over the exposures that it takes."""
-    filling = law.filled_per_DN * np.maximum(light_DN, 0.0)
-    pace = filling + interval_s / law.fade_s
-    return filling / pace, pace
+def filling(law: GainMemory, light_DN: FloatArray, interval_s: float) -> list[tuple[FloatArray, FloatArray]]:
+    """Of each kind of traps, the share that is full in the end under exposures of this light, and 1 over those that it takes."""
+    taken = law.filled_per_DN * np.maximum(light_DN, 0.0)
+    paces = [np.maximum(taken + interval_s / fade_s, _SLOWEST) for _, fade_s in law.kinds]
+    return [(taken / pace, pace) for pace in paces]
 
 
 def gain_course(
-    law: GainMemory, before: FloatArray, light_DN: FloatArray, interval_s: float, exposures: int, averaged: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean factor on the signal over a series, and its change: (map, profile over the stored frames of mean 0).
+    law: GainMemory,
+    before: Sequence[FloatArray],
+    light_DN: FloatArray,
+    interval_s: float,
+    exposures: int,
+    averaged: int,
+) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
+    """Mean factor on the signal over a series, and its changes: (map, profile over the stored frames of mean 0) by kind of traps.
 
     The mean is exact; all pixels change in the course of the one in the middle, as far as each does.
     """
-    steady, pace = filling(law, light_DN, interval_s)
-    away = before - steady
-    left = -np.expm1(-exposures * pace)
-    mean = steady + away * left / (exposures * -np.expm1(-pace))
-    course = np.exp(-float(np.median(pace)) * np.arange(exposures))
-    course = frame_means(
-        (course - course.mean()) / max(1.0 - math.exp(-float(np.median(pace)) * exposures), 1e-300), averaged
-    )
-    return 1.0 + law.most * mean, law.most * away * left, course
+    gain: FloatArray = np.ones((1, 1))
+    changes = []
+    for (share, _), full, (steady, pace) in zip(law.kinds, before, filling(law, light_DN, interval_s), strict=True):
+        away = full - steady
+        left = -np.expm1(-exposures * pace)
+        gain = gain + law.most * share * (steady + away * left / (exposures * -np.expm1(-pace)))
+        course = np.exp(-float(np.median(pace)) * np.arange(exposures))
+        course = frame_means(
+            (course - course.mean()) / max(1.0 - math.exp(-float(np.median(pace)) * exposures), 1e-300), averaged
+        )
+        changes.append((law.most * share * away * left, course))
+    return gain, changes
 
 
 def temporal_covariance(law: LagLaw, decay: FloatArray, averaged: int) -> FloatArray:

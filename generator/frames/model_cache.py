@@ -1,7 +1,7 @@
 """What the forward model makes once and keeps between calls."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +12,24 @@ from ..line.line_state import FloatArray
 
 _BUDGET_BYTES = 600_000_000
 _ENTRY_BYTES = 1000  # key and bookkeeping of a small result
+_CARRIED = 64  # results that are carried on at a time, some 0.3 MB each at 128 x 128 pixels
+
+
+@dataclass(slots=True, eq=False)
+class Carried:
+    """A result that the next one begins with: `value` is what `owner` made of `steps`, one after the other."""
+
+    owner: object
+    steps: tuple[object, ...] = ()
+    value: Any = None
+
+    def begins(self, steps: Sequence[object]) -> bool:
+        """Whether it was made of the first of these very steps."""
+        return len(self.steps) <= len(steps) and all(a is b for a, b in zip(self.steps, steps, strict=False))
+
+    def take(self, steps: tuple[object, ...], value: Any) -> None:
+        """Hold another one."""
+        self.steps, self.value = steps, value
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -26,6 +44,7 @@ class ModelCache:
     draft: bool = False
     _kept: "OrderedDict[tuple[Hashable, ...], tuple[tuple[object, ...], Any, int]]" = field(default_factory=OrderedDict)
     _held: int = 0
+    _carried: "OrderedDict[Hashable, Carried]" = field(default_factory=OrderedDict)
 
     def made(self, kind: str, owners: tuple[object, ...], key: Hashable, make: Callable[[], Any]) -> Any:
         """What `make` gives, made once.
@@ -50,6 +69,16 @@ class ModelCache:
         else:
             self._kept.move_to_end(whole)
         return found[1]
+
+    def carried(self, owner: object, key: Hashable) -> "Carried":
+        """What an owner found last under a key; nothing yet where it is asked first."""
+        found = self._carried.get(key)
+        if found is None or found.owner is not owner:
+            self._carried[key] = found = Carried(owner)
+        self._carried.move_to_end(key)
+        while len(self._carried) > _CARRIED:
+            self._carried.popitem(last=False)
+        return found
 
     def pixels(self, owner: object, key: Hashable, read: Callable[[], NDArray[np.floating]]) -> FloatArray:
         """A map (row, column) of the detector's; a draft's may be (1, 1)."""

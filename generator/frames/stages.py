@@ -304,31 +304,35 @@ class RisingGain:
         law: of its traps.
         clock: of the series.
         light_DN: of one exposure.
-        before: share of the traps that earlier series have filled.
+        before: share of each kind of its traps that earlier series have filled.
     """
 
-    def __init__(self, law: GainMemory, clock: Clock, light_DN: FloatArray, before: FloatArray) -> None:
-        self._law, self._clock, self._light, self._filled = law, clock, light_DN, before
-        self._steady, self._pace = filling(law, light_DN, clock.interval_s)
+    def __init__(self, law: GainMemory, clock: Clock, light_DN: FloatArray, before: Sequence[FloatArray]) -> None:
+        self._law, self._clock, self._light, self._filled = law, clock, light_DN, list(before)
+        self._filling = filling(law, light_DN, clock.interval_s)
 
     def expect(self, frames: Frames) -> Frames:
         """Times the mean gain, which rises over the series."""
         clock = self._clock
-        gain, rise, course = gain_course(
+        gain, changes = gain_course(
             self._law, self._filled, self._light, clock.interval_s, clock.exposures, clock.averaged
         )
+        rising = ((rise * frames.signal_DN, course) for rise, course in changes)
         return replace(
             frames,
             signal_DN=gain * frames.signal_DN,
-            trend=[*((gain * amount, each) for amount, each in frames.trend), (rise * frames.signal_DN, course)],
+            trend=[*((gain * amount, each) for amount, each in frames.trend), *rising],
             on_quanta=frames.on_quanta * gain**2,
         )
 
     def sample(self, value_DN: FloatArray, exposure: Exposure) -> FloatArray:
         """Times the gain as it is now."""
-        value_DN = value_DN * (1.0 + self._law.most * self._filled)
-        self._filled = self._steady + (self._filled - self._steady) * np.exp(-self._pace)
-        return value_DN
+        full = sum(share * filled for (share, _), filled in zip(self._law.kinds, self._filled, strict=True))
+        self._filled = [
+            steady + (filled - steady) * np.exp(-pace)
+            for filled, (steady, pace) in zip(self._filled, self._filling, strict=True)
+        ]
+        return value_DN * (1.0 + self._law.most * full)
 
 
 class Response:

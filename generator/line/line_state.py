@@ -66,12 +66,19 @@ class LagLaw:
 class GainMemory:
     """A gain that is larger by the share `most` where all traps q are full: each DN of light fills `filled_per_DN` of the empty ones.
 
-    They empty with `fade_s`: dq = filled_per_DN (1 - q) dx - q dt / fade_s.
+    They empty with `fade_s`: dq = filled_per_DN (1 - q) dx - q dt / fade_s; but for `lasting_share` of them, which stay full.
     """
 
     most: float
     filled_per_DN: float
     fade_s: float
+    lasting_share: float = 0.0
+
+    @property
+    def kinds(self) -> tuple[tuple[float, float], ...]:
+        """Kinds of traps: share, and time in which they empty, s."""
+        kinds = (1.0 - self.lasting_share, self.fade_s), (self.lasting_share, math.inf)
+        return tuple(kind for kind in kinds if kind[0] > 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,13 +145,22 @@ class LineFlicker:
 class TelegraphPixels:
     """A share of the pixels, drawn from `seed`, whose level jumps up by `amplitude_reads` read noises and down again.
 
-    stay_exposures: mean stay in a level.
+    stay_exposures: mean stay in a level; differ: ratio of the largest to the smallest height, and of the longest to the shortest
+    stay, of pixels that are even in the logarithm between them; heights and stays given are the middle ones.
     """
 
     share: float
     amplitude_reads: float
     stay_exposures: float
     seed: int = 0
+    differ: float = 1.0
+
+    def of_pixels(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Heights, read noises, and mean stays, exposures, of so many pixels (pixel,)."""
+        if self.differ == 1.0:
+            return np.full(count, self.amplitude_reads), np.full(count, self.stay_exposures)
+        height, stay = self.differ ** (rng.random((2, count)) - 0.5)
+        return self.amplitude_reads * height, np.maximum(self.stay_exposures * stay, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,8 +22,9 @@ class SeriesRequest:
     session's begin); index; thickness_mm: material of the scene -> (row, column); source_object_mm, source_detector_mm;
     belt_speed_mm_s, belt_axis (`row` or `column`: the axis along which the object moves); panel_rotation_deg;
     after_calibration (later than the series that calibrated the twin); previous: exposures before this one that lag may
-    remember, oldest first; averaged (exposures in a stored frame, where there is no setting to say so);
-    open_signal_DN: level of the open beam in one exposure where the tube load is unknown; product_material: the
+    remember, oldest first; long_ago: those before these, which only what fades in hours remembers; averaged (exposures in
+    a stored frame, where there is no setting to say so); open_signal_DN: level of the open beam in one
+    exposure where the tube load is unknown; product_material: the
     material of the scene that is the product; scene_kind (`wedge`, `slab`, `edge`, `disc`, `product`);
     displacement_px: how far along rows and columns the scene is known to lie from where its thickness maps have it;
     pause_stated: start_s says how long nothing was exposed before the series.
@@ -44,6 +45,7 @@ class SeriesRequest:
     panel_rotation_deg: float = 0.0
     after_calibration: bool = True
     previous: tuple["SeriesRequest", ...] = ()
+    long_ago: tuple["SeriesRequest", ...] = ()
     averaged: int = 1
     open_signal_DN: float | None = None
     product_material: str | None = None

@@ -1,0 +1,79 @@
+"""Strengths with the inner parameters of laws integrated out: what reach and shape leave open, a strength's interval holds.
+
+Near where refinement found them, theta_0, a response is a straight line in its inner parameters, and each is as likely anywhere in
+its range, about the middle of it, theta_m. So what they may change is covariance that grows with the strength, as what an effect
+does by chance is:
+
+r ~ N(s m, C + s^2 J J^T),    m = m_0 - (theta_0 - theta_m) dm / dtheta,    J = dm / dtheta * range / sqrt(12)
+
+Source: Rasmussen, Williams, Gaussian Processes for Machine Learning (2006), section 2.7, parameters of a mean that are Gaussian.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ...generator.effects import EFFECTS
+from ..model.changes import Variant
+from ..model.curves import Curve
+from .curve_fits import fit_curve, interval_of
+from .discrepancy import only
+from .inference import Hypothesis
+from .observed import Observed, Point
+from .search import from_middle, slopes_of
+from .seen import Responder, Seen, Whitener
+
+_SD = 1.0 / math.sqrt(3.0)  # of what is even over a range, in halves of it
+
+
+def with_inner_open(
+    hypothesis: Hypothesis,
+    *,
+    variants: Mapping[tuple[str, str], Variant],
+    observed: Observed,
+    respond: Responder,
+    whitener: Whitener,
+) -> Hypothesis:
+    """A hypothesis whose strengths' intervals hold what its laws' inner parameters leave open.
+
+    Args:
+        hypothesis: with whitened curves.
+        variants: by effect and name.
+        observed: what is weighed, whitened.
+        respond: asks the forward model.
+        whitener: of its responses.
+    """
+    seen = Seen(observed=replace(observed, given=()), respond=respond, whitener=whitener)
+    opened = {
+        effect: _opened(curve, variants[effect, curve.variant], hypothesis.strengths[effect][0], seen)
+        for effect, curve in hypothesis.variants.items()
+    }
+    if all(opened[effect] is curve for effect, curve in hypothesis.variants.items()):
+        return hypothesis
+    strengths = dict(hypothesis.strengths)
+    for effect, curve in opened.items():
+        beside = observed.standing(*hypothesis.effects)
+        for other, its in opened.items():
+            if other != effect:
+                strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
+                beside = beside.beside(Point(curve=its, strength=strength, level=level))
+        fit = fit_curve(beside, beside.scaled(curve), levels=only(hypothesis.levels[effect]))
+        strengths[effect] = interval_of([fit])
+    return replace(hypothesis, strengths=strengths)
+
+
+def _opened(curve: Curve, variant: Variant, strength: float, seen: Seen) -> Curve:
+    """A curve with what its inner parameters may change among what the effect does by chance; itself where none is refined."""
+    inner = [item for item in variant.fitted if item.name in variant.parameters]
+    if not (inner and EFFECTS[curve.effect].grid.refined and variant.refined_from is not None):
+        return curve
+    slopes = slopes_of(curve, variant, inner, strength, seen)
+    a_unit = slopes.at(1.0)
+    by_name = {item.name: item for item in inner}
+    away = np.array([from_middle(by_name[name], variant.parameters[name]) for name in slopes.names])
+    changes = _SD * a_unit.T
+    spread = changes if curve.spread is None else np.concatenate([curve.spread, changes], axis=1)
+    middle = curve.responses - np.outer(curve.strengths, away @ a_unit)
+    return replace(curve, responses=middle, spread=spread)

@@ -1322,20 +1322,20 @@ def test_only_counters_lose_counts(series_line):
         LineModel(series_line, effects=applied("pile_up")).expect(request())
 
 
-@pytest.mark.parametrize("peaked", [0.0, 1.0])
+@pytest.mark.parametrize("peakedness", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("source_object_mm", [990.0, 850.0])
-def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_line, peaked, source_object_mm):
+def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_line, peakedness, source_object_mm):
     """Points are drawn on the source and shadows thrown one by one; no transfer function is used."""
     strength, width_mm, count = 15.0, 3.0, 4_000_000
-    effect = applied("off_focal", strength, width_mm=width_mm, peaked_share=peaked)
+    effect = applied("off_focal", strength, width_mm=width_mm, peakedness=peakedness)
     plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
     asked = request("object", thickness_mm=plate, source_object_mm=source_object_mm)
     found, sharp = expect(series_line, asked, effect), expect(series_line, asked)
     even = series_line.level_nearest(asked.setting).flat_shape
     known, plain = ((one.signal_DN / even).mean(axis=0) for one in (found, sharp))
     rng = np.random.default_rng(4)
-    # a Gaussian of exponentially distributed variance falls from a peak with a long tail
-    size = np.sqrt(rng.exponential(1.0, count)) if peaked else 1.0
+    # Gaussians of variances that differ fall from a peak with a long tail
+    size = np.sqrt(rng.gamma(1.0 / peakedness, peakedness, count)) if peakedness else 1.0
     place_mm = width_mm * size * rng.standard_normal(count) * (rng.random(count) < strength / 100.0)
     border = 20.0 - (1059.0 / source_object_mm - 1.0) / series_line.instrument.pixel_mm * place_mm
     column, luck = rng.uniform(0.0, 40.0, count), rng.random(count)

@@ -53,6 +53,11 @@ def log_frequency(level: float, *, another: bool = False) -> float:
     return math.log(frequencies[int(np.argmin(np.abs(np.array(LEVELS.levels) - level)))])
 
 
+def at_most_off(level: float) -> float:
+    """A level by which a law may be off in shape: one that is as good as exact stands for all levels below the next, half of that."""
+    return level or 0.5 * LEVELS.levels[1]
+
+
 def _learnt() -> Levels:
     """As `validation/learn_discrepancy.py` left them."""
     table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, interval_of, log_mean_exp
-from .discrepancy import LEVELS, log_frequency, log_rest
+from .discrepancy import LEVELS, at_most_off, log_frequency, log_rest
 from .observed import Observed, Point
 from .pairs import Single, left_by_the_stronger, left_in_place, log_prior, weigh_pairs
 from .unknown import LOG_DENSITY, Beyond, beyond
@@ -160,7 +160,7 @@ def _left_by_given(
     if not (observed.given and others):
         return None
     squares = np.sum([observed.squares_by_series(one.curve, one.strength) for one in observed.given], axis=0)
-    levels = [(1.0, observed.given[0].level)]
+    levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
         weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, squares, levels)
         for effect in others

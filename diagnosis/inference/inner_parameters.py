@@ -60,7 +60,10 @@ def with_inner_open(
                 strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
                 beside = beside.beside(Point(curve=its, strength=strength, level=level))
         fit = fit_curve(beside, beside.scaled(curve), levels=only(hypothesis.levels[effect]))
-        strengths[effect] = interval_of([fit])
+        # the straight line says how much stays open; the strength itself is known from the law as it bends
+        value, low, high = hypothesis.strengths[effect]
+        _, low_open, high_open = interval_of([fit])
+        strengths[effect] = value, min(low, low_open), max(high, high_open)
     return replace(hypothesis, strengths=strengths)
 
 

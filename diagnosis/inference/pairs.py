@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, fit_curve, log_integral, log_mean_exp, refined
-from .discrepancy import FARTHEST_LEVEL, LEVELS, leak_below, leak_density, log_frequency
+from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency
 from .observed import Observed, Point
 
 _IN_FULL = 3  # pairs, the likeliest at first sight, that are settled: with ten the same are named (notebook, ablation)
@@ -140,7 +140,8 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     squares = observed.squares_by_series(first.curve, first.best)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
-    return strong, left_in_place(observed, pair.fits[weak], squares, list(zip(shares, LEVELS.levels, strict=False)))
+    levels = map(at_most_off, LEVELS.levels)
+    return strong, left_in_place(observed, pair.fits[weak], squares, list(zip(shares, levels, strict=False)))
 
 
 def left_in_place(

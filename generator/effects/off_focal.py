@@ -2,9 +2,11 @@
 
 Seen from the object it is a second, wide source; its picture of an edge is as much larger as the detector lies behind the object:
 
-H(f) = 1 - w + w [(1 - q) exp(-2 (pi s_d f)^2) + q / (1 + 2 (pi s_d f)^2)],    s_d = s (M - 1)
+H(f) = 1 - w + w [1 + 2 p (pi s_d f)^2]^(-1 / p),    s_d = s (M - 1)
 
-The open field has the same light with it and without. What lies beyond the borders of the field is taken to go on as at them.
+Its profile is a Gaussian at p = 0, falls exponentially from the middle at p = 2/3, and has a peak and a long tail beyond: Gaussians
+whose variances are spread by a gamma law of relative variance p. The open field has the same light with it and without. What lies
+beyond the borders of the field is taken to go on as at them.
 """
 
 import math
@@ -15,6 +17,8 @@ import numpy as np
 
 from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, Parameter, Shows
+
+_GAUSSIAN = 1e-6  # peakedness below which a profile is a Gaussian to every digit that matters
 
 
 def _add_source(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -27,11 +31,11 @@ def _add_source(state: LineState, parameters: Mapping[str, float], context: Line
     )
     share = parameters["strength"] / 100.0
     width_px = parameters["width_mm"] * (magnification - 1.0) / pitch
-    peaked = parameters["peaked_share"]
+    peakedness = parameters["peakedness"]
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        squared = (2.0 * math.pi * width_px) ** 2 * (f_row**2 + f_column**2)
-        wide = (1.0 - peaked) * np.exp(-0.5 * squared) + peaked / (1.0 + 0.5 * squared)
+        half = 0.5 * (2.0 * math.pi * width_px) ** 2 * (f_row**2 + f_column**2)
+        wide = np.exp(-half) if peakedness < _GAUSSIAN else (1.0 + peakedness * half) ** (-1.0 / peakedness)
         return np.asarray(1.0 - share + share * wide)
 
     return replace(state, object_transfers=(*state.object_transfers, transfer))
@@ -40,7 +44,7 @@ def _add_source(state: LineState, parameters: Mapping[str, float], context: Line
 OFF_FOCAL = Effect(
     id="off_focal",
     title="radiation from around the focal spot",
-    law=r"H(f) = 1 - w + w\left[(1 - q)\,e^{-2(\pi s_d f)^2} + \frac{q}{1 + 2(\pi s_d f)^2}\right],\quad s_d = s\,(M - 1)",
+    law=r"H(f) = 1 - w + w\,\left[1 + 2\,p\,(\pi s_d f)^2\right]^{-1/p},\quad s_d = s\,(M - 1)",
     parameters=(
         Parameter(
             name="strength",
@@ -62,12 +66,12 @@ OFF_FOCAL = Effect(
             log=True,
         ),
         Parameter(
-            name="peaked_share",
+            name="peakedness",
             unit="",
             low=0.0,
-            high=1.0,
+            high=2.0,
             default=0.5,
-            source="share of a profile that falls from a peak with a long tail; the rest is Gaussian",
+            source="relative variance of the widths of which a profile is made: 0 Gaussian, 2/3 exponential, more: a peak with a long tail",
             log=False,
             sought_last=True,
         ),
@@ -80,5 +84,5 @@ OFF_FOCAL = Effect(
     isolated_by="an opaque disc at two magnifications",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
-    grid=Grid(shares=(0.8,), variants=tuple({"width_mm": width, "peaked_share": 0.5} for width in (2.7, 8.3))),
+    grid=Grid(shares=(0.8,), variants=tuple({"width_mm": width, "peakedness": 0.5} for width in (2.7, 8.3))),
 )

@@ -111,6 +111,6 @@ K_FLUORESCENCE = Effect(
     shows=Shows(series=LIT_SERIES, axis="sharpness"),
     either_onset=True,
     absorbed="noise",
-    reading=Reading(law_sd=0.25),  # a K photon's reach stands for how many there are: eleven shares were off by 25 %
+    reading=Reading(law_sd=0.36),  # a K photon's reach stands for how many there are: thirteen shares were off by 36 %
     grid=Grid(shares=(0.8,), variants=({"range_mm": 0.15}, {"range_mm": 0.33})),
 )

@@ -100,10 +100,12 @@ validation-simulators: $(READY)
 	for line in curved points areas; do OMP_NUM_THREADS=1 $(BIN)/python validation/gvxr_sessions.py --line $$line --json build/gvxr_$$line.json || exit 1; done
 	$(BIN)/python validation/export_in_simulators.py --json build/export_in_simulators.json
 
-# how far laws of a kind depart from ours, for diagnosis/inference/discrepancy.toml: an hour on one core
+# how far laws of a kind depart from ours, for diagnosis/inference/discrepancy.toml, and how far strengths are off: an hour on one core
 discrepancy: $(READY)
-	for line in usual coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/learn_discrepancy.py --line $$line --families --seed 9001 --json build/discrepancy/$${line}_families.json || exit 1; done
+	for line in usual coarse; do OMP_NUM_THREADS=1 $(BIN)/python validation/learn_discrepancy.py --line $$line --families --seed 15001 --json build/discrepancy/$${line}_families.json || exit 1; done
+	OMP_NUM_THREADS=1 $(BIN)/python validation/lab_effects.py --seed 2900 --json build/discrepancy/lab_2900.json
 	$(BIN)/python validation/learn_discrepancy.py --learn build/discrepancy/*.json
+	$(BIN)/python validation/lab_effects.py --strengths build/discrepancy/lab_*.json
 
 # the diagnosis on sealed cases, hours: `make blind-check SEED=...` with one that nobody has looked at; a stopped run goes on
 CASES ?= 600

@@ -1,4 +1,4 @@
-"""How far laws of an effect's kind depart from the catalogue's: learnt from sessions of the second simulator.
+"""How far laws of an effect's kind depart from the catalogue's: learnt from sessions of the second simulator and of the lab.
 
 Each session has one effect, by the simulator's own law or a drawn family (`law_families.py`). The evidence of that effect at each
 level of discrepancy, with and without a rest, tells how often each occurs and how long rests are (empirical Bayes, by expectation
@@ -6,6 +6,7 @@ and maximisation); the same of what looks most like it once it is left out of th
 it.
 
     python validation/learn_discrepancy.py --line usual --families --json build/discrepancy/usual.json
+    python validation/lab_effects.py --json build/discrepancy/lab.json
     python validation/learn_discrepancy.py --learn build/discrepancy/*.json
 """
 

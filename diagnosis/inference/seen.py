@@ -119,9 +119,9 @@ class Seen:
         return fit_curve(self.observed, curve, levels=only(self.level))
 
     def more_exact(self) -> "Seen | None":
-        """The same with laws off by the next lower level; None: they are exact."""
+        """The same with laws off by the level after the next lower one; None: they are exact."""
         lower = [level for level in LEVELS.levels if level < self.level]
-        return replace(self, level=lower[-1]) if lower else None
+        return replace(self, level=lower[-2:][0]) if lower else None
 
     def evidence(self, curve: Curve) -> float:
         """Log evidence of a curve in these units, its law off by any level."""

@@ -71,7 +71,7 @@ OFF_FOCAL = Effect(
             low=0.0,
             high=2.0,
             default=0.5,
-            source="relative variance of the squared widths that make a profile: 0 Gaussian, 2/3 exponential, then a peak with a tail",
+            source="relative variance of the squared widths that make a profile: 0 Gaussian, 2/3 exponential, then a peak, a tail",
             log=False,
             sought_last=True,
         ),

@@ -576,6 +576,23 @@ def test_motion_blurs_along_the_belt_in_proportion_to_the_exposure(series_line, 
             assert found == pytest.approx(float(np.sinc(length * frequency)), rel=1e-3)
 
 
+@pytest.mark.parametrize("uneven", [-0.7, 0.3, 1.0])
+def test_an_object_that_moves_unevenly_is_the_mean_of_where_it_stands(series_line, uneven):
+    """Pictures of the object, displaced from place to place, averaged over the exposure."""
+    plate = {"Al": np.where(np.indices(SHAPE)[0] < 20, 8.0, 0.0)}
+    asked = request("object", setting="kv=90,power_w=45,exposure_ms=50,filter=Cu:0.05", thickness_mm=plate)
+    asked = replace(asked, source_object_mm=990.0)
+    found = expect(series_line, asked, applied("motion_blur", 6.0, acceleration=uneven)).signal_DN
+    time = (np.arange(60) + 0.5) / 60
+    places = 6.0 * (time + uneven * (time**2 - time))
+    places -= places.mean()
+    stood = np.mean([expect(series_line, replace(asked, displacement_px=(d, 0.0))).signal_DN for d in places], axis=0)
+    even = expect(series_line, asked, applied("motion_blur", 6.0)).signal_DN
+    inside, step = slice(10, 30), float(np.ptp(stood))
+    assert np.abs(found - stood)[inside].max() < 4e-3 * step
+    assert np.abs(even - stood)[inside].max() > 0.015 * step
+
+
 def test_a_standing_belt_blurs_nothing(series_line):
     asked = request(**BEHIND, belt_speed_mm_s=0.0)
     np.testing.assert_array_equal(

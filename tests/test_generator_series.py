@@ -308,6 +308,20 @@ def test_sampling_cells_at_pixels_is_their_mean_and_moves_by_whole_pixels():
     np.testing.assert_allclose(moved[2:, :-1], means[:-2, 1:], atol=1e-12)
 
 
+@pytest.mark.parametrize("shape", [(10, 8), (8, 410)])
+def test_a_picture_that_moves_is_the_mean_of_where_it_stands(shape):
+    """Small panels are drawn by matrices, large ones by transforms."""
+    cells = np.random.default_rng(0).random((3 * shape[0], 3 * shape[1]))
+    transform = transform_of_cells(cells)
+    places = (-0.8, 0.1, 0.3, 2.4)
+    course = sampled_picture([(transform, None)], shape, (0.4, -0.2), (places, ()))
+    stood = np.mean([sampled_picture([(transform, None)], shape, (0.4 + one, -0.2)) for one in places], axis=0)
+    np.testing.assert_allclose(course, stood, atol=1e-12)
+    across = sampled_picture([(transform, None)], shape, (0.0, 0.0), ((), places))
+    stood = np.mean([sampled_picture([(transform, None)], shape, (0.0, one)) for one in places], axis=0)
+    np.testing.assert_allclose(across, stood, atol=1e-12)
+
+
 def test_a_smooth_object_has_no_borders_and_a_step_is_found_where_it_is():
     column = np.indices((30, 30))[1]
     assert not find_borders(0.05 * column, least_depth=0.02).any_steps

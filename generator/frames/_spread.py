@@ -137,14 +137,22 @@ def _frequencies(length: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=32)
 def _drawing(
-    length: int, points: int, kept: int, psf_model: str, psf_sigma_px: float, shift_px: float
+    length: int,
+    points: int,
+    kept: int,
+    psf_model: str,
+    psf_sigma_px: float,
+    shift_px: float,
+    places_px: tuple[float, ...] = (),
 ) -> NDArray[np.float64]:
     """What the calibrated spread and a displacement make of pixels or cells along one axis: (length, points)."""
     order = np.arange(kept)
     transfer = base_transfer_1d(psf_model, psf_sigma_px, order / (2.0 * length))
     if points > length:
         transfer = transfer * averaging(points)[:kept]
-    return np.asarray((cosines_at_pixels(length, points, kept, shift_px) * transfer) @ _cosines(points, kept))
+    return np.asarray(
+        (cosines_at_pixels(length, points, kept, shift_px, places_px) * transfer) @ _cosines(points, kept)
+    )
 
 
 @lru_cache(maxsize=8)
@@ -195,13 +203,15 @@ def spread_maps(
 
         def drawn(picture: NDArray[np.floating], counts: Sequence[int]) -> FloatArray:
             rows, columns = (
-                _drawing(length, points, count, spread.model, spread.sigma_px, shift)
-                for length, points, count, shift in zip(shape, picture.shape, counts, state.shift_px, strict=True)
+                _drawing(length, points, count, spread.model, spread.sigma_px, shift, places)
+                for length, points, count, shift, places in zip(
+                    shape, picture.shape, counts, state.shift_px, state.course_px, strict=True
+                )
             )
             return np.asarray(rows @ picture @ columns.T)
 
         if fine is not None:
-            key = (spread, state.shift_px, *cosines)
+            key = (spread, state.shift_px, state.course_px, *cosines)
             if key not in fine.fine.drawn:
                 fine.fine.drawn[key] = drawn(fine.fine.cells, cosines)
             blurred = fine.scale * fine.fine.drawn[key]
@@ -225,7 +235,7 @@ def spread_maps(
             pictures.append((sharp, transfer(cosines)))
         if rest is not None:
             pictures.append((dctn(rest, type=2), transfer(shape)))
-        blurred = sampled_picture(pictures, shape, state.shift_px)
+        blurred = sampled_picture(pictures, shape, state.shift_px, state.course_px)
     radial_px, turn_px = state.distortion_px
     blurred = distorted(np.asarray(blurred, dtype=np.float64), radial_px=radial_px, turn_px=turn_px)
     if draft:
@@ -234,7 +244,10 @@ def spread_maps(
     power = pattern.squared_transfer(f_row, f_column)
     blur = _object_transfer(state, f_row, f_column)
     variance = sampled_picture(
-        [(dctn(variance_DN2, type=2), power if blur is None else power * blur)], shape, state.shift_px
+        [(dctn(variance_DN2, type=2), power if blur is None else power * blur)],
+        shape,
+        state.shift_px,
+        state.course_px,
     )
     variance = distorted(variance, radial_px=radial_px, turn_px=turn_px)
     return blurred, np.maximum(variance, 0.0)
@@ -243,7 +256,7 @@ def spread_maps(
 def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     """Signal and variance before the spread of light, with the blur of the object in them, 0 or more."""
     signal, variance = state.signal_DN, state.variance_DN2
-    still = state.shift_px == state.distortion_px == (0.0, 0.0)
+    still = state.shift_px == state.distortion_px == (0.0, 0.0) and state.course_px == ((), ())
     if signal.shape == (1, 1) or (still and not state.object_transfers):
         return signal, variance
     from scipy.fft import dctn
@@ -253,7 +266,9 @@ def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     radial_px, turn_px = state.distortion_px
     spread = [
         distorted(
-            sampled_picture([(dctn(one, type=2), blur)], shape, state.shift_px), radial_px=radial_px, turn_px=turn_px
+            sampled_picture([(dctn(one, type=2), blur)], shape, state.shift_px, state.course_px),
+            radial_px=radial_px,
+            turn_px=turn_px,
         )
         for one in (signal, variance)
     ]

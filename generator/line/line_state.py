@@ -188,6 +188,7 @@ class LineState:
         picture: the signal as it was projected, finer than pixels, where it has sharp borders; what effects have made of
             `signal_DN` since is their difference.
         shift_px: of the object against its thickness maps, along rows and columns.
+        course_px: where it stands in turn along rows and along columns, from there, equally long; empty: it stays.
         distortion_px: rms displacement of an enlargement and of a counter-clockwise turn of the picture.
         object_transfers: blur of what stands in the beam.
         optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
@@ -220,6 +221,7 @@ class LineState:
     secondary_DN: float = 0.0
     picture: FinePicture | None = None
     shift_px: tuple[float, float] = (0.0, 0.0)
+    course_px: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     distortion_px: tuple[float, float] = (0.0, 0.0)
     object_transfers: tuple[Transfer, ...] = ()
     optical_transfers: tuple[Transfer, ...] = ()

@@ -229,18 +229,34 @@ def kept_cosines(along: FloatArray, least: float) -> int:
 
 
 @lru_cache(maxsize=32)
-def cosines_at_pixels(length: int, points: int, count: int, shift_px: float) -> FloatArray:
+def cosines_at_pixels(
+    length: int, points: int, count: int, shift_px: float, places_px: tuple[float, ...] = ()
+) -> FloatArray:
     """Pixels (length,) from the first `count` amplitudes of a cosine transform over `points`: (length, count).
 
-    The picture is moved on by `shift_px`, and mirrors at its borders. What no pixel can tell apart (frequencies beyond half
-    a cycle a pixel) adds up.
+    The picture is moved on by `shift_px` (and stands at `places_px` from there in turn), and mirrors at its borders. What no pixel
+    can tell apart (frequencies beyond half a cycle a pixel) adds up.
     """
-    angle = np.pi * np.outer((np.arange(length) + 0.5 - shift_px) / length, np.arange(count))
-    return np.asarray(np.cos(angle) * np.where(np.arange(count) == 0, 0.5, 1.0) / points)
+    scale = np.where(np.arange(count) == 0, 0.5, 1.0) / points
+    if not places_px:
+        angle = np.pi * np.outer((np.arange(length) + 0.5 - shift_px) / length, np.arange(count))
+        return np.asarray(np.cos(angle) * scale)
+    even, odd = _moved(length, count, shift_px, places_px)
+    angle = np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(count))
+    return np.asarray((np.cos(angle) * even + np.sin(angle) * odd) * scale)
 
 
-def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float) -> tuple[FloatArray, ...]:
-    """Amplitudes of the cosines, and of the sines where `shift_px` is not 0, of a picture sampled at the pixels.
+def _moved(length: int, count: int, shift_px: float, places_px: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """What a displacement makes of each cosine (count,): as much of the cosine, and of the sine; means over the places."""
+    places = shift_px + (np.array(places_px) if places_px else np.zeros(1))
+    phase = np.pi * np.outer(places, np.arange(count)) / length
+    return np.cos(phase).mean(axis=0), np.sin(phase).mean(axis=0)
+
+
+def sampled_terms(
+    transform: FloatArray, length: int, axis: int, shift_px: float, places_px: tuple[float, ...] = ()
+) -> tuple[FloatArray, ...]:
+    """Amplitudes of the cosines, and of the sines where the picture moves, of a picture sampled at the pixels.
 
     A picture moved on by d is cos(w (x - d)) = cos(w x) cos(w d) + sin(w x) sin(w d) for each of its cosines. What no
     pixel can tell apart (frequencies beyond half a cycle a pixel) is added up.
@@ -250,22 +266,23 @@ def sampled_terms(transform: FloatArray, length: int, axis: int, shift_px: float
             (the first of those over cells).
         length: pixels along the axis.
         shift_px: displacement.
+        places_px: where the picture stands in turn, from there; empty: it stays.
 
     Returns:
         Amplitudes for `scipy.fft.idct`, and for `idst` after a shift, `length` along the axis.
     """
     found = np.moveaxis(transform, axis, 0)
-    if shift_px == 0.0:
+    if shift_px == 0.0 and not places_px:
         return (np.moveaxis(_fold(found, length, -1.0), 0, axis),)
-    phase = np.pi * shift_px * np.arange(found.shape[0]) / length
+    of_cosine, of_sine = _moved(length, found.shape[0], shift_px, places_px)
     along = (slice(None), *([None] * (found.ndim - 1)))
-    odd = _fold(found * np.sin(phase)[along], length, 1.0)
+    odd = _fold(found * of_sine[along], length, 1.0)
     sines = np.zeros_like(odd)
     sines[:-1] = odd[1:]
     if found.shape[0] > length:
-        sines[-1] = 2.0 / FINE * found[length] * np.sin(phase[length])
+        sines[-1] = 2.0 / FINE * found[length] * of_sine[length]
     return (
-        np.moveaxis(_fold(found * np.cos(phase)[along], length, -1.0), 0, axis),
+        np.moveaxis(_fold(found * of_cosine[along], length, -1.0), 0, axis),
         np.moveaxis(sines, 0, axis),
     )
 
@@ -287,6 +304,7 @@ def sampled_picture(
     transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
     shape: tuple[int, int],
     shift_px: tuple[float, float],
+    course_px: tuple[tuple[float, ...], tuple[float, ...]] = ((), ()),
 ) -> FloatArray:
     """Pixels (row, column) of the sum of pictures given by their cosine transforms, blurred and displaced.
 
@@ -294,16 +312,17 @@ def sampled_picture(
         transforms: (the first amplitudes of a transform over pixels or cells, transfer function of its shape or None) each.
         shape: rows and columns of the pixels.
         shift_px: displacement along rows and columns.
+        course_px: where the picture stands in turn along each, from there; empty: it stays.
     """
     if max(shape) <= _MATRICES_TO_PX:
-        return _sampled_by_matrices(transforms, shape, shift_px)
+        return _sampled_by_matrices(transforms, shape, shift_px, course_px)
     from scipy.fft import idct, idst
 
     inverse = (idct, idst)
     rows: list[list[FloatArray]] = [[], []]
     for transform, filters in transforms:
         found = np.asarray(transform if filters is None else transform * filters)
-        for kind, part in enumerate(sampled_terms(found, shape[0], 0, shift_px[0])):
+        for kind, part in enumerate(sampled_terms(found, shape[0], 0, shift_px[0], course_px[0])):
             rows[kind].append(part)
     result = np.zeros(shape)
     for kind, parts in enumerate(rows):
@@ -311,7 +330,7 @@ def sampled_picture(
             continue
         sums: list[FloatArray | None] = [None, None]
         for part in parts:
-            for other, term in enumerate(sampled_terms(part, shape[1], 1, shift_px[1])):
+            for other, term in enumerate(sampled_terms(part, shape[1], 1, shift_px[1], course_px[1])):
                 before = sums[other]
                 sums[other] = term if before is None else before + term
         lines = sum(inverse[other](term, type=2, axis=1) for other, term in enumerate(sums) if term is not None)
@@ -323,13 +342,14 @@ def _sampled_by_matrices(
     transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
     shape: tuple[int, int],
     shift_px: tuple[float, float],
+    course_px: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> FloatArray:
     """`sampled_picture` as one product a side."""
     result = np.zeros(shape)
     for transform, filters in transforms:
         rows, columns = (
-            cosines_at_pixels(length, length if count == length else FINE * length, count, shift)
-            for length, count, shift in zip(shape, transform.shape, shift_px, strict=True)
+            cosines_at_pixels(length, length if count == length else FINE * length, count, shift, places)
+            for length, count, shift, places in zip(shape, transform.shape, shift_px, course_px, strict=True)
         )
         result += rows @ (transform if filters is None else transform * filters) @ columns.T
     return result

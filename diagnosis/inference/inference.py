@@ -138,7 +138,9 @@ def _weighed(
         strong, leaves = left_by_the_stronger(observed, pair)
         if any(observed.has(effect) for effect in pair.effects if effect != strong):
             continue
-        alone = replace(whole[strong], log_evidence=found.log_evidence + leaves, rest=found.rest)
+        # as it is once that is taken off
+        alone = _of_fits((strong,), {strong: pair.fits[strong]}, found.log_evidence + leaves)
+        alone = replace(alone, rest=found.rest)
         if alone.log_evidence > leaks.get(strong, singles[strong]).log_evidence:
             leaks[strong] = alone
     weighed += [(item, of_single) for item in leaks.values()]

@@ -289,9 +289,21 @@ def test_what_came_after_calibration_changes_references_and_what_was_always_ther
             assert abs(drop) < 0.002
 
 
-@pytest.mark.parametrize("effect", ["focal_spot", "mtf_tail", "veiling_glare", "motion_blur", "heel"])
-def test_a_late_change_of_the_picture_reaches_references_as_the_series_model_has_it(series_line, references, effect):
-    applied = AppliedEffect(id=effect, parameters={}, since="calibration")
+@pytest.mark.parametrize(
+    ("effect", "parameters"),
+    [
+        ("focal_spot", {}),
+        ("mtf_tail", {}),
+        ("veiling_glare", {}),
+        ("motion_blur", {}),
+        ("motion_blur", {"strength": 9.0, "acceleration": 1.0}),
+        ("heel", {}),
+    ],
+)
+def test_a_late_change_of_the_picture_reaches_references_as_the_series_model_has_it(
+    series_line, references, effect, parameters
+):
+    applied = AppliedEffect(id=effect, parameters=parameters, since="calibration")
     model = channel(series_line, [applied])
     with read_dataset(references) as dataset:
         quiet = np.exp(-dataset.images(1)[1].astype(np.float64))

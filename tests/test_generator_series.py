@@ -579,7 +579,7 @@ def test_detectors_of_any_shape_take_any_effect(series_line, shape):
         None,
         ("object_scatter", {"strength": 10.0}),
         ("heel", {"strength": 8.0}),
-        ("motion_blur", {"strength": 3.0}),
+        ("motion_blur", {"strength": 3.0, "acceleration": 0.5}),
         ("mtf_tail", {"strength": 20.0}),
         ("excess_noise", {"strength": 20.0}),
     ],

@@ -28,7 +28,7 @@ from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import OpenBeam, SpectralModel
 from ..line.twin import Twin
 from ..line.twin_spectrum import spectral_model_of
-from ..spread._fine_picture import FineCells, pixel_means
+from ..spread._fine_picture import FineCells, pixel_means, sampled_picture
 
 _PICTURE = ("arrivals", "object_blur", "optics")
 
@@ -290,9 +290,9 @@ class ImageEffects:
         before = self.open_level_DN * np.asarray(quiet, dtype=np.float64)
         state = replace(self._open_state(), signal_DN=before, variance_DN2=self.gain_DN * before)
         state = self._through(state, late, {self.product_material: thickness_mm})
-        from scipy.fft import dctn, idctn
+        from scipy.fft import dctn
 
-        shape = before.shape
+        shape = before.shape[0], before.shape[1]
         f_row, f_column = np.arange(shape[0])[:, None] / (2.0 * shape[0]), np.arange(shape[1])[None] / (2.0 * shape[1])
         ratio: FloatArray | None = None
         if state.tails or state.optical_transfers:
@@ -305,7 +305,7 @@ class ImageEffects:
             ratio = part if ratio is None else ratio * part
         after = state.signal_DN
         if ratio is not None:
-            after = np.asarray(idctn(dctn(after, type=2) * ratio, type=2))
+            after = sampled_picture([(dctn(after, type=2), ratio)], shape, (0.0, 0.0), state.course_px)
         return np.asarray((after - before) / self.open_level_DN)
 
     def read_out(self, charge_DN: NDArray[np.floating], rng: np.random.Generator) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from ...errors import InputError
 from ..line.line_state import LineContext, LineState, TelegraphPixels
-from .effect import Effect, Grid, Parameter, Reading, Shows
+from .effect import EVERY_SERIES, Effect, Grid, Parameter, Reading, Shows
 
 
 def _let_pixels_jump(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -97,7 +97,7 @@ RANDOM_TELEGRAPH = Effect(
     after_calibration=True,
     change=_let_pixels_jump,
     isolated_by="a long series of darks",
-    shows=Shows(series=("dark", "flat"), axis="tails", flats=False),
+    shows=Shows(series=EVERY_SERIES, axis="tails", flats=False),
     absorbed="maps",
     reading=Reading(probes=("lasting pixels",)),
     # how many are found hangs on their height and stay, which counts alone do not tell well

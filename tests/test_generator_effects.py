@@ -1334,6 +1334,22 @@ def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series
     assert shares < 0.99
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("off_focal", {"peakedness": -0.1}),
+        ("motion_blur", {"acceleration": 1.2}),
+        ("burn_in", {"lasting_share": 1.1}),
+        ("burn_in", {"lasting_share": -0.1}),
+        ("random_telegraph", {"differ": 0.9}),
+    ],
+)
+def test_a_parameter_that_no_line_can_have_is_refused(series_line, name, wrong):
+    (parameter,) = wrong
+    with pytest.raises(InputError, match=f"{parameter} of {name}: got"):
+        expect(series_line, request(**BEHIND, source_object_mm=850.0), applied(name, **wrong))
+
+
 def test_only_counters_lose_counts(series_line):
     with pytest.raises(InputError, match="only counters have a dead time"):
         LineModel(series_line, effects=applied("pile_up")).expect(request())

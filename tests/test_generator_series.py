@@ -598,6 +598,30 @@ def test_a_series_is_the_same_whatever_was_asked_of_the_cache_before(series_line
         np.testing.assert_allclose(kept.white_variance_DN2, fresh.white_variance_DN2, rtol=1e-12)
 
 
+def test_burn_in_is_the_same_in_whatever_order_series_are_asked(series_line):
+    """What was found for one series is taken up for the next; a series asked before, or of other ones, begins anew."""
+    parameters = {"strength": 4.0, "lasting_share": 0.3}
+    effects = (AppliedEffect(id="burn_in", parameters=parameters, since="always"),)
+    bare = [
+        request("object", thickness_mm=product()),
+        request(start_s=5.0),
+        request(start_s=9.0),
+        request(start_s=40.0),
+    ]
+    asked = [
+        replace(one, long_ago=tuple(bare[: max(n - 1, 0)]), previous=tuple(bare[max(n - 1, 0) : n]))
+        for n, one in enumerate(bare)
+    ]
+    others = [replace(bare[3], previous=(bare[2],)), replace(bare[3], previous=tuple(bare[1:3]))]
+    fresh = [LineModel(series_line, effects=effects).expect(one).mean_DN for one in (*asked, *others)]
+    assert np.abs(fresh[3] - fresh[4]).max() > 1e-3  # what was long ago is seen
+    for order in ((0, 1, 2, 3, 4, 5), (3, 5, 1, 4, 2, 0, 3)):
+        cache = ModelCache()
+        for number in order:
+            kept = LineModel(series_line, effects=effects, cache=cache).expect((*asked, *others)[number])
+            np.testing.assert_array_equal(kept.mean_DN, fresh[number])
+
+
 def test_light_goes_as_the_load_of_the_tube(series_line):
     scene = product()
     effects = (AppliedEffect(id="object_scatter", parameters={"strength": 10.0}, since="calibration"),)

@@ -1,4 +1,4 @@
-"""Each effect of the virtual lab alone: is it named, and does the interval of its strength hold what was planted?
+"""Each effect of the virtual lab alone, but a composition: is it named, and does the interval of its strength hold what was planted?
 
     python validation/lab_effects.py --seed 2960 --json build/lab_effects/2960.json [--only EFFECT ...]
     python validation/lab_effects.py --strengths build/lab_effects/*.json
@@ -30,6 +30,7 @@ from raytwin.lab import EffectRequest, run_protocol
 from raytwin.lab.cases import COARSE, FINE, MAY_COME_LATER
 from raytwin.lab.effects import EFFECTS as LAWS
 
+HARDLY_SHOWN = ("composition_error",)  # some per cent lie within what attenuation tables leave open (LIMITS weak-1)
 _COUNTS_AS = 4.0  # sessions: what is known of laws in general
 _WITHIN = 1.959964
 
@@ -97,7 +98,8 @@ def main() -> None:
         tell_strengths(options.strengths)
         return
     rows = []
-    for number, effect in enumerate(effect for effect in LAWS if effect in EFFECTS):
+    shown = [effect for effect in LAWS if effect in EFFECTS and effect not in HARDLY_SHOWN]
+    for number, effect in enumerate(shown):
         if options.only and effect not in options.only:
             continue
         rng = np.random.default_rng([options.seed, zlib.crc32(effect.encode())])

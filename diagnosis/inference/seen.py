@@ -119,9 +119,9 @@ class Seen:
         return fit_curve(self.observed, curve, levels=only(self.level))
 
     def more_exact(self) -> "Seen | None":
-        """The same with laws off by the level after the next lower one; None: they are exact."""
-        lower = [level for level in LEVELS.levels if level < self.level]
-        return replace(self, level=lower[-2:][0]) if lower else None
+        """The same with laws off by the level two below, or exact; None: they are exact."""
+        below = sum(level < self.level for level in LEVELS.levels)
+        return replace(self, level=LEVELS.levels[max(below - 2, 0)]) if below else None
 
     def evidence(self, curve: Curve) -> float:
         """Log evidence of a curve in these units, its law off by any level."""

@@ -24,6 +24,8 @@ def _remember_light(state: LineState, parameters: Mapping[str, float], context: 
     for name in ("fade_s", "fills_after_exposures"):
         if not parameters[name] > 0.0:
             raise InputError(f"{name} of burn_in", received=parameters[name], expected="above 0")
+    if not 0.0 <= parameters["lasting_share"] <= 1.0:
+        raise InputError("lasting_share of burn_in", received=parameters["lasting_share"], expected="0 to 1")
     bits = context.twin.instrument.bits or 16
     full_DN = 2.0**bits - 1.0 - context.twin.dark_DN.value
     fills_after = parameters["fills_after_exposures"]
@@ -32,7 +34,7 @@ def _remember_light(state: LineState, parameters: Mapping[str, float], context: 
         most=most,
         filled_per_DN=1.0 / (fills_after * full_DN),
         fade_s=parameters["fade_s"],
-        lasting_share=min(max(parameters["lasting_share"], 0.0), 1.0),
+        lasting_share=parameters["lasting_share"],
     )
     return replace(state, gain_memory=law)
 

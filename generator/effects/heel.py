@@ -116,6 +116,7 @@ HEEL = Effect(
     absorbed="maps of beams",
     grid=Grid(
         shares=(0.8,),
+        # a search begins between a change about the middle (0) and one that grows from a border on (1/2)
         variants=tuple({"direction_deg": direction, "offset": 0.2} for direction in (0.0, 90.0, 180.0, 270.0)),
     ),
     variation=Variation(random="sides"),

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState
 from .effect import Effect, Grid, Parameter, Shows
 
@@ -27,6 +28,10 @@ def _blur_by_motion(state: LineState, parameters: Mapping[str, float], context: 
         length_px *= context.source_detector_mm / context.source_object_mm / usual
     along_rows = request.belt_axis != "column"
     uneven = parameters["acceleration"]
+    if abs(uneven) > 1.0:
+        raise InputError(
+            "acceleration of motion_blur", received=uneven, expected="-1 to 1: the object does not turn back"
+        )
     steps = 1 if uneven == 0.0 else max(math.ceil(_STEPS_A_PX * abs(length_px)), 2)
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:

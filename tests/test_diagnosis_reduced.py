@@ -23,8 +23,9 @@ from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.diagnosis.session.session import measured_levels, read_session
-from raytwin.generator.effects import EFFECTS
+from raytwin.generator.effects import EFFECTS, AppliedEffect
 from raytwin.generator.frames.conditions import session_conditions
+from raytwin.generator.frames.line_model import LineModel
 from raytwin.generator.twins.twin_io import read_twin
 
 FLAT_40, FLAT_90 = "flat_40kV_25ms_Cu0.05", "flat_90kV_25ms_Cu0.05"
@@ -657,3 +658,59 @@ def test_a_change_of_the_beam_that_one_calibrated_voltage_cannot_tell_stays_a_ti
     assert at["filtration_error"] < 0.6
     if answer["verdict"] == "ambiguous":
         assert "A change is told by what was measured before it as well" in answer["next_measurement"]["text"]
+
+
+def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):
+    """With a higher voltage there is more light, and more of it strays; calibrating series are as they were."""
+    higher = AppliedEffect(id="kv_error", parameters={"strength": 6.0}, since="calibration")
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+        beside = problem.with_nuisances_beside([higher])
+    before = dict(zip(problem.factor_names, problem.factors.T, strict=True))
+    after = dict(zip(beside.factor_names, beside.factors.T, strict=True))
+    assert set(before) == set(after)
+    calibrates = np.array([problem.views[number].session.calibrates for number in problem.series_of])
+    for name, column in before.items():
+        np.testing.assert_array_equal(after[name][calibrates], column[calibrates])
+    twin = replace(problem.base, effects=(higher,))
+    seen = 0
+    for number, view in enumerate(problem.views):
+        request = view.session.request
+        if view.session.calibrates or not request.beam_on or request.kind != "flat":
+            continue
+        brighter = float(np.mean(LineModel(twin, use_measured_level=False).expect(request).signal_DN)) / float(
+            np.mean(view.expected.signal_DN)
+        )
+        assert brighter > 1.05
+        level = (problem.series_of == number) & np.array([name.location == "whole field" for name in problem.names])
+        name = f"level of {view.session.name}"
+        np.testing.assert_allclose(after[name][level], brighter * before[name][level], rtol=0.01)
+        seen += 1
+    assert seen
+
+
+def test_an_effect_beside_another_is_what_it_adds_to_that_one(line):
+    """A beam that a filter has weakened gains less light by a higher voltage."""
+    filtered = AppliedEffect(id="filtration_error", parameters={"strength": 1.0}, since="calibration")
+    variant = next(item for item in catalogue_variants() if item.effect == "kv_error" and item.sign > 0)
+    variant = replace(variant, strengths=(6.0,))
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=(variant,))
+        found = problem.respond([variant, replace(variant, beside=filtered)])
+    level = np.array([name.location == "whole field" for name in problem.names])
+    seen = 0
+    for number, view in enumerate(problem.views):
+        if view.session.calibrates or view.session.series.kind != "flat":
+            continue
+
+        def light(*effects, request=view.session.request):
+            twin = replace(problem.base, effects=effects)
+            return float(np.mean(LineModel(twin, use_measured_level=False).expect(request).signal_DN))
+
+        more = variant.applied(6.0)
+        weaker = (light(filtered, more) - light(filtered)) / (light(more) - light())
+        assert weaker < 0.95
+        probes = level & (problem.series_of == number)
+        np.testing.assert_allclose(found[1][0, probes], weaker * found[0][0, probes], rtol=0.01)
+        seen += 1
+    assert seen

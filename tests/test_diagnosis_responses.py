@@ -17,7 +17,7 @@ from raytwin.diagnosis.model.changes import catalogue_variants, departures_found
 from raytwin.diagnosis.model.forward_model import Change, ForwardModel, strength_rows
 from raytwin.diagnosis.model.placing import inside
 from raytwin.diagnosis.probes.registration import Placement
-from raytwin.diagnosis.problem.nuisance_columns import local_nuisances
+from raytwin.diagnosis.problem.nuisance_columns import nuisances_of_series
 from raytwin.diagnosis.problem.series_probes import variance_of_what_came
 from raytwin.diagnosis.session.even_maps import compact, full_size
 from raytwin.errors import InputError
@@ -193,7 +193,7 @@ def test_a_change_touches_what_its_effect_can_show_and_only_after_it_began():
     late = changed("dark_drift", since="calibration", strength=2.0)
     assert late.touches(request("dark"))
     assert not late.touches(request("dark", after=False))
-    beam = Change(label="log_output", twin=None, spectral=True)
+    beam = Change(label="log_output", twin=None, steps="lit")
     assert beam.touches(request("flat"))
     assert not beam.touches(request("dark"))
 
@@ -316,6 +316,7 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         projection=SimpleNamespace(apply=lambda image: np.asarray(image, dtype=float).ravel()),
         of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),
         of_scalars=lambda change: np.zeros(4),
+        shrink=np.ones(4),
     )
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_edges", lambda *_: {})
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._read_texture", lambda *_: np.zeros(4))
@@ -323,7 +324,9 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns.gradient", lambda image: (image, image))
 
     def columns(beams_differ):
-        return local_nuisances(probes, signal, {"Al": (thinner, {})}, sharp=False, beams_differ=beams_differ)
+        model = SimpleNamespace(sharp=False, beams_differ=beams_differ)
+        session = SimpleNamespace(model=model, maps=SimpleNamespace(shares={}))
+        return nuisances_of_series(session, probes, signal, {"Al": (thinner, {})})
 
     usual, wider = columns(1.0), columns(3.0)
     # all exposures 20 us longer or shorter than stated

@@ -21,7 +21,7 @@ from learn_discrepancy import row_of
 
 from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.judgement.judgement import verdict_of, weigh_problem
+from raytwin.diagnosis.judgement.judgement import verdict_of
 from raytwin.diagnosis.judgement.strengths import strength_of
 from raytwin.diagnosis.problem.assemble import problem_of
 from raytwin.generator.effects import EFFECTS
@@ -50,9 +50,9 @@ def session_row(path: Path, request: EffectRequest) -> dict:
     """What a session says of the effect that was planted in it."""
     with open_acquisition(path) as acquisition:
         session = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
-        weighed = weigh_problem(problem_of(session, session.twin))
+        row, weighed = row_of(problem_of(session, session.twin), request.id)
     leading = verdict_of(weighed.hypotheses).leading
-    row = row_of(weighed, request.id) | {"strength": request.strength, "since": request.since}
+    row |= {"strength": request.strength, "since": request.since}
     if request.id in leading.variants:
         sign = weighed.problem.variant_of(leading.variants[request.id]).sign
         row["found"] = [sign * value for value in strength_of(weighed.problem, leading, request.id)]

@@ -15,7 +15,8 @@ import json
 import math
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import law_families
@@ -26,11 +27,11 @@ from raytwin.acquisition import open_acquisition
 from raytwin.diagnosis.checks.preparation import prepare_session
 from raytwin.diagnosis.inference.curve_fits import CurveFit
 from raytwin.diagnosis.inference.discrepancy import LEVELS
-from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest, weigh_hypotheses
-from raytwin.diagnosis.inference.observed import Observed
+from raytwin.diagnosis.inference.inference import UNKNOWN, evidence_with_rest
 from raytwin.diagnosis.inference.unknown import LOG_DENSITY
 from raytwin.diagnosis.judgement.judgement import Weighed, verdict_of, weigh_problem
 from raytwin.diagnosis.problem.assemble import problem_of
+from raytwin.diagnosis.problem.problem import Problem
 
 _ROUNDS = 300
 _CLEAR = 3.0  # log evidence from which something is said
@@ -42,43 +43,45 @@ def session_row(path: Path, planted: str) -> dict:
     """Evidence of the planted effect by level, of the likest once it is left out, and what is named with and without it."""
     with open_acquisition(path) as acquisition:
         session = prepare_session(acquisition, twin=None, rng=np.random.default_rng(0))
-        weighed = weigh_problem(problem_of(session, session.twin))
-    return row_of(weighed, planted)
-
-
-def row_of(weighed: Weighed, planted: str) -> dict:
-    """What one session tells of the planted effect's law, and of the law that is likest it."""
-    problem, observed = weighed.problem, weighed.observed
-    parts = {"parts": problem.parts, "part_names": problem.part_names}
-    row = {"planted": planted, **told(weighed.hypotheses)}
-    if planted == "none":
-        return row
-    own = [fit for fit in weighed.fits if fit.curve.effect == planted]
-    others = [fit for fit in weighed.fits if fit.curve.effect != planted]
-    if own:
-        row["kind"] = told_by_law(observed, _likest(own), parts)
-    if others:
-        likest = _likest(others)
-        row["another"] = told_by_law(observed, likest, parts, another=True)
-        row["likest"] = likest.curve.effect
-        row["left_out"] = told(weigh_hypotheses([(observed, others)], **parts))
+        row, _ = row_of(problem_of(session, session.twin), planted)
     return row
 
 
-def _likest(fits: list[CurveFit]) -> CurveFit:
+def row_of(problem: Problem, planted: str) -> tuple[dict, Weighed]:
+    """What one session tells of the planted effect's law, and of the law that is likest it; all hypotheses."""
+    weighed = weigh_problem(problem)
+    row = {"planted": planted, **told(weighed.hypotheses)}
+    if planted == "none":
+        return row, weighed
+    own = [fit for fit in weighed.fits if fit.curve.effect == planted]
+    if own:
+        row["kind"] = told_by_law(weighed, _likest(own))
+    kept = [number for number, curve in enumerate(problem.curves) if curve.effect != planted]
+    if kept:
+        curves, variants = (tuple(items[number] for number in kept) for items in (problem.curves, problem.variants))
+        others = weigh_problem(replace(problem, curves=curves, variants=variants))
+        likest = _likest(others.fits)
+        row["another"] = told_by_law(others, likest, another=True)
+        row["likest"] = likest.curve.effect
+        row["left_out"] = told(others.hypotheses)
+    return row, weighed
+
+
+def _likest(fits: Sequence[CurveFit]) -> CurveFit:
     """The likeliest of those that were fitted with all levels."""
     full = [fit for fit in fits if len(fit.by_level) == len(LEVELS.levels)]
     return max(full, key=lambda fit: fit.log_evidence)
 
 
-def told_by_law(observed: Observed, fit: CurveFit, parts: dict, *, another: bool = False) -> dict:
+def told_by_law(weighed: Weighed, fit: CurveFit, *, another: bool = False) -> dict:
     """Log evidence of a law by level, and with a rest of any length beside it; that length over what the law does.
 
     another: the effect is only like the law's: it has any strength, and where it leaves a rest the law is off by most.
     """
     by_level = fit.at_any_strength if another else fit.by_level
     point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
-    evidence, ratio = evidence_with_rest(observed, [point], **parts, another=another)
+    parts = {"parts": weighed.problem.parts, "part_names": weighed.problem.part_names}
+    evidence, ratio = evidence_with_rest(weighed.observed, [point], **parts, another=another)
     return {"by_level": list(by_level), "with_rest": evidence, "ratio": ratio}
 
 

@@ -70,6 +70,7 @@ def weigh_hypotheses(
     priors: Priors | None = None,
     of_catalogue: int = 0,
     rests: bool = True,
+    beside: Sequence[Curve] = (),
 ) -> tuple[Hypothesis, ...]:
     """All hypotheses, most probable first; their probabilities sum to 1.
 
@@ -84,13 +85,14 @@ def weigh_hypotheses(
         priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
+        beside: curves of effects as they respond beside another.
     """
     weighed: list[tuple[Hypothesis, float]] = []
     for observed, fits in seen:
         # one zero for all, and how often laws are off by so much
         zero = observed.standing().log_likelihood - seen[0][0].standing().log_likelihood
         zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
-        found = _weighed(observed, fits, parts, part_names, priors or Priors(), of_catalogue, rests)
+        found = _weighed(observed, fits, parts, part_names, priors or Priors(), of_catalogue, rests, beside)
         weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
     return _by_effects(weighed)
 
@@ -103,15 +105,16 @@ def _weighed(
     priors: Priors,
     of_catalogue: int,
     rests: bool,
+    beside: Sequence[Curve],
 ) -> list[tuple[Hypothesis, float]]:
     """All hypotheses with their log evidence over none, and the logarithms of their priors."""
     singles = _singles(fits)
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     looked_at = _WITH_REST if rests else 0
-    beside = _Rests(observed, parts, part_names)
-    none = beside.none
-    nothing = beside.no_effect(rests)
+    left = _Rests(observed, parts, part_names)
+    none = left.none
+    nothing = left.no_effect(rests)
     weighed = [(nothing, math.log(priors.none))]
     of_single = math.log(priors.single / count)
     alike, whole = [], {}
@@ -120,8 +123,8 @@ def _weighed(
         found = _of_fits((effect,), {effect: single.best}, single.log_evidence)
         found = replace(found, strengths={effect: interval_of(single.fits)})
         if effect in ranked[:looked_at]:
-            found = beside.of_kind(found, [single.best])
-            alike.append(beside.of_another(single))
+            found = left.of_kind(found, [single.best])
+            alike.append(left.of_another(single))
         weighed.append((found, of_single))
         whole[effect] = found
     of_given = _left_by_given(observed, singles, whole)
@@ -129,10 +132,10 @@ def _weighed(
         weighed.append((replace(nothing, log_evidence=of_given), math.log(priors.none)))
     leaks: dict[str, Hypothesis] = {}
     of_pair = math.log(priors.pair / max(count * (count - 1) // 2, 1))
-    for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM)):
+    for number, pair in enumerate(weigh_pairs(observed, singles, leading=_PAIRS_FROM, beside=beside)):
         found = _of_fits(pair.effects, pair.fits, pair.log_evidence)
         if number < looked_at:
-            found = beside.of_kind(found, list(pair.fits.values()))
+            found = left.of_kind(found, list(pair.fits.values()))
         weighed.append((found, of_pair))
         # or the weaker of them is what the stronger one's law leaves; not one that the twin has, which would have to be there
         strong, leaves = left_by_the_stronger(observed, pair)

@@ -52,33 +52,51 @@ class Pair:
         return first, second
 
 
-def weigh_pairs(observed: Observed, singles: Mapping[str, Single], *, leading: int) -> list[Pair]:
+def weigh_pairs(
+    observed: Observed, singles: Mapping[str, Single], *, leading: int, beside: Sequence[Curve] = ()
+) -> list[Pair]:
     """The effects that explain most, so many as `leading` says, each with every other one: those that are likely at first sight.
 
     Args:
         observed: what is weighed.
         singles: all effects, by id.
         leading: how many effects are the first of a pair.
+        beside: curves of effects as they respond beside another.
     """
     if len(singles) < 2:
         return []
-    curves = {name: [fit.curve for fit in single.fits] for name, single in singles.items()}
+
+    def curves(effect: str, other: str) -> list[Curve]:
+        own = [fit.curve for fit in singles[effect].fits]
+        return own + [curve for curve in beside if (curve.effect, curve.beside) == (effect, other)]
+
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
     for first in ranked[:leading]:
         best = singles[first].best
         point = best.at_level(min(best.level, FARTHEST_LEVEL))
         alone = _beside_first(observed, point, first)
-        for second, own in curves.items():
+        for second in singles:
             if second == first:
                 continue
-            start, beside = _beside_first(observed, point, second) if observed.has(second) else alone
-            gain = max(fit_curve(beside, beside.scaled(curve), exact=True).log_evidence for curve in own)
+            start, left = _beside_first(observed, point, second) if observed.has(second) else alone
+            own = curves(second, first)
+            gain = max(fit_curve(left, left.scaled(curve), exact=True).log_evidence for curve in own)
             a, b = sorted((first, second))
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
     likely = sorted(seen.values(), key=lambda item: -item[0])[:_IN_FULL]
-    return [_settled(observed, singles[point.curve.effect].best, point, curves, other) for _, point, other in likely]
+    return [
+        _settled(
+            observed,
+            singles[first].best,
+            point,
+            {first: curves(first, other), other: curves(other, first)},
+            other,
+        )
+        for _, point, other in likely
+        for first in [point.curve.effect]
+    ]
 
 
 def _settled(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import EFFECTS
+from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.effects.effect import Placement
 from ..model.changes import Variant
 from ..model.curves import Curve
@@ -88,6 +88,9 @@ class _Refinement:
             placement = EFFECTS[task.effect].placement
             if placement is not None:
                 starts += _displaced_and_distorted(clear, self._variants, placement)
+            if task.beside is not None and not task.moves_more:
+                there = self._there(task.beside)
+                starts = [(replace(variant, beside=there), fit) for variant, fit in starts]
         best: _Closer | None = None
         for variant, fit in starts:
             found = searched(variant, fit, seen)
@@ -114,6 +117,16 @@ class _Refinement:
         known = self._closer.get(effect)
         curve, strength = grid if known is None else (known.curve, known.strength)
         return Point(curve=curve, strength=strength, level=USUAL_LEVEL)
+
+    def _there(self, grid: tuple[Curve, float]) -> AppliedEffect | None:
+        """An effect of a pair as it was found last, as the other one has it beside it; None: it acts in some series only."""
+        known = self._closer.get(grid[0].effect)
+        variant, strength = (
+            (self._variants[grid[0].effect, grid[0].variant], grid[1])
+            if known is None
+            else (known.variant, known.strength)
+        )
+        return None if variant.series else variant.applied(strength)
 
     def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import EFFECTS
+from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.line.twin import Twin
 from ..advice.next_series import best_measurement, proposal_text
 from ..advice.plan import WORTH_IT, best_repeat, repeat_text
@@ -101,19 +101,7 @@ class Weighed:
 def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stage: None) -> Weighed:
     """All hypotheses against the whitened probes, twice: inner parameters are refined for the likely ones."""
     tell("hypotheses")
-    whitening = Whitening(problem.factors, problem.blocks)
-    had = [point.curve.effect for point in problem.given]
-    given = whitening.curves([point.curve for point in problem.given])
-    observed = Observed(
-        residual=whitening.apply(problem.residual_without(had)[None, :])[0],
-        nuisances=Nuisances(whitening.factors),
-        groups=problem.groups,
-        series=problem.series_of,
-        places=problem.places,
-        given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
-    )
-    whitened = whitening.curves(problem.curves)
-
+    whitening, observed, whitened = _whitened(problem)
     fits = fit_effects(observed, whitened)
     for effect in (effect for effect, entry in EFFECTS.items() if entry.in_some_series and not observed.has(effect)):
         of_effect = [fit for fit in fits if fit.curve.effect == effect]
@@ -130,9 +118,16 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
             part_names=problem.part_names,
             of_catalogue=len(EFFECTS),
             rests=rests,
+            beside=[curve for curve in whitened if curve.beside],
         )
 
     first = weigh([(observed, fits)], rests=False)
+    likeliest = next((item for item in first if item.effects and item.effects != (UNKNOWN,)), None)
+    if likeliest is not None and likeliest.log_evidence > 0.0:
+        tell("nuisances beside the likeliest explanation")
+        problem = problem.with_nuisances_beside(_applied_everywhere(problem, likeliest))
+        whitening, observed, whitened = _whitened(problem)
+        first = _with_curves(first, whitened)
     tell("refinement")
     closer = refine(
         first,
@@ -143,15 +138,15 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         whitener=whitening,
         blocks=problem.asked_in_blocks,
     )
-    if closer:
-        problem = problem.with_variants(closer)
-        whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
-        fits = fit_effects(observed, whitened)
+    problem = problem.with_variants(closer)
+    whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
+    alone = [curve for curve in whitened if not curve.beside]
+    fits = fit_effects(observed, alone)
     tell("all hypotheses")
     seen = [(observed, fits)]
     if observed.given:
         levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
-        seen = [(one, fit_effects(one, whitened)) for one in levels]
+        seen = [(one, fit_effects(one, alone)) for one in levels]
     hypotheses = weigh(seen, rests=True)
     by_name = {(item.effect, item.name): item for item in problem.variants}
     hypotheses = tuple(
@@ -161,17 +156,47 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         for item in hypotheses
     )
     problem = problem.released()
-    own = {(curve.effect, curve.variant): curve for curve in problem.curves}
     return Weighed(
         problem=problem,
-        hypotheses=tuple(
-            replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
-            for item in hypotheses
-        ),
+        hypotheses=_with_curves(hypotheses, problem.curves),
         out_of_reach=_out_of_reach(problem, whitened, observed),
         observed=observed,
         fits=fits,
     )
+
+
+def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]:
+    """A problem's probes and curves with nuisances of single series integrated out."""
+    whitening = Whitening(problem.factors, problem.blocks)
+    had = [point.curve.effect for point in problem.given]
+    given = whitening.curves([point.curve for point in problem.given])
+    observed = Observed(
+        residual=whitening.apply(problem.residual_without(had)[None, :])[0],
+        nuisances=Nuisances(whitening.factors),
+        groups=problem.groups,
+        series=problem.series_of,
+        places=problem.places,
+        given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
+    )
+    return whitening, observed, whitening.curves(problem.curves)
+
+
+def _with_curves(hypotheses: Sequence[Hypothesis], curves: Sequence[Curve]) -> tuple[Hypothesis, ...]:
+    """Hypotheses with the curves of the same variants."""
+    own = {(curve.effect, curve.variant): curve for curve in curves}
+    return tuple(
+        replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
+        for item in hypotheses
+    )
+
+
+def _applied_everywhere(problem: Problem, hypothesis: Hypothesis) -> list[AppliedEffect]:
+    """The effects of a hypothesis as they fit best, less those that act in some series only."""
+    return [
+        problem.variant_of(curve).applied(hypothesis.strengths[effect][0])
+        for effect, curve in hypothesis.variants.items()
+        if not curve.series
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

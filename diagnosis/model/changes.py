@@ -80,7 +80,8 @@ class Variant:
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
     the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior, most: as of a `Curve`.
+    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior, most: as of a `Curve`;
+    beside: another effect that is there: its response is what it adds to that one's.
     """
 
     effect: str
@@ -97,6 +98,7 @@ class Variant:
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
     most: float = math.inf
+    beside: AppliedEffect | None = None
 
     def curve(
         self,
@@ -122,15 +124,17 @@ class Variant:
             series=self.series,
             log_prior=self.log_prior,
             most=self.most,
+            beside="" if self.beside is None else self.beside.id,
         )
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
         """The same with other inner parameters, asked at other strengths; its name says where it came from."""
         label = ", ".join(f"{name} {value:.3g}" for name, value in parameters.items())
+        beside = "" if self.beside is None else f", beside {self.beside.id}"
         return replace(
             self,
             parameters=dict(parameters),
-            name=f"{label}, refined from {self.name}".strip(", "),
+            name=f"{label}, refined from {self.name}{beside}".strip(", "),
             strengths=tuple(strengths),
             refined_from=self.name,
         )

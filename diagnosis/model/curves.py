@@ -26,7 +26,8 @@ class Curve:
     that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
     strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
     the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
-    probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %).
+    probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %); beside: id of
+    another effect beside which it responds so (empty: none need be there).
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -45,6 +46,7 @@ class Curve:
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
     most: float = math.inf
+    beside: str = ""
 
     @property
     def reach(self) -> tuple[float, float]:

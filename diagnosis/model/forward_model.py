@@ -38,7 +38,7 @@ class Change:
 
     Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
     one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
-    standard deviations; spectral: moves lit series alone.
+    standard deviations; steps: series that a step of the twin moves, "all", "lit" or none.
     """
 
     label: str
@@ -47,7 +47,7 @@ class Change:
     instead_of: tuple[AppliedEffect, ...] = ()
     parameters: NDArray[np.float64] | None = None
     step_sd: float = 1.0
-    spectral: bool = False
+    steps: str = ""
 
     @classmethod
     def of_twin(cls, step: TwinChange) -> "Change":
@@ -57,13 +57,13 @@ class Change:
             twin=step.twin,
             parameters=step.parameters,
             step_sd=step.step_sd,
-            spectral=step.parameters is not None,
+            steps="all" if step.parameters is None else "lit",
         )
 
     def touches(self, request: SeriesRequest) -> bool:
         """Whether the change can show in a series."""
-        if not (self.effects or self.instead_of):
-            return self.spectral is False or request.beam_on
+        if self.steps == "all" or (self.steps == "lit" and request.beam_on):
+            return True
         if any(effect.since == "always" or request.after_calibration for effect in self.instead_of):
             return True
         for effect in self.effects:
@@ -74,13 +74,24 @@ class Change:
                 return True
         return False
 
+    def beside(self, other: "Change") -> "Change | None":
+        """A nuisance's step once effects have been found; None: it is a little of one of these.
+
+        other: the base twin with these effects.
+        """
+        if {item.id for item in self.effects} & {item.id for item in other.effects}:
+            return None
+        return replace(
+            self,
+            twin=replace(self.twin, effects=other.twin.effects),
+            effects=(*self.effects, *other.effects),
+            instead_of=other.instead_of,
+        )
+
     @property
     def only_displaces(self) -> bool:
         """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
-        if self._misplaced is None:
-            return False
-        lies = self._misplaced.lies
-        return math.hypot(lies.radial_px, lies.turn_px) <= _ALL_SHIFT * lies.size_px
+        return len(self.effects) == 1 and self._misplaced is not None and self._misplaced.only_shifts
 
     @property
     def displacement(self) -> dict[str, float]:
@@ -97,7 +108,9 @@ class Change:
         if misplaced is None or self.only_displaces:
             return self
         effect = misplaced.effect
-        others = (item for item in self.effects if item is not effect)
+        others = [item for item in self.effects if item is not effect]
+        if misplaced.only_shifts:
+            return replace(self, effects=tuple(others))
         rest = misplaced.placement.without_shift(effect.parameters)
         return replace(self, effects=(*others, replace(effect, parameters=rest)))
 
@@ -113,6 +126,7 @@ class Change:
         """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
         if (
             self.instead_of
+            or self.steps
             or len(self.effects) != 1
             or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS
             or not self.touches(request)
@@ -132,6 +146,10 @@ class _Misplaced:
     effect: AppliedEffect
     placement: Placement
     lies: Displacement
+
+    @property
+    def only_shifts(self) -> bool:
+        return math.hypot(self.lies.radial_px, self.lies.turn_px) <= _ALL_SHIFT * self.lies.size_px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,17 +176,27 @@ class ForwardModel:
         """How many times more than usual beams may differ from the spectral model: 1 unless calibration found large departures."""
         return 1.0 + OF_BEAMS_GROWS * (departures_found(self.base.spectral) - 1.0)
 
+    @property
+    def unchanged(self) -> Change:
+        """The base twin itself."""
+        return Change(label="base", twin=self.base)
+
     def change(self, variant: Variant, strength: float) -> Change:
         """An effect of the catalogue at a strength, in this session; it takes the place of the same one, if the base has that."""
-        applied = with_conditions(variant.applied(strength), self.conditions)
-        return replace(self.without(variant.effect), label=variant.effect, effects=(applied,))
+        beside = [] if variant.beside is None else [variant.beside]
+        return replace(self.with_found([*beside, variant.applied(strength)]), label=variant.effect)
 
-    def without(self, effect: str) -> Change:
-        """The base twin less one of its effects; the base itself where it has not that."""
-        had = tuple(item for item in self.base.effects if item.id == effect)
-        rest = tuple(item for item in self.base.effects if item.id != effect)
+    def with_found(self, effects: Sequence[AppliedEffect]) -> Change:
+        """The base twin with effects in this session; they take the place of the same ones, if the base has those."""
+        applied = tuple(with_conditions(item, self.conditions) for item in effects)
+        return replace(self.without(*(item.id for item in effects)), label="found", effects=applied)
+
+    def without(self, *effects: str) -> Change:
+        """The base twin less some of its effects; the base itself where it has none of them."""
+        had = tuple(item for item in self.base.effects if item.id in effects)
+        rest = tuple(item for item in self.base.effects if item.id not in effects)
         twin = replace(self.base, effects=rest) if had else self.base
-        return Change(label=f"without {effect}", twin=twin, instead_of=had)
+        return Change(label=f"without {', '.join(effects)}", twin=twin, instead_of=had)
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
         """The series as the base twin expects it.
@@ -176,7 +204,7 @@ class ForwardModel:
         Raises:
             InputError: the twin knows too little for it.
         """
-        return self._asked(request, Change(label="base", twin=self.base))
+        return self.under(self.unchanged, request)
 
     def expect_changed(self, request: SeriesRequest, change: Change, unchanged: ExpectedSeries) -> ExpectedSeries:
         """The series under a change: `unchanged` itself where the change cannot show.
@@ -184,7 +212,7 @@ class ForwardModel:
         Raises:
             InputError: the twin knows too little for it.
         """
-        return self._asked(request, change) if change.touches(request) else unchanged
+        return self.under(change, request) if change.touches(request) else unchanged
 
     def expect_all(self, items: Sequence[SessionSeries]) -> tuple[dict[str, ExpectedSeries], list[str]]:
         """The series as the base twin expects them, by name, and why others cannot be."""
@@ -197,7 +225,12 @@ class ForwardModel:
                 refused.append(f"{item.name}: {error}")
         return expected, refused
 
-    def _asked(self, request: SeriesRequest, change: Change) -> ExpectedSeries:
+    def under(self, change: Change, request: SeriesRequest) -> ExpectedSeries:
+        """A series under a change, whether that can show there or not.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
         effects = (*change.twin.effects, *change.effects)
         in_maps = {item.id for item in effects if EFFECTS[item.id].absorbed == _IN_MAPS_OF_BEAMS}
         if self.own_maps and any(item.id in in_maps and item.since == "always" for item in effects):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +107,11 @@ class SessionModel:
             shares += sum(weight**2 / self.maps.darks.frames[name] for name, weight in weights.items())
         return self.lines_DN2[0] * shares, self.lines_DN2[1] * shares
 
+    @property
+    def unchanged(self) -> Asked:
+        """The base twin itself."""
+        return Asked(change=self.model.unchanged, absorbed=Absorbed())
+
     def ask(self, change: Change, *, refused: str = "") -> Asked:
         """A change with what it does to the calibrating series; refused: why it is not to be asked."""
         if refused:
@@ -177,7 +182,8 @@ class SessionModel:
         if one.placement is not None and change.only_displaces:
             moved = NOWHERE
         if item.request.beam_on and bool(np.any(absorbed.gain)):
-            moved = moved - np.asarray(one.expected.signal_DN, dtype=np.float32) * absorbed.gain
+            signal = np.asarray(one.expected.signal_DN, dtype=np.float32)
+            moved = (moved - signal * absorbed.gain) / (1.0 + absorbed.gain)
         if not item.calibrates:
             values = _with_patterns(
                 values,
@@ -191,6 +197,23 @@ class SessionModel:
         if one.tells_displacement:
             values = {**values, **_NO_DISPLACEMENT, **change.displacement}
         return np.asarray(moved, dtype=np.float32), values
+
+    def under(self, one: SeriesModel, asked: Asked) -> SeriesModel:
+        """One series as it is expected under a change that can show there; what line noise leaves in maps aside.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
+        change = asked.change if one.placement is None else asked.change.found_in_place()
+        expected = self.model.under(change, one.session.request)
+        return replace(one, expected=expected, scalars={**one.scalars, **expected_scalars(expected, one.context)})
+
+    def with_scene(self, one: SeriesModel, thickness_mm: Mapping[str, NDArray[np.floating]], asked: Asked) -> Moved:
+        """What another scene would show in a series (`under` the change that is asked), less what its own shows there."""
+        change = asked.change if one.placement is None else asked.change.found_in_place()
+        changed = self.model.under(change, replace(one.session.request, thickness_mm=dict(thickness_mm)))
+        moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
+        return moved / (1.0 + asked.absorbed.gain), expected_scalars(changed, one.context)
 
     def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
         """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.

@@ -3,6 +3,7 @@
 Files:
     assemble           session and twin to problem, top to bottom
     problem            the problem: residual, factors, curves, names
+    asked_again        further variants; nuisances where effects have been found
     series_probes      one series projected: templates, scalars, residual
     series_block       one series in numbers: residual, nuisances, responses, random parts
     nuisance_columns   nuisances of one series

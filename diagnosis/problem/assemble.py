@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,22 +32,21 @@ from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
 from ..model.forward_model import Change, ForwardModel, draft_cache, strength_rows
 from ..model.placing import place_scenes
-from ..model.responses import Asked, Moved, SeriesModel, SessionModel, session_model
-from ..probes.model_scalars import expected_scalars
+from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from ..session.even_maps import Map
 from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
 from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all
+from .asked_again import AskedAgain, ProbedSeries, notable
 from .known_effects import lasting, with_found
 from .line_noise import usual_line_noise
-from .nuisance_columns import Columns
+from .nuisance_columns import Columns, nuisances_of_series
 from .problem import Problem, SeriesView
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
-from .series_probes import MeanFrame, SeriesProbes, mean_frame, series_probes
+from .series_probes import MeanFrame, mean_frame, series_probes
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
-_LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
 _NEAR_A_POINT = 0.2
 _PLACES = "places of scenes"
@@ -105,12 +103,14 @@ def build_problem(
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
     steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
-    changes += [Change.of_twin(step) for step in steps_taken]
-    changes += [
+    had = {item.id: item for item in model.base.effects}
+    steps = [Change.of_twin(step) for step in steps_taken]
+    steps += [
         replace(model.change(variant, variant.strengths[0]), label=variant.name)
         for variant in always_a_little(side=side)
+        if variant.effect not in had
     ]
-    had = {item.id: item for item in model.base.effects}
+    changes += steps
     changes += [model.without(effect) for effect in had]
     unjudged = _of_quanta() if only_own_noise(session) else {}
     compared = _Compared(
@@ -118,6 +118,7 @@ def build_problem(
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
         had=had,
         variants=tuple(variants),
+        steps=tuple(steps),
         thicker=_thicker_scenes(expected.series),
         back=back,
         side=side,
@@ -289,22 +290,24 @@ class _Part:
 
     view: SeriesView
     block: SeriesBlock
-    probes: SeriesProbes
+    probed: ProbedSeries
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Compared:
     """A session and the changes that every series of it is asked with.
 
-    Fields: measured; asked: changes, those of variants' strengths first, the twin less each of its effects last; had: these effects;
-    variants; thicker: see `_thicker_scenes`; back: prior standard deviations from the base twin's spectral parameters to the
-    calibrated ones, by name; side: of the squares of the panel's pixels that stand for pixels.
+    Fields: measured; asked: changes, those of variants' strengths first, then steps, the twin less each of its effects last; had:
+    these effects; variants; steps: of nuisances that lie in the twin; thicker: see `_thicker_scenes`; back: prior standard
+    deviations from the base twin's spectral parameters to the calibrated ones, by name; side: of the squares of the panel's
+    pixels that stand for pixels.
     """
 
     measured: _Measured
     asked: tuple[Asked, ...]
     had: Mapping[str, AppliedEffect]
     variants: tuple[Variant, ...]
+    steps: tuple[Change, ...]
     thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
     back: Mapping[str, float]
     side: int
@@ -328,20 +331,18 @@ class _Compared:
             copies=measured.copies.get(one.name, 0),
             lasting=measured.lasting,
         )
-        block = series_block(session, probes, frame, self.asked, moved, self._thicker(one))
-        return _Part(view=_view(one, frame, measured.summaries[one.name]), block=block, probes=probes)
-
-    def _thicker(self, one: SeriesModel) -> dict[str, Moved]:
-        """What a scene with one material thicker would show in a series, by material; empty where there is none."""
-        if one.session.series.kind != "object":
-            return {}
-        result: dict[str, Moved] = {}
-        for material in one.session.request.thickness_mm or {}:
-            scene = self.thicker[one.session.series.scene, material]
-            changed = self.measured.expected.model.expect(replace(one.session.request, thickness_mm=scene))
-            moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
-            result[material] = moved, expected_scalars(changed, one.context)
-        return result
+        scenes = {
+            material: self.thicker[one.session.series.scene, material]
+            for material in one.session.request.thickness_mm or {}
+            if one.session.series.kind == "object"
+        }
+        thicker = {material: session.with_scene(one, scene, session.unchanged) for material, scene in scenes.items()}
+        nuisances = nuisances_of_series(session, probes, frame.signal_DN, thicker)
+        return _Part(
+            view=_view(one, frame, measured.summaries[one.name]),
+            block=series_block(probes, frame, self.asked, moved, nuisances),
+            probed=ProbedSeries(probes=probes, signal_DN=frame.signal_DN, thicker=scenes),
+        )
 
 
 def _view(one: SeriesModel, frame: MeanFrame, summary: SeriesSummary) -> SeriesView:
@@ -420,7 +421,14 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         skipped=compared.measured.skipped,
         missing_effects=missing,
         conditions=session.model.conditions,
-        respond=partial(_respond, session, [part.probes for part in parts], done),
+        again=AskedAgain(
+            session=session,
+            series=tuple(part.probed for part in parts),
+            # a spectrum's parameters cancel in calibrating flats to a ten thousandth, as straight lines about the base alone
+            steps=tuple(step for step in compared.steps if step.steps != "lit"),
+            done=done,
+            factors=factors,
+        ),
         side=compared.side,
         given=tuple(_as_given(item, done[effect]) for effect, item in compared.had.items()),
     )
@@ -463,7 +471,7 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
     """Responses (probe,) to nuisances by name: what calibration fitted, and what series have of their own."""
     columns: Columns = {}
     first = sum(len(variant.strengths) for variant in compared.variants)
-    last = len(compared.asked) - len(compared.had)
+    last = first + len(compared.steps)
     for item, response in zip(compared.asked[first:last], responses[first:last], strict=True):
         if not item.failed:
             columns[item.change.label] = response / item.change.step_sd
@@ -472,7 +480,7 @@ def _factors(blocks: Sequence[SeriesBlock], responses: NDArray[np.float64], comp
         for name, column in block.nuisances.items():
             columns.setdefault(name, np.zeros(responses.shape[1]))[start : start + len(block)] += column
         start += len(block)
-    return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}
+    return notable(columns)
 
 
 def _of_quanta() -> dict[str, str]:
@@ -517,44 +525,6 @@ def _curves(
     return curves, chosen, missing
 
 
-def _respond(
-    session: SessionModel,
-    probes: Sequence[SeriesProbes],
-    done: Mapping[str, NDArray[np.float64]],
-    variants: Sequence[Variant],
-    wanted: NDArray[np.bool_] | None = None,
-) -> dict[int, NDArray[np.float64]]:
-    """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
-
-    done: as in `_curves`. Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
-    """
-    asked = [
-        session.ask(session.model.change(variant, strength)) for variant in variants for strength in variant.strengths
-    ]
-    responses = np.zeros((len(asked), sum(map(len, probes))))
-    start = 0
-    for one in probes:
-        if wanted is not None and not wanted[start : start + len(one)].any():
-            start += len(one)
-            continue
-        moved = [(row, found) for row, found in enumerate(session.moved(one.series, asked)) if found is not None]
-        if moved:
-            stop = start + len(one)
-            responses[[row for row, _ in moved], start:stop] = one.responses([found for _, found in moved])
-        start += len(one)
-    names = np.repeat([one.series.name for one in probes], [len(one) for one in probes])
-
-    def of(variant: Variant, rows: range) -> NDArray[np.float64]:
-        found = responses[list(rows)] + done.get(variant.effect, 0.0)
-        return np.where(np.isin(names, variant.series), found, 0.0) if variant.series else found
-
-    return {
-        number: of(variants[number], rows)
-        for number, rows in enumerate(strength_rows(variants))
-        if not any(asked[row].failed for row in rows)
-    }
-
-
 def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:
     """What effects change in each view's corrected mean frame (row, column), DN, calibration having taken in its part.
 
@@ -581,6 +551,6 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     for view in problem.views:
         change = lit(view)
         if view.session.series.kind in ("flat", "object"):
-            change = change - view.signal_DN * taken
+            change = (change - view.signal_DN * taken) / (1.0 + taken)
         result.append(np.asarray(change, dtype=np.float32))
     return result

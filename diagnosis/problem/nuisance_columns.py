@@ -1,6 +1,6 @@
 """What is no effect and may differ all the same: nuisances of one series, and what effects do by chance there.
 
-A nuisance is a response (probe,) of one prior standard deviation, not shrunk; equal names in several series are one nuisance.
+A nuisance is a response (probe,) of one prior standard deviation; equal names in several series are one nuisance.
 """
 
 import math
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...generator.line.line_state import TilePattern
 from ..model import changes as scales
+from ..model.forward_model import ForwardModel
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import autocovariance, correlation_sum
 from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
@@ -28,24 +29,25 @@ _UNKNOWN_GAIN_SD = 0.5  # relative, of the gain of a beam of unknown voltage
 _GAIN_MAP_MODES = 3  # cosines along each side
 
 
-def local_nuisances(
-    probes: SeriesProbes,
-    signal: NDArray[np.float64],
-    thicker: Mapping[str, Moved],
-    *,
-    sharp: bool,
-    beams_differ: float,
+def nuisances_of_series(
+    session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved]
 ) -> Columns:
-    """Nuisances of one series by name.
+    """Nuisances of one series by name, shrunk.
 
     Args:
+        session: all series.
         probes: of the series.
         signal: expected (row, column), DN.
         thicker: what a scene with one material thicker by THICKNESS_SD would show, by material.
-        sharp: pixels see no farther than themselves.
-        beams_differ: times more than usual from the spectral model.
     """
-    item = probes.series.session
+    columns = _of_its_own(session.model, probes, signal, thicker) | _gain_map_noise(session, probes, signal)
+    return {name: column * probes.shrink for name, column in columns.items()}
+
+
+def _of_its_own(
+    model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved]
+) -> Columns:
+    item, beams_differ = probes.series.session, model.beams_differ
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
     }
@@ -61,8 +63,8 @@ def local_nuisances(
     if item.series.kind == "object":
         dy, dx = gradient(signal)
         columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
-        images |= _of_scene(item, dy, dx, sharp=sharp)
-        if sharp:
+        images |= _of_scene(item, dy, dx, sharp=model.sharp)
+        if model.sharp:
             images |= _between_points(item, signal)
     return columns | _projected(probes, images)
 
@@ -330,7 +332,7 @@ def _of_thickness(
     return columns
 
 
-def gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
+def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
     """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
 
     Empty where the series has no part in it: without calibrating flats, before the beam, for those that calibrate, and where the

@@ -6,16 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
 from ..inference.observed import Point
-from ..inference.seen import Blocks, Responder
+from ..inference.seen import Blocks
 from ..model.changes import Variant
 from ..model.curves import Curve
 from ..probes.probes import ProbeName
 from ..session.even_maps import Map
 from ..session.session import SessionSeries
 from ..session.summaries import SeriesSummary
+from .asked_again import AskedAgain
 
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
 
@@ -44,8 +46,8 @@ class Problem:
     series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
     part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
     calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
-    cannot be judged here and why; conditions of the session that effects know; respond asks the forward model for further
-    variants; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
+    cannot be judged here and why; conditions of the session that effects know; again asks the forward model
+    once more; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
     the residual: what they do, at their strengths.
     """
 
@@ -70,7 +72,7 @@ class Problem:
     skipped: tuple[str, ...]
     missing_effects: dict[str, str]
     conditions: dict[str, float]
-    respond: Responder
+    again: AskedAgain | None
     side: int = 1
     given: tuple[Point, ...] = ()
 
@@ -117,15 +119,13 @@ class Problem:
 
     @property
     def places(self) -> NDArray[np.intp]:
-        """Place of each probe (probe,): one axis of one series."""
-        axes = {axis: number for number, axis in enumerate(dict.fromkeys(name.axis for name in self.names))}
-        return np.array(
-            [
-                int(series) * len(axes) + axes[name.axis]
-                for series, name in zip(self.series_of, self.names, strict=True)
-            ],
-            dtype=np.intp,
+        """Place of each probe (probe,): one axis of one series, or what one effect alone can make there: it is read exactly."""
+        exact = {name for effect in EFFECTS.values() if effect.reading.sd == 0.0 for name in effect.reading.probes}
+        kinds = [name.statistic if name.statistic in exact else name.axis for name in self.names]
+        _, found = np.unique(
+            [f"{series} {kind}" for series, kind in zip(self.series_of, kinds, strict=True)], return_inverse=True
         )
+        return np.asarray(found, dtype=np.intp)
 
     @property
     def asked_in_blocks(self) -> Blocks:
@@ -137,12 +137,25 @@ class Problem:
         return Blocks(of=self.blocks, costs=costs)
 
     def released(self) -> "Problem":
-        """Without the frames' projections that `respond` holds."""
+        """Without the frames' projections, so that nothing can be asked again."""
+        return replace(self, again=None)
 
-        def spent(asked: Sequence[Variant], wanted: NDArray[np.bool_] | None = None) -> dict[int, NDArray[np.float64]]:
-            raise RuntimeError(f"{len(asked)} variants asked of a problem whose projections were released")
+    def respond(
+        self, variants: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None
+    ) -> Mapping[int, NDArray[np.float64]]:
+        """Responses (strength, probe) of further variants, see `AskedAgain.respond`."""
+        return self._open.respond(variants, wanted)
 
-        return replace(self, respond=spent)
+    def with_nuisances_beside(self, effects: Sequence[AppliedEffect]) -> "Problem":
+        """With nuisances as they act where effects have been found, see `AskedAgain.factors_with`."""
+        factors = self._open.factors_with(effects)
+        return replace(self, factors=np.stack(list(factors.values()), axis=1), factor_names=tuple(factors))
+
+    @property
+    def _open(self) -> AskedAgain:
+        if self.again is None:
+            raise RuntimeError("asked of a problem whose projections were released")
+        return self.again
 
     def with_variants(self, more: Sequence[tuple[Variant, NDArray[np.float64]]]) -> "Problem":
         """With further variants and their responses (strength, probe)."""

@@ -11,7 +11,7 @@ from ...generator.effects import EFFECTS
 from ...generator.line.line_state import TilePattern, between_lines
 from ..model import changes as scales
 from ..model.changes import Variant
-from ..model.responses import Asked, Moved, SessionModel
+from ..model.responses import Asked, Moved
 from ..probes.probes import ProbeName
 from ..probes.scalar_context import time_templates
 from ..session.session import SessionSeries
@@ -19,9 +19,7 @@ from .nuisance_columns import (
     Columns,
     changed_gain_pattern,
     changed_tiles,
-    gain_map_noise,
     level_of,
-    local_nuisances,
     noise_of_lines,
     offset_of_later,
     uneven,
@@ -62,27 +60,22 @@ class SeriesBlock:
 
 
 def series_block(
-    session: SessionModel,
     probes: SeriesProbes,
     frame: MeanFrame,
     asked: Sequence[Asked],
     moved: Sequence[Moved | None],
-    thicker: dict[str, Moved],
+    nuisances: Columns,
 ) -> SeriesBlock:
     """One series in numbers.
 
     Args:
-        session: all series as the base twin expects them.
         probes: of this series.
         frame: its mean frame against the model.
         asked: changes.
         moved: what each does to this series.
-        thicker: what its scene with one material thicker by THICKNESS_SD would show, by material.
+        nuisances: responses (probe,) by name.
     """
     signal, shrink = frame.signal_DN, probes.shrink
-    nuisances = local_nuisances(
-        probes, signal, thicker, sharp=session.model.sharp, beams_differ=session.model.beams_differ
-    ) | gain_map_noise(session, probes, signal)
     responses = np.zeros((len(asked), len(probes)))
     known = [(number, found) for number, found in enumerate(moved) if found is not None]
     if known:
@@ -106,7 +99,7 @@ def series_block(
         residual=probes.residual(frame.residual_DN),
         sd=probes.sd,
         noise=probes.noise,
-        nuisances={name: column * shrink for name, column in nuisances.items()},
+        nuisances=nuisances,
         responses=responses,
         offset=offset_of_later(probes) * shrink,
         pattern=pattern * shrink[:, None],

@@ -114,8 +114,8 @@ class Reading:
     """How the strength is read from a session.
 
     Fields: law_sd: relative standard deviation of strengths found by the fit, as lines depart from the law; probes: those that the
-    strength is defined by, where no law can be far off; sd: relative, of a strength read from these alone (None: it is fitted);
-    frame_levels (it is the rms of the frames' levels).
+    strength is defined by, where no law can be far off; sd: relative, of a strength read from these alone (None: it is fitted; 0:
+    no other effect makes any of them); frame_levels (it is the rms of the frames' levels).
     """
 
     law_sd: float = 0.12

@@ -1,0 +1,128 @@
+"""The forward model asked again once a problem stands: further variants, and nuisances where effects have been found."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...generator.effects import AppliedEffect
+from ..model.changes import Variant
+from ..model.forward_model import Change, strength_rows
+from ..model.responses import Asked, SessionModel
+from ..session.even_maps import full_size
+from .nuisance_columns import Columns, nuisances_of_series
+from .series_probes import SeriesProbes
+
+_LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
+Thicker = Mapping[str, Mapping[str, NDArray[np.floating]]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbedSeries:
+    """One series as the base twin expects it, and what its numbers are.
+
+    Fields: probes; signal_DN (row, column): expected, corrected; thicker: thickness maps of its scene with one material thicker by
+    THICKNESS_SD, by that material.
+    """
+
+    probes: SeriesProbes
+    signal_DN: NDArray[np.floating]
+    thicker: Thicker
+
+    def __len__(self) -> int:
+        return len(self.probes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskedAgain:
+    """A session's forward model and the probes of its series.
+
+    Fields: session; series, in order of time; steps: of nuisances that lie in the twin; done (probe,): what the base's own effects
+    do, by id; factors (probe,): nuisances of the base, by name.
+    """
+
+    session: SessionModel
+    series: tuple[ProbedSeries, ...]
+    steps: tuple[Change, ...]
+    done: Mapping[str, NDArray[np.float64]]
+    factors: Columns
+
+    def respond(
+        self, variants: Sequence[Variant], wanted: NDArray[np.bool_] | None = None
+    ) -> dict[int, NDArray[np.float64]]:
+        """Responses (strength, probe) of further variants, by their place among them; failed ones are left out.
+
+        Series without any of the probes that are wanted (probe,) are not asked: their probes are 0.
+        """
+        model = self.session.model
+        changes = [model.change(item, strength) for item in variants for strength in item.strengths]
+        there = []
+        for item in variants:
+            if item.beside is not None and item.beside not in there:
+                there.append(item.beside)
+        asked = [self.session.ask(change) for change in (*changes, *(model.with_found([item]) for item in there))]
+        responses = np.zeros((len(asked), sum(map(len, self.series))))
+        for one, place in zip(self.series, self._places, strict=True):
+            if wanted is not None and not wanted[place].any():
+                continue
+            found = enumerate(self.session.moved(one.probes.series, asked))
+            moved = {row: item for row, item in found if item is not None}
+            if moved:
+                responses[list(moved), place] = one.probes.responses(list(moved.values()))
+        names = np.repeat([one.probes.series.name for one in self.series], [len(one) for one in self.series])
+
+        def of(variant: Variant, rows: range) -> NDArray[np.float64]:
+            found = responses[list(rows)] + self.done.get(variant.effect, 0.0)
+            if variant.beside is not None:
+                found = found - responses[len(changes) + there.index(variant.beside)]
+            return np.where(np.isin(names, variant.series), found, 0.0) if variant.series else found
+
+        return {
+            number: of(variants[number], rows)
+            for number, rows in enumerate(strength_rows(variants))
+            if not any(asked[row].failed for row in (*rows, *range(len(changes), len(asked))))
+        }
+
+    def factors_with(self, effects: Sequence[AppliedEffect]) -> Columns:
+        """Responses (probe,) to nuisances by name where effects have been found; the base's where they change nothing.
+
+        Behind a voltage that is 3 % higher there is a third more light, and a third more of it strays.
+        """
+        found = self.session.ask(self.session.model.with_found(effects))
+        columns = {name: column.copy() for name, column in self.factors.items()}
+        if found.failed:
+            return columns
+        beside = {step.label: change for step in self.steps if (change := step.beside(found.change)) is not None}
+        asked = {label: self.session.ask(change) for label, change in beside.items()}
+        for one, place in zip(self.series, self._places, strict=True):
+            for name, column in self._of_series(one, found, asked).items():
+                columns.setdefault(name, np.zeros(len(next(iter(columns.values())))))[place] = column
+        return notable(columns)
+
+    @property
+    def _places(self) -> list[slice]:
+        stops = np.cumsum([len(one) for one in self.series])
+        return [slice(int(stop) - len(one), int(stop)) for stop, one in zip(stops, self.series, strict=True)]
+
+    def _of_series(self, one: ProbedSeries, found: Asked, asked: Mapping[str, Asked]) -> Columns:
+        """Responses (probe,) of one series to nuisances; none where the effects do not change what it shows."""
+        at, *others = self.session.moved(one.probes.series, [found, *asked.values()])
+        if at is None or not np.any(one.probes.responses([at])):
+            return {}
+        known = {label: item for label, item in zip(asked, others, strict=True) if item is not None}
+        steps = one.probes.responses([at, *known.values()])
+        columns = {
+            label: (step - steps[0]) / asked[label].change.step_sd for label, step in zip(known, steps[1:], strict=True)
+        }
+        here = replace(one.probes, series=self.session.under(one.probes.series, found))
+        signal = np.asarray(one.signal_DN, np.float64) + full_size(at[0], one.signal_DN.shape)
+        thicker = {
+            material: self.session.with_scene(here.series, scene, found) for material, scene in one.thicker.items()
+        }
+        return columns | nuisances_of_series(self.session, here, signal, thicker)
+
+
+def notable(columns: Columns) -> Columns:
+    """Nuisances (probe,) that any probe shows."""
+    return {name: column for name, column in columns.items() if float(np.max(np.abs(column))) > _LEAST_FACTOR}

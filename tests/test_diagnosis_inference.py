@@ -19,7 +19,7 @@ from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
-from raytwin.diagnosis.inference.unknown import beyond
+from raytwin.diagnosis.inference.unknown import Families, beyond
 from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
 from raytwin.diagnosis.judgement.strengths import _outright
@@ -109,7 +109,9 @@ def seen(residual, factors=None, *, places=GROUPS, series=GROUPS):
 
 def weigh(residual, factors, chosen, **options):
     observed = seen(residual, factors)
-    return weigh_hypotheses([(observed, fit_effects(observed, chosen))], parts=GROUPS, part_names=NAMES, **options)
+    return weigh_hypotheses(
+        [(observed, fit_effects(observed, chosen))], families=Families(of=GROUPS, names=NAMES), **options
+    )
 
 
 def test_projection_gives_the_inner_product_of_the_inverse_covariance(setup):
@@ -891,7 +893,7 @@ def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unkn
     assert weigh(many, factors, chosen)[0].effects == (UNKNOWN,)
     much = residual.copy()
     much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
-    assert beyond(seen(much, factors), GROUPS, NAMES).place == "group 7"
+    assert beyond(seen(much, factors), Families(of=GROUPS, names=NAMES)).place == "group 7"
 
 
 # ---- effects in some series only

@@ -13,6 +13,7 @@ from raytwin.diagnosis.inference.discrepancy import FARTHEST_LEVEL, LEVELS
 from raytwin.diagnosis.inference.inference import Hypothesis, weigh_hypotheses
 from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed, Point
+from raytwin.diagnosis.inference.unknown import Families
 from raytwin.diagnosis.judgement.judgement import Verdict, _of_another_strength
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
@@ -81,7 +82,7 @@ def weighed(line, shown):
         given=(Point(curve=effects[0], strength=STRENGTH, level=0.1, strength_sd=0.12),),
     )
     seen = [(one, fit_effects(one, effects)) for one in map(observed.off_by, LEVELS.up_to(FARTHEST_LEVEL).levels)]
-    return weigh_hypotheses(seen, parts=GROUPS, part_names=NAMES)
+    return weigh_hypotheses(seen, families=Families(of=GROUPS, names=NAMES))
 
 
 def test_what_the_twin_has_is_no_gap(line):

@@ -14,6 +14,7 @@ from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.refine import refine
 from raytwin.diagnosis.inference.seen import Blocks
+from raytwin.diagnosis.inference.unknown import Families
 from raytwin.diagnosis.judgement.judgement import _threshold
 from raytwin.diagnosis.model.changes import catalogue_variants
 from raytwin.diagnosis.model.curves import Curve, node_weights
@@ -145,7 +146,9 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
     observed = Observed(
         residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups, series=groups
     )
-    hypotheses = weigh_hypotheses([(observed, fit_effects(observed, curves))], parts=groups, part_names=("all",))
+    hypotheses = weigh_hypotheses(
+        [(observed, fit_effects(observed, curves))], families=Families(of=groups, names=("all",))
+    )
     return refine(
         hypotheses,
         variants={(item.effect, item.name): item for item in variants},

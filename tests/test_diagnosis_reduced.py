@@ -85,9 +85,9 @@ def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
     with open_acquisition(line / "session.h5") as acquisition:
         problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
     found = np.array([name.statistic.startswith("displacement along") for name in problem.names])
-    (number,) = set(problem.parts[found])
-    assert problem.part_names[number] == "places of scenes"
-    np.testing.assert_array_equal(problem.parts == number, found)
+    (number,) = set(problem.families.of[found])
+    assert problem.families.names[number] == "places of scenes"
+    np.testing.assert_array_equal(problem.families.of == number, found)
     whitening = Whitening(problem.factors, problem.blocks)
     shared = Nuisances(whitening.factors)
 
@@ -96,7 +96,7 @@ def test_scenes_that_all_lie_elsewhere_are_seen_as_a_family_of_their_own(line):
         seen = Observed(
             residual=residual, nuisances=shared, groups=problem.groups, places=problem.places, series=problem.series_of
         )
-        return beyond(seen, problem.parts, problem.part_names)
+        return beyond(seen, problem.families)
 
     assert unknown(0.0).log_evidence < 0.0
     found_there = unknown(8.0)
@@ -658,6 +658,21 @@ def test_a_change_of_the_beam_that_one_calibrated_voltage_cannot_tell_stays_a_ti
     assert at["filtration_error"] < 0.6
     if answer["verdict"] == "ambiguous":
         assert "A change is told by what was measured before it as well" in answer["next_measurement"]["text"]
+
+
+def test_what_one_effect_alone_can_make_is_a_place_of_its_own(line):
+    """Noise of lines, however its law is off, makes no frame the copy of another."""
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+    copies = np.array([name.statistic == "repeated frames" for name in problem.names])
+    assert copies.any()
+    places, series = problem.places, problem.series_of
+    for number in np.flatnonzero(copies):
+        assert np.count_nonzero(places == places[number]) == 1
+    others = [name.axis for name in problem.names]
+    for number in np.flatnonzero(~copies):
+        alike = np.flatnonzero(~copies & (places == places[number]))
+        assert {(series[one], others[one]) for one in alike} == {(series[number], others[number])}
 
 
 def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):

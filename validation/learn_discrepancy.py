@@ -80,8 +80,7 @@ def told_by_law(weighed: Weighed, fit: CurveFit, *, another: bool = False) -> di
     """
     by_level = fit.at_any_strength if another else fit.by_level
     point = fit.at_level(LEVELS.levels[-1] if another else fit.level)
-    parts = {"parts": weighed.problem.parts, "part_names": weighed.problem.part_names}
-    evidence, ratio = evidence_with_rest(weighed.observed, [point], **parts, another=another)
+    evidence, ratio = evidence_with_rest(weighed.observed, [point], families=weighed.problem.families, another=another)
     return {"by_level": list(by_level), "with_rest": evidence, "ratio": ratio}
 
 

@@ -18,14 +18,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, interval_of, log_mean_exp
 from .discrepancy import LEVELS, at_most_off, log_frequency, log_rest
 from .observed import Observed, Point
 from .pairs import Single, left_by_the_stronger, left_in_place, log_prior, weigh_pairs
-from .unknown import LOG_DENSITY, Beyond, beyond
+from .unknown import LOG_DENSITY, Beyond, Families, beyond
 
 UNKNOWN = "unknown_effect"
 _WITH_REST = 3  # effects, and pairs, the likeliest, whose rest is looked at
@@ -65,8 +64,7 @@ class Priors:
 def weigh_hypotheses(
     seen: Sequence[tuple[Observed, Sequence[CurveFit]]],
     *,
-    parts: NDArray[np.intp],
-    part_names: Sequence[str],
+    families: Families,
     priors: Priors | None = None,
     of_catalogue: int = 0,
     rests: bool = True,
@@ -81,7 +79,7 @@ def weigh_hypotheses(
         seen: standardised probes less the twin's with what may vary, and the fits of each effect's curves to it; several curves of
             one effect are variants with equal prior. Several of these for several levels by which laws of the twin's own effects may
             be off, over which the evidence is averaged.
-        parts, part_names: families of probes (probe,) in which an unknown effect may show.
+        families: of probes, in which an unknown effect may show.
         priors: of the kinds of hypothesis.
         of_catalogue: number of effects that share the priors, those that cannot show here among them; at least those with fits.
         rests: laws may leave a rest; False: they may not, a first look at a third of the cost.
@@ -92,7 +90,7 @@ def weigh_hypotheses(
         # one zero for all, and how often laws are off by so much
         zero = observed.standing().log_likelihood - seen[0][0].standing().log_likelihood
         zero += log_frequency(observed.given[0].level) if len(seen) > 1 else 0.0
-        found = _weighed(observed, fits, parts, part_names, priors or Priors(), of_catalogue, rests, beside)
+        found = _weighed(observed, fits, families, priors or Priors(), of_catalogue, rests, beside)
         weighed += [(replace(item, log_evidence=item.log_evidence + zero), prior) for item, prior in found]
     return _by_effects(weighed)
 
@@ -100,8 +98,7 @@ def weigh_hypotheses(
 def _weighed(
     observed: Observed,
     fits: Sequence[CurveFit],
-    parts: NDArray[np.intp],
-    part_names: Sequence[str],
+    families: Families,
     priors: Priors,
     of_catalogue: int,
     rests: bool,
@@ -112,7 +109,7 @@ def _weighed(
     count = max(len(singles), of_catalogue, 1)
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     looked_at = _WITH_REST if rests else 0
-    left = _Rests(observed, parts, part_names)
+    left = _Rests(observed, families)
     none = left.none
     nothing = left.no_effect(rests)
     weighed = [(nothing, math.log(priors.none))]
@@ -191,15 +188,14 @@ def evidence_with_rest(
     observed: Observed,
     points: Sequence[Point],
     *,
-    parts: NDArray[np.intp],
-    part_names: Sequence[str],
+    families: Families,
     another: bool = False,
 ) -> tuple[float, float]:
     """Log evidence over none of effects at their points with a rest beside them of any length, and its length over theirs.
 
     another: they are only like these.
     """
-    rests = _Rests(observed, parts, part_names)
+    rests = _Rests(observed, families)
     evidence, found = rests.beside(points, another=another)
     return evidence, rests.ratio(points, found)
 
@@ -207,18 +203,18 @@ def evidence_with_rest(
 class _Rests:
     """What laws leave beside effects, in families of probes."""
 
-    def __init__(self, observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> None:
+    def __init__(self, observed: Observed, families: Families) -> None:
         self._observed = observed
-        self._parts = parts
-        self._names = names
-        self.none = beyond(observed.standing(), parts, names)
+        self._families = families
+        self.none = beyond(observed.standing(), families)
 
     def no_effect(self, rests: bool) -> Hypothesis:
         """What the twin has and nothing else; with `rests` the laws of that may leave a rest."""
         plain = Hypothesis(effects=(), probability=0.0, log_evidence=0.0)
         if not (rests and self._observed.given):
             return plain
-        return self._weighed(plain, [], self.none.log_evidence, self.none)
+        found = beyond(self._observed.standing(), self._families, left_by_laws=True)
+        return self._weighed(plain, [], found.log_evidence, found)
 
     def of_kind(self, hypothesis: Hypothesis, fits: Sequence[CurveFit]) -> Hypothesis:
         """A hypothesis whose laws may leave a rest; fits: of its effects, whose curves are in the first units."""
@@ -269,7 +265,7 @@ class _Rests:
             any_strength = another and self._any_strength(point.curve.effect)
             priors += log_prior(others, point, another=another, any_strength=any_strength)
             beside = beside.beside(point)
-        found = beyond(beside, self._parts, self._names)
+        found = beyond(beside, self._families, left_by_laws=True)
         evidence = self._observed.over_none(*effects) + beside.log_likelihood - alone.log_likelihood
         evidence += found.log_evidence + priors
         return evidence, found

@@ -38,8 +38,8 @@ class Observed:
 
     Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
     one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law leaves
-    nothing that shows in a series that it does not move; root (probe,): standard deviations of the probes in the units of the first
-    (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
+    nothing that shows in a series, or in a part of it, that it does not move; root (probe,): standard deviations of the probes in
+    the units of the first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
     """
 
     residual: NDArray[np.float64]

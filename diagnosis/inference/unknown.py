@@ -4,7 +4,6 @@ In how many families an unknown effect shows is not known: every number of them 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,18 @@ from .observed import Observed
 SIZES = np.geomspace(0.5, 5000.0, 14)  # standard deviations
 LOG_DENSITY = -math.log(math.log(SIZES[-1] / SIZES[0]))  # of their logarithm, where every size is as likely
 _SWEEPS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Families:
+    """Families of probes: one axis of the series of one kind and scene, or what shows in it that one effect alone can make.
+
+    Fields: of (probe,): number of each probe's family; names; exact: numbers of those in which one effect alone shows.
+    """
+
+    of: NDArray[np.intp]
+    names: tuple[str, ...]
+    exact: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,20 +41,23 @@ class Beyond:
     length: float
 
 
-def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) -> Beyond:
-    """What a residual shows beyond what may vary, in families `parts` (probe,) of probes.
+def beyond(observed: Observed, families: Families, *, left_by_laws: bool = False) -> Beyond:
+    """What a residual shows beyond what may vary, in families of probes; left_by_laws: in none in which one effect alone shows.
 
     Every family may have an extra variance tau^2, log-uniform over a grid; the evidence is that of the best combination (each
     family's tau in turn, several sweeps), its prior in it, of one family at least.
     """
     residual, nuisances = observed.residual, observed.nuisances
     factors = nuisances.full()
-    members = [np.nonzero(parts == number)[0] for number in range(len(names))]
+    members = [np.nonzero(families.of == number)[0] for number in range(len(families.names))]
+    open_ones = [
+        number for number, part in enumerate(members) if len(part) and not (left_by_laws and number in families.exact)
+    ]
     grams = np.stack([factors[part].T @ factors[part] for part in members])
     sums = np.stack([factors[part].T @ residual[part] for part in members])
     squares = np.array([float(np.sum(residual[part] ** 2)) for part in members])
     sizes = np.array([len(part) for part in members])
-    count = int(np.count_nonzero(sizes))
+    count = len(open_ones)
     grid = np.concatenate([[0.0], SIZES])
     normal = np.eye(factors.shape[1]) + grams.sum(axis=0)
     tau2 = np.zeros(len(members))
@@ -51,9 +65,8 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
     base, best = 0.0, -math.inf
     for sweep in range(_SWEEPS):
         changed = False
-        for g, part in enumerate(members):
-            if not len(part):
-                continue
+        for g in open_ones:
+            part = members[g]
             weights = 1.0 / (1.0 + tau2)
             weights[g] = 0.0
             without = normal - grams[g] / (1.0 + tau2[g])
@@ -84,7 +97,7 @@ def beyond(observed: Observed, parts: NDArray[np.intp], names: Sequence[str]) ->
     length = math.sqrt(
         sum(float(size) * float(np.sum(units[part] ** 2)) for size, part in zip(tau2, members, strict=True))
     )
-    return Beyond(log_evidence=best - base, place=str(names[place]), length=length)
+    return Beyond(log_evidence=best - base, place=families.names[place], length=length)
 
 
 def _price(shown: int, count: int) -> float:

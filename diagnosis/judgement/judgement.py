@@ -114,8 +114,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     def weigh(seen: Sequence[tuple[Observed, Sequence[CurveFit]]], *, rests: bool) -> tuple[Hypothesis, ...]:
         return weigh_hypotheses(
             seen,
-            parts=problem.parts,
-            part_names=problem.part_names,
+            families=problem.families,
             of_catalogue=len(EFFECTS),
             rests=rests,
             beside=[curve for curve in whitened if curve.beside],
@@ -174,7 +173,7 @@ def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]
         residual=whitening.apply(problem.residual_without(had)[None, :])[0],
         nuisances=Nuisances(whitening.factors),
         groups=problem.groups,
-        series=problem.series_of,
+        series=problem.left_apart,
         places=problem.places,
         given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
     )

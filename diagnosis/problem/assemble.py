@@ -17,6 +17,7 @@ from ...generator.line.twin import Twin
 from ..checks.preparation import PreparedSession
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
+from ..inference.unknown import Families
 from ..model import changes as scales
 from ..model.calibrated_maps import calibrated_maps, exposure_of
 from ..model.changes import (
@@ -42,7 +43,7 @@ from .asked_again import AskedAgain, ProbedSeries, notable
 from .known_effects import lasting, with_found
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns, nuisances_of_series
-from .problem import Problem, SeriesView
+from .problem import Problem, SeriesView, read_exactly
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, mean_frame, series_probes
 
@@ -386,15 +387,6 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
             for axis, series in of_probes
         ]
     )
-    places, place_names = _numbered(
-        [
-            # a few probes a scene, lost among its others
-            _PLACES
-            if name.statistic in (ALONG_ROWS, ALONG_COLUMNS)
-            else f"{axis} of {series.kind} {series.scene}".strip()
-            for name, (axis, series) in zip(names, of_probes, strict=True)
-        ]
-    )
     sharing, _ = _numbered([_shares_nuisances(block.session) for block in blocks])
     residual = np.concatenate([block.residual for block in blocks])
     for name, step in compared.back.items():
@@ -411,8 +403,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         noise=np.concatenate([block.noise for block in blocks]),
         groups=groups,
         group_names=group_names,
-        parts=places,
-        part_names=place_names,
+        families=_families(names, [series for _, series in of_probes]),
         blocks=sharing[series_of],
         views=tuple(part.view for part in parts),
         base=session.model.base,
@@ -452,6 +443,21 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
     sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
     return Point(curve=curve, strength=strength, level=level, strength_sd=sd)
+
+
+def _families(names: Sequence[ProbeName], series: Sequence[Series]) -> Families:
+    """Families of probes, with their names and the series that each lies in."""
+    exact = read_exactly()
+
+    def family(name: ProbeName, one: Series) -> str:
+        if name.statistic in exact:
+            return name.statistic
+        # a few probes a scene, lost among its others
+        displaced = name.statistic in (ALONG_ROWS, ALONG_COLUMNS)
+        return _PLACES if displaced else f"{name.axis} of {one.kind} {one.scene}".strip()
+
+    of, found = _numbered([family(name, one) for name, one in zip(names, series, strict=True)])
+    return Families(of=of, names=found, exact=frozenset(number for number, name in enumerate(found) if name in exact))
 
 
 def _numbered(keys: Sequence[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:

@@ -11,6 +11,7 @@ from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
 from ..inference.observed import Point
 from ..inference.seen import Blocks
+from ..inference.unknown import Families
 from ..model.changes import Variant
 from ..model.curves import Curve
 from ..probes.probes import ProbeName
@@ -43,8 +44,8 @@ class Problem:
     Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
     series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
     noise's share of each probe's standard deviation; blocks (probe,):
-    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; parts,
-    part_names: places of an unknown effect; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
+    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; families: in which an
+    unknown effect may show; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
     calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
     cannot be judged here and why; conditions of the session that effects know; again asks the forward model
     once more; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
@@ -62,8 +63,7 @@ class Problem:
     noise: NDArray[np.float64]
     groups: NDArray[np.intp]
     group_names: tuple[str, ...]
-    parts: NDArray[np.intp]
-    part_names: tuple[str, ...]
+    families: Families
     blocks: NDArray[np.intp]
     views: tuple[SeriesView, ...]
     base: Twin
@@ -119,12 +119,21 @@ class Problem:
 
     @property
     def places(self) -> NDArray[np.intp]:
-        """Place of each probe (probe,): one axis of one series, or what one effect alone can make there: it is read exactly."""
-        exact = {name for effect in EFFECTS.values() if effect.reading.sd == 0.0 for name in effect.reading.probes}
-        kinds = [name.statistic if name.statistic in exact else name.axis for name in self.names]
-        _, found = np.unique(
-            [f"{series} {kind}" for series, kind in zip(self.series_of, kinds, strict=True)], return_inverse=True
-        )
+        """Place of each probe (probe,): one axis of one series, or what one effect alone can make there."""
+        return self._numbered([name.axis for name in self.names])
+
+    @property
+    def left_apart(self) -> NDArray[np.intp]:
+        """Series of each probe (probe,), what one effect alone can make apart: a law leaves nothing where it moves nothing."""
+        return self._numbered(["" for _ in self.names])
+
+    def _numbered(self, kinds: Sequence[str]) -> NDArray[np.intp]:
+        exact = read_exactly()
+        own = [
+            name.statistic if name.statistic in exact else kind for name, kind in zip(self.names, kinds, strict=True)
+        ]
+        keys = [f"{series} {kind}" for series, kind in zip(self.series_of, own, strict=True)]
+        _, found = np.unique(keys, return_inverse=True)
         return np.asarray(found, dtype=np.intp)
 
     @property
@@ -168,3 +177,8 @@ class Problem:
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
         )
+
+
+def read_exactly() -> frozenset[str]:
+    """Statistics that one effect alone can make, by name."""
+    return frozenset(name for effect in EFFECTS.values() if effect.reading.sd == 0.0 for name in effect.reading.probes)

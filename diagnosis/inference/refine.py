@@ -89,8 +89,8 @@ class _Refinement:
             if placement is not None:
                 starts += _displaced_and_distorted(clear, self._variants, placement)
             if task.beside is not None and not task.moves_more:
-                there = self._there(task.beside)
-                starts = [(replace(variant, beside=there), fit) for variant, fit in starts]
+                stronger = self._there(task.beside)
+                starts = [(replace(variant, beside=stronger), fit) for variant, fit in starts]
         best: _Closer | None = None
         for variant, fit in starts:
             found = searched(variant, fit, seen)

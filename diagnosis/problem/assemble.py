@@ -93,8 +93,8 @@ def build_problem(
     base, cache = replace(smooth_twin(twin), effects=known), draft_cache()
     back: dict[str, float] = {}
     if spectral_point is not None and base.spectral is not None:
-        steps = (base.spectral.best - spectral_point) / spectral_sds(base.spectral)
-        back = dict(zip(base.spectral.names, map(float, steps), strict=True))
+        away = (base.spectral.best - spectral_point) / spectral_sds(base.spectral)
+        back = dict(zip(base.spectral.names, map(float, away), strict=True))
         base = replace(base, spectral=replace(base.spectral, best=spectral_point))
     conditions |= beam_conditions(base, requests, cache=cache)
     own_maps = any(item.calibrates and item.series.kind == "flat" for item in session)
@@ -103,15 +103,9 @@ def build_problem(
     expected = measured.expected
     tell("responses")
     changes = [model.change(variant, strength) for variant in variants for strength in variant.strengths]
-    steps_taken = twin_changes(model.base, spectral_steps=_NEAR_A_POINT if back else 1.0)
-    had = {item.id: item for item in model.base.effects}
-    steps = [Change.of_twin(step) for step in steps_taken]
-    steps += [
-        replace(model.change(variant, variant.strengths[0]), label=variant.name)
-        for variant in always_a_little(side=side)
-        if variant.effect not in had
-    ]
+    steps = _steps_in_twin(model, spectral_steps=_NEAR_A_POINT if back else 1.0, side=side)
     changes += steps
+    had = {item.id: item for item in model.base.effects}
     changes += [model.without(effect) for effect in had]
     unjudged = _of_quanta() if only_own_noise(session) else {}
     compared = _Compared(
@@ -119,7 +113,7 @@ def build_problem(
         asked=tuple(expected.ask(change, refused=unjudged.get(change.label, "")) for change in changes),
         had=had,
         variants=tuple(variants),
-        steps=tuple(steps),
+        steps=steps,
         thicker=_thicker_scenes(expected.series),
         back=back,
         side=side,
@@ -129,6 +123,14 @@ def build_problem(
         tell(f"responses of {one.name}")
         parts.append(compared.part(one))
     return _joined(parts, compared)
+
+
+def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:
+    """Changes of nuisances that lie in the twin; spectral_steps: as in `twin_changes`."""
+    had = {item.id for item in model.base.effects}
+    fitted = [Change.of_twin(step) for step in twin_changes(model.base, spectral_steps=spectral_steps)]
+    little = [item for item in always_a_little(side=side) if item.effect not in had]
+    return *fitted, *(replace(model.change(item, item.strengths[0]), label=item.name) for item in little)
 
 
 def problem_of(

@@ -86,17 +86,12 @@ def weigh_pairs(
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
     likely = sorted(seen.values(), key=lambda item: -item[0])[:_IN_FULL]
-    return [
-        _settled(
-            observed,
-            singles[first].best,
-            point,
-            {first: curves(first, other), other: curves(other, first)},
-            other,
-        )
-        for _, point, other in likely
-        for first in [point.curve.effect]
-    ]
+    result = []
+    for _, point, other in likely:
+        first = point.curve.effect
+        both = {first: curves(first, other), other: curves(other, first)}
+        result.append(_settled(observed, singles[first].best, point, both, other))
+    return result
 
 
 def _settled(

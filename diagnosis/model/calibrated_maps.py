@@ -14,7 +14,7 @@ from ..session.even_maps import full_size, mean_over
 from ..session.session import SessionSeries
 from ..session.summaries import FirstLook
 
-_LEAST_GAIN = 0.05  # of a pixel in use
+LEAST_GAIN = 0.05  # of a pixel in use
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +149,7 @@ def calibrated_maps(
             gain_darks[name] -= share * part
         signal = np.maximum(full_size(model.signal_DN, good.shape), 1e-9)
         gain += shares[item.name] * (looks[item.name].mean_DN - under.under(item)) / signal
-    lit = good & (gain > _LEAST_GAIN)
+    lit = good & (gain > LEAST_GAIN)
     if np.count_nonzero(lit) < LEAST_PIXELS:
         raise InputError(
             "gain map of the calibrating flats",
@@ -215,7 +215,7 @@ def _beams_of_twin(
     """Smooth shape (row, column) of the twin's flats of each lit series' beam over its gain map: a heel differs from beam to beam."""
     if len(twin.levels) < 2:
         return {}
-    in_use = good & (gain > _LEAST_GAIN)
+    in_use = good & (gain > LEAST_GAIN)
     shapes: dict[str, NDArray[np.float64]] = {}
     beams = {}
     for item in kept:

@@ -19,7 +19,7 @@ from ..session.even_maps import NOWHERE, Map, compact, mean_over
 from ..session.session import SessionSeries
 from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries, counted_copies
-from .calibrated_maps import CalibratedMaps, exposure_of
+from .calibrated_maps import LEAST_GAIN, CalibratedMaps, exposure_of
 from .changes import DUST_LIMIT
 from .defects import counting_series
 from .forward_model import Change, ForwardModel
@@ -73,6 +73,11 @@ class Absorbed:
     dark_DN: dict[float, Map] = field(default_factory=dict)
     gain: Map = field(default_factory=lambda: NOWHERE)
     lines: Lines = field(default_factory=dict)
+
+    @property
+    def divides(self) -> Map:
+        """What the gain map divides later frames by (row, column or 1, 1), over what it did before."""
+        return np.asarray(np.maximum(1.0 + self.gain, LEAST_GAIN), dtype=np.float32)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -183,7 +188,7 @@ class SessionModel:
             moved = NOWHERE
         if item.request.beam_on and bool(np.any(absorbed.gain)):
             signal = np.asarray(one.expected.signal_DN, dtype=np.float32)
-            moved = (moved - signal * absorbed.gain) / (1.0 + absorbed.gain)
+            moved = (moved - signal * absorbed.gain) / absorbed.divides
         if not item.calibrates:
             values = _with_patterns(
                 values,
@@ -213,7 +218,7 @@ class SessionModel:
         change = asked.change if one.placement is None else asked.change.found_in_place()
         changed = self.model.under(change, replace(one.session.request, thickness_mm=dict(thickness_mm)))
         moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
-        return moved / (1.0 + asked.absorbed.gain), expected_scalars(changed, one.context)
+        return moved / asked.absorbed.divides, expected_scalars(changed, one.context)
 
     def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
         """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.

@@ -188,7 +188,7 @@ class SessionModel:
             moved = NOWHERE
         if item.request.beam_on and bool(np.any(absorbed.gain)):
             signal = np.asarray(one.expected.signal_DN, dtype=np.float32)
-            moved = (moved - signal * absorbed.gain) / absorbed.divides
+            moved = np.asarray((moved - signal * absorbed.gain) / absorbed.divides, dtype=np.float32)
         if not item.calibrates:
             values = _with_patterns(
                 values,

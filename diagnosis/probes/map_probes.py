@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ._projection_loops import weigh_template
+from ._projection_loops import REACH, weigh_template
 from .probes import ProbeName
 from .registration import gradient
 
@@ -134,9 +134,13 @@ class MapProjection:
 def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Kernels (part, tap) along rows and along columns whose products add up to an autocovariance, a quarter of each as of the table.
 
-    A spread that no effect has changed is one such product.
+    A spread that no effect has changed is one such product. Lags that the table does not hold are 0: the loops
+    read REACH of them, whatever they are given.
     """
-    across, sizes, along = np.linalg.svd(table)
+    taps = np.zeros((1 + REACH, 1 + REACH))
+    known = table[: 1 + REACH, : 1 + REACH]
+    taps[: known.shape[0], : known.shape[1]] = known
+    across, sizes, along = np.linalg.svd(taps)
     parts = np.flatnonzero(sizes > 1e-12 * sizes[0])
     halves = (across[:, parts] * sizes[parts]).T, along[parts]
     rows, columns = (half.astype(np.float32) for half in halves)

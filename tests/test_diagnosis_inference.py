@@ -896,6 +896,38 @@ def test_one_family_that_is_off_by_a_little_is_no_effect_and_several_are_an_unkn
     assert beyond(seen(much, factors), Families(of=GROUPS, names=NAMES)).place == "group 7"
 
 
+def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
+    rng, factors, _ = setup
+    much = noise(rng, factors)
+    much[GROUPS == 7] += 2.5 * rng.standard_normal(20)
+    families = Families(of=GROUPS, names=NAMES, exact=frozenset({7}))
+    observed = seen(much, factors)
+    assert beyond(observed, families).place == "group 7"
+    left = beyond(observed, families, left_by_laws=True)
+    assert left.place != "group 7"
+    assert left.log_evidence < beyond(observed, families).log_evidence - 5.0
+
+
+def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one_and_beside_no_other():
+    rng = np.random.default_rng(12)
+    strong, weak, other = (replace(one, high=500.0) for one in independent((300, 1.0), (300, 1.0), (300, 1.0)))
+    changed = weak.response(1.0) * np.where(np.arange(PROBES) % 2, 1.0, -1.0)
+    beside = one_node("effect1", changed, high=500.0, variant="beside effect0", beside="effect0")
+    elsewhere = replace(beside, variant="beside effect2", beside="effect2")
+    observed = seen(100.0 * strong.response(1.0) + 60.0 * changed + rng.standard_normal(PROBES))
+    fits = fit_effects(observed, [strong, weak, other])
+
+    def leading(*more):
+        return weigh_hypotheses([(observed, fits)], families=Families(of=GROUPS, names=NAMES), beside=more)
+
+    found = next(item for item in leading(beside) if item.effects == ("effect0", "effect1"))
+    assert found.variants["effect1"].variant == "beside effect0"
+    assert found.strengths["effect1"][0] == pytest.approx(60.0, rel=0.1)
+    assert leading(beside)[0].log_evidence > leading(elsewhere)[0].log_evidence + 50.0
+    # what acts so beside another does not act so alone
+    assert all(item.variants["effect1"].variant == "" for item in leading(beside) if item.effects == ("effect1",))
+
+
 # ---- effects in some series only
 
 

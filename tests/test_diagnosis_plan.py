@@ -160,6 +160,31 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
     )
 
 
+def test_the_lesser_of_two_effects_is_asked_where_the_other_one_was_found():
+    x = np.linspace(0.0, 3.0, PROBES)
+    rng = np.random.default_rng(3)
+    of_voltage = rng.standard_normal(PROBES)
+
+    def law(parameters, strength):
+        if "length_mm" not in parameters:
+            return 4.0 * strength * of_voltage
+        return 400.0 * strength * np.exp(-((x - np.log(parameters["length_mm"])) ** 2))
+
+    variants = [
+        item
+        for item in catalogue_variants()
+        if (item.effect, item.since) == ("veiling_glare", "always") or (item.effect == "kv_error" and item.sign > 0)
+    ]
+    true = next(item.parameters["length_mm"] for item in variants if item.effect == "veiling_glare") * 1.2
+    residual = law({"length_mm": true}, 2.0) + law({}, 3.0) + rng.standard_normal(PROBES)
+    found = [item for item, _ in refined(variants, law, residual)]
+    (voltage,) = (item for item in found if item.beside is not None)
+    assert voltage.effect == "kv_error"
+    assert voltage.beside.id == "veiling_glare"
+    assert voltage.beside.parameters["strength"] == pytest.approx(2.0, rel=0.1)
+    assert voltage.beside.parameters["length_mm"] == pytest.approx(true, rel=0.1)
+
+
 def test_refinement_asks_the_series_that_tell_most_and_all_of_them_in_the_end():
     x = np.linspace(0.0, 3.0, PROBES)
 

@@ -19,7 +19,7 @@ from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
 from raytwin.diagnosis.inference.whitening import Whitening
-from raytwin.diagnosis.model.changes import catalogue_variants
+from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.diagnosis.session.session import measured_levels, read_session
@@ -673,6 +673,11 @@ def test_what_one_effect_alone_can_make_is_a_place_of_its_own(line):
     for number in np.flatnonzero(~copies):
         alike = np.flatnonzero(~copies & (places == places[number]))
         assert {(series[one], others[one]) for one in alike} == {(series[number], others[number])}
+    # nor does a law leave its shape there; all else of a series counts as one
+    apart = problem.left_apart
+    assert len(set(apart)) == len(set(series)) + np.count_nonzero(copies)
+    assert set(apart[copies]).isdisjoint(apart[~copies])
+    assert {problem.families.names[number] for number in problem.families.exact} == {"repeated frames"}
 
 
 def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):
@@ -700,6 +705,45 @@ def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):
         level = (problem.series_of == number) & np.array([name.location == "whole field" for name in problem.names])
         name = f"level of {view.session.name}"
         np.testing.assert_allclose(after[name][level], brighter * before[name][level], rtol=0.01)
+        seen += 1
+    assert seen
+
+
+def test_what_calibration_takes_in_divides_later_frames(line):
+    """A response that bends by a fifth was there when the gain map was made, at the level of its flats."""
+    variant = next(
+        item
+        for item in catalogue_variants()
+        if item.effect == "nonlinearity" and item.sign > 0 and item.since == "always"
+    )
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+        (found,) = problem.respond([replace(variant, strengths=(20.0,))])[0]
+    level = np.array([name.location == "whole field" for name in problem.names])
+    factors = dict(zip(problem.factor_names, problem.factors.T, strict=True))
+    bent = replace(problem.base, effects=(variant.applied(20.0),))
+
+    def changes(view):
+        """Light with the effect over that without."""
+        return float(
+            np.mean(LineModel(bent, use_measured_level=False).expect(view.session.request).signal_DN)
+            / np.mean(view.expected.signal_DN)
+        )
+
+    taken_in = sum(
+        problem.gain_shares[view.session.name] * changes(view)
+        for view in problem.views
+        if view.session.name in problem.gain_shares
+    )
+    seen = 0
+    for number, view in enumerate(problem.views):
+        if view.session.calibrates or view.session.series.kind != "flat":
+            continue
+        probes = level & (problem.series_of == number)
+        of_level = factors[f"level of {view.session.name}"][probes] / LEVEL_OF_SERIES_SD
+        expected = changes(view) / taken_in - 1.0
+        np.testing.assert_allclose(found[probes] / of_level, expected, rtol=0.01)
+        assert abs(changes(view) - taken_in) < 0.97 * abs(expected)  # subtracted, it would be less
         seen += 1
     assert seen
 

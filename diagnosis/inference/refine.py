@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import EFFECTS, AppliedEffect
+from ...generator.effects import EFFECTS
 from ...generator.effects.effect import Placement
 from ..model.changes import Variant
 from ..model.curves import Curve
@@ -70,11 +70,9 @@ class _Refinement:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
         seen = self._standing(task)
         if task.beside is not None:
-            if task.moves_more and not self._clear(
-                task.beside[0].effect, seen.beside(self._where(task.effect, task.own))
-            ):
+            if task.moves_more and not self._clear(task.beside[0].effect, seen.beside(self._last(task.own).point)):
                 return
-            seen = seen.beside(self._where(task.beside[0].effect, task.beside))
+            seen = seen.beside(self._last(task.beside).point)
         # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
         known = self._closer.get(task.effect) if task.moves_more else None
         if known is not None:
@@ -89,8 +87,10 @@ class _Refinement:
             if placement is not None:
                 starts += _displaced_and_distorted(clear, self._variants, placement)
             if task.beside is not None and not task.moves_more:
-                stronger = self._there(task.beside)
-                starts = [(replace(variant, beside=stronger), fit) for variant, fit in starts]
+                stronger = self._last(task.beside)
+                if not stronger.variant.series:  # what acts in some series only is not there in all
+                    there = stronger.variant.applied(stronger.strength)
+                    starts = [(replace(variant, beside=there), fit) for variant, fit in starts]
         best: _Closer | None = None
         for variant, fit in starts:
             found = searched(variant, fit, seen)
@@ -100,11 +100,12 @@ class _Refinement:
             name = fit.curve.variant if known is None else known.variant.name
             like = next(item for item in self._curves if (item.effect, item.variant) == (variant.effect, name))
             curve = curve_of(found[0], self._whole.own(found[1]), like)
-            there = seen.fit(curve)
-            if best is None or there.log_evidence > best.log_evidence:
+            at = seen.fit(curve)
+            if best is None or at.log_evidence > best.log_evidence:
                 start = replace(variant, name=name, parameters=found[0].parameters)
-                best = _Closer(start, curve, there.best, there.log_evidence)
-        if best is not None:
+                best = _Closer(start, curve, at.best, at.log_evidence)
+        # what it is beside another says nothing of it beside a third
+        if best is not None and best.variant.beside is None:
             self._closer[task.effect] = best
 
     def _standing(self, task: Task) -> Seen:
@@ -112,21 +113,11 @@ class _Refinement:
         effects = [task.effect] if task.beside is None else [task.effect, task.beside[0].effect]
         return replace(self._whole, observed=self._whole.observed.standing(*effects))
 
-    def _where(self, effect: str, grid: tuple[Curve, float]) -> Point:
-        """An effect as it was found last, its law off as usual; that of the grid before."""
-        known = self._closer.get(effect)
-        curve, strength = grid if known is None else (known.curve, known.strength)
-        return Point(curve=curve, strength=strength, level=USUAL_LEVEL)
-
-    def _there(self, grid: tuple[Curve, float]) -> AppliedEffect | None:
-        """An effect of a pair as it was found last, as the other one has it beside it; None: it acts in some series only."""
-        known = self._closer.get(grid[0].effect)
-        variant, strength = (
-            (self._variants[grid[0].effect, grid[0].variant], grid[1])
-            if known is None
-            else (known.variant, known.strength)
-        )
-        return None if variant.series else variant.applied(strength)
+    def _last(self, grid: tuple[Curve, float]) -> "_Closer":
+        """An effect as it was found last; as the grid has it before."""
+        curve, strength = grid
+        known = self._closer.get(curve.effect)
+        return known or _Closer(self._variants[curve.effect, curve.variant], curve, strength, -math.inf)
 
     def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""
@@ -142,6 +133,11 @@ class _Closer:
     curve: Curve
     strength: float
     log_evidence: float
+
+    @property
+    def point(self) -> Point:
+        """What stands there, its law off as usual."""
+        return Point(curve=self.curve, strength=self.strength, level=USUAL_LEVEL)
 
 
 def _separation(fit: CurveFit, seen: "Seen") -> float:

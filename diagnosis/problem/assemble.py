@@ -19,7 +19,7 @@ from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
 from ..model import changes as scales
-from ..model.calibrated_maps import calibrated_maps, exposure_of
+from ..model.calibrated_maps import LEAST_GAIN, calibrated_maps, exposure_of
 from ..model.changes import (
     Variant,
     always_a_little,
@@ -559,6 +559,6 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     for view in problem.views:
         change = lit(view)
         if view.session.series.kind in ("flat", "object"):
-            change = (change - view.signal_DN * taken) / (1.0 + taken)
+            change = (change - view.signal_DN * taken) / np.maximum(1.0 + taken, LEAST_GAIN)
         result.append(np.asarray(change, dtype=np.float32))
     return result

@@ -15,10 +15,8 @@ from ..generator.line.twin import BAD_PIXEL_CODES, BAD_PIXEL_MAP, Twin
 from ..generator.twins.twin_answer import calibration_answer
 from ..spectra import (
     DEFAULT_ANGLE_DEG,
-    DEFAULT_MODEL,
     MAXIMUM_KV_OF_ANODE,
     MINIMUM_KV,
-    MODELS,
     Spectrum,
     energy_grid_keV,
     tube_fluence_interpolated,
@@ -173,15 +171,13 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
         return  # whatever is wrong is said where it belongs
     tell("spectra")
     # the finest of SpekPy's spectra, where the lines lie, takes most and comes first
-    for name in MODELS:
-        tube_fluence_interpolated(
-            measured[0],
-            energies_keV=energy_grid_keV(measured[0]),
-            anode=anode,
-            anode_angle_deg=acquisition.instrument.anode_angle_deg or DEFAULT_ANGLE_DEG,
-            model=name,
-            for_sums=name == DEFAULT_MODEL,
-        )
+    tube_fluence_interpolated(
+        measured[0],
+        energies_keV=energy_grid_keV(measured[0]),
+        anode=anode,
+        anode_angle_deg=acquisition.instrument.anode_angle_deg or DEFAULT_ANGLE_DEG,
+        for_sums=True,
+    )
     materials = [layer.material for item in flats for layer in item.filters]
     # as far as errors of the voltage go, their tilt between voltages, and what a varying voltage takes to both sides
     farthest = -PRIORS["kV_error"].low + 6.0 * PRIORS["kV_tilt"].sd + KV_STEP
@@ -195,9 +191,7 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
         for kV, largest in wanted.items():
             samples[:, model.names.index("kV_error")] = np.linspace(-largest, largest, len(samples))
             if kV <= model.highest_kV:
-                model.log_derivatives(
-                    samples, OpenBeam(kV=kV, filters=stack), ["spectrum_model", *_shares(model.names)]
-                )
+                model.log_derivatives(samples, OpenBeam(kV=kV, filters=stack), _shares(model.names))
 
 
 def _shares(names: Sequence[str]) -> list[str]:

@@ -76,8 +76,10 @@ PRIORS: dict[str, Prior] = {
         high=0.0,
         reason="light only, 0.8-1: escape of K photons, which takes CsI and Gd2O2S screens down to 0.7, is in the response",
     ),
-    "spectrum_model": Prior(
-        centre=0.5, sd=0.5, reason="SpekPy's casim is 0, its kqp 1: mean and sd of the two, taken as equally likely"
+    "end_exponent": Prior(
+        centre=-0.06,
+        sd=0.08,
+        reason="fall to the end point: mean and sd of SpekPy's six models (0 to -0.2); PTB's spectra want -0.08 to -0.13",
     ),
     "yield_exponent": Prior(
         centre=0.0,
@@ -206,10 +208,8 @@ MEASURED_SPECTRUM: dict[str, Prior] = {
     "inherent_filtration_mm_Al": Prior(
         centre=0.0, sd=0.1, low=0.0, high=12.0, reason="beyond the measured spectrum: its own error, as mm Al"
     ),
-    "spectrum_model": Prior(
-        centre=0.0,
-        sd=0.3,
-        reason="the models' difference is in the measured spectrum; what differs between voltages stays",
+    "end_exponent": Prior(
+        centre=0.0, sd=0.04, reason="in the measured spectrum up to 0.85 of its kV; the end beyond it stays"
     ),
     "hardness_exponent": Prior(
         centre=0.0, sd=0.03, reason="of the measured spectrum: the spectrometer's own efficiency"

@@ -41,7 +41,7 @@ def truth(model):
         "log_DN_per_keV": math.log(0.1),
         "log_swank": math.log(0.9),
         "kV_error": 0.004,
-        "spectrum_model": 0.5,
+        "end_exponent": -0.05,
     }
     full = np.zeros(len(model.names))
     for name, value in values.items():

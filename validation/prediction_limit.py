@@ -254,7 +254,7 @@ def prior_sd() -> dict[str, float]:
         "hardness": "hardness_exponent",
         "hardness tilt": "hardness_tilt",
         "roughness": "anode_roughness_um",
-        "model": "spectrum_model",
+        "end point": "end_exponent",
         "escape": "escape_scale",
         "scintillator table": "scintillator_table",
         "cover": "cover_mm_C",
@@ -333,7 +333,7 @@ class Forward:
             # light counts twice in the square
             rows[name] = np.array([once[0], once[0] + 2.0 * once[1]])
         rows["swank exponent"] = np.array([0.0, -by(np.log(energy / 50.0)).sum()])
-        rows["model"] = by(_other_spectrum_model(kV, self.system.anode_angle_deg, energy))
+        rows["end point"] = by(np.log(2.0 * np.maximum(1.0 - energy / kV, 0.02)))
         for material in ("Al", "Cu"):
             thickness = sum(layer.thickness_mm for layer in filters if layer.material == material)
             depth = _mu_per_mm(material, energy) * thickness
@@ -428,21 +428,6 @@ def _other_attenuation(material: str, table: str, energy_keV: Array) -> Array:
         ratio = np.asarray(values) * composition(material)[1] / 10.0 / _mu_per_mm(material, energy_keV)
         _KEPT[key] = np.clip(ratio - 1.0, -0.1, 0.1)
     return _KEPT[key]
-
-
-def _other_spectrum_model(kV: float, anode_angle_deg: float, energy_keV: Array) -> Array:
-    """Logarithm of SpekPy's casim over its kqp at a whole kV, on the lab's energies; constant beyond the end."""
-    key = (kV, anode_angle_deg)
-    if key not in _KEPT:
-        import spekpy
-
-        both = [
-            spekpy.Spek(kvp=kV, th=anode_angle_deg, dk=0.5, physics=model, targ="W").get_spectrum(edges=False)
-            for model in ("casim", "kqp")
-        ]
-        seen = (both[0][1] > 0) & (both[1][1] > 0)
-        _KEPT[key] = np.array([both[0][0][seen], np.clip(np.log(both[0][1][seen] / both[1][1][seen]), -0.15, 0.15)])
-    return np.interp(energy_keV, *_KEPT[key])
 
 
 def information_limit(

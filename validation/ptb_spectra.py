@@ -2,6 +2,7 @@
 
     python validation/ptb_spectra.py FOLDER [--json FILE]
     python validation/ptb_spectra.py --qualities [--json FILE]
+    python validation/ptb_spectra.py --models [--json FILE]
 
 FOLDER holds W_20kV.dat ... W_45kV.dat (Ketelhut and Bueermann, PTB, CC BY 4.0: germanium detector, 4 mm Be, 30 degrees,
 1 m of air). The model is SpekPy's casim behind 4 mm Be and 1 m of air and one parameter more. It is fitted on two
@@ -15,6 +16,10 @@ know a combination of the two and not which it is.
 `--qualities` takes PTB's catalogue of beam qualities (Ankerhold 2000, PTB-Dos-34, 30 to 150 kV, as SpekPy ships it): half-value
 layers in Al and Cu and mean energies, and which hardness exponent or how much tungsten each wants of either of SpekPy's models.
 The priors `hardness_exponent`, `hardness_tilt` and `anode_roughness_um` have their widths from both.
+
+`--models` compares SpekPy's six models with casim: which hardness exponent and which exponent of 1 - E / kV turn casim's
+bremsstrahlung into theirs. The prior `end_exponent` has its mean and width from these, and from what PTB's spectra want of it beside
+tungsten (printed with FOLDER).
 """
 
 import argparse
@@ -48,6 +53,9 @@ DECLARED = (Filter(material="Be", thickness_mm=4.0), Filter(material="air", thic
 ANODE_ANGLE_DEG = 30.0
 REFERENCE_KEV = 50.0
 BOUND_TOGETHER = 0.95
+BELOW_END = 0.95  # of the kV: nearer to it a spectrometer's resolution and the voltage's ripple show
+SPEKPY_MODELS = ("kqp", "sim", "uni", "diff", "classical")
+MODELS_AT_KV = (40, 60, 90, 120)
 
 # name -> (size of a step, lowest, highest)
 PARAMETERS: dict[str, tuple[float, float, float]] = {
@@ -179,6 +187,53 @@ def compare(measured: dict[int, Spectrum]) -> dict[str, Any]:
     }
 
 
+def end_exponents(measured: dict[int, Spectrum]) -> dict[int, dict[str, float]]:
+    """Tungsten (um) and exponent of 1 - E / kV that bring the roots of each spectrum's shape closest, below its end."""
+    found = {}
+    for kV, spectrum in measured.items():
+        energies = spectrum.energies_keV[spectrum.energies_keV > ABOVE_KEV]
+        below = energies < BELOW_END * kV
+
+        def misfit(
+            x: NDArray[np.float64],
+            spectrum: Spectrum = spectrum,
+            energies: Any = energies,
+            below: Any = below,
+            kV: int = kV,
+        ) -> NDArray[np.float64]:
+            model = modelled_shape(spectrum, {"tungsten_um": max(float(x[0]), 1e-6)}) * (
+                np.maximum(1.0 - energies / kV, 1e-3) ** float(x[1])
+            )
+            return np.asarray((np.sqrt(model / model.sum()) - np.sqrt(shape(spectrum)))[below])
+
+        answer = least_squares(misfit, [0.3, 0.0], diff_step=1e-3)
+        found[kV] = {"tungsten_um": float(answer.x[0]), "end_exponent": float(answer.x[1])}
+    return found
+
+
+def compare_models() -> list[dict[str, Any]]:
+    """Exponents of E and of 1 - E / kV that turn casim's bremsstrahlung into another model's, from 0.3 to 0.97 of the kV."""
+    import spekpy
+
+    rows = []
+    for model in SPEKPY_MODELS:
+        for kV in MODELS_AT_KV:
+            both = [
+                spekpy.Spek(kvp=kV, th=12, dk=0.5, physics=name, targ="W").get_spectrum(char=False)
+                for name in ("casim", model)
+            ]
+            share = both[0][0] / kV
+            seen = (share > 0.3) & (share < 0.97)
+            terms = np.stack([np.ones(seen.sum()), np.log(share[seen]), np.log(1.0 - share[seen])], axis=1)
+            ratio = np.log(both[1][1] / both[0][1])[seen]
+            solved = np.linalg.lstsq(terms, ratio, rcond=None)[0]
+            left = float(np.sqrt(np.mean((ratio - terms @ solved) ** 2)))
+            rows.append(
+                {"model": model, "kV": kV, "hardness": float(solved[1]), "end": float(solved[2]), "left_rms": left}
+            )
+    return rows
+
+
 def compare_qualities(model: str) -> list[dict[str, Any]]:
     """What PTB's beam qualities want of a tube model, by quantity and range of kV: rms error, hardness, tungsten.
 
@@ -244,7 +299,23 @@ def main() -> int:
     )
     parser.add_argument("--json", type=Path, help="also write the answer here")
     parser.add_argument("--qualities", action="store_true", help="PTB's beam qualities instead, which come with SpekPy")
+    parser.add_argument("--models", action="store_true", help="SpekPy's models beside casim instead")
     arguments = parser.parse_args()
+    if arguments.models:
+        rows = compare_models()
+        for row in rows:
+            print(
+                f"{row['model']:9s} {row['kV']:>3} kV: hardness {row['hardness']:+.3f}, end {row['end']:+.3f}, left"
+                f" {100 * row['left_rms']:.1f} % rms"
+            )
+        ends = [0.0, *(np.mean([row["end"] for row in rows if row["model"] == name]) for name in SPEKPY_MODELS)]
+        print(
+            f"exponents of 1 - E / kV of the six: mean {np.mean(ends):.3f}, standard deviation {np.std(ends, ddof=1):.3f}"
+        )
+        if arguments.json is not None:
+            arguments.json.parent.mkdir(parents=True, exist_ok=True)
+            arguments.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+        return 0
     if arguments.qualities:
         table = [row for model in MODELS for row in compare_qualities(model)]
         for row in table:
@@ -264,7 +335,8 @@ def main() -> int:
     if missing:
         print(f"skipped: {', '.join(missing)} not in {arguments.folder}", file=sys.stderr)
         return 0
-    answer = compare({kV: spectrum_from_file(path) for kV, path in files.items()})
+    measured = {kV: spectrum_from_file(path) for kV, path in files.items()}
+    answer = compare(measured) | {"end_exponents": end_exponents(measured)}
     rows = answer["rows"]
     bare = rows["none"]["error_each_kV"]
     print("nothing fitted: " + ", ".join(f"{kV} kV {error:.3f}" for kV, error in bare.items()))
@@ -276,6 +348,10 @@ def main() -> int:
                 f"{name:18s} {middle:8.3g} ({low:.3g} to {high:.3g} over {row['pairs']} pairs), error at the other kV: "
                 f"median {error['median']:.4f}, worst pair {error['worst']:.4f}"
             )
+    for kV, found in answer["end_exponents"].items():
+        print(
+            f"{kV} kV: {found['tungsten_um']:.2f} um of tungsten and an exponent of 1 - E / kV of {found['end_exponent']:+.3f}"
+        )
     print("correlation when two are fitted together:")
     for pair, value in answer["correlation"].items():
         print(f"  {pair}: {value:+.3f}" + ("   known only together" if pair in answer["not_told_apart"] else ""))

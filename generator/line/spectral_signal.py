@@ -3,14 +3,14 @@
 Per mAs, at distance d, on a pixel of pitch a (mean deposited energy m1(E), its mean square m2(E), interacting
 fraction D(E)):
 
-    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (Phi' / Phi)^s exp(-sum mu t) (1000 / d)^2 a^2
+    N(E)    = kappa Phi(E; kV (1 + e)) (kV / 60)^x (E / 50)^(h + u ln(kV / 60)) (2 - 2 E / kV)^s exp(-sum mu t) (1000 / d)^2 a^2
     signal  = gamma sum N c l m1    gain = (gamma / A_S) sum N c l^2 m2 (E / 50)^-w / sum N c l m1    absorbed = sum N c D
 
-for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, Phi' the
-other of SpekPy's models, e = kV_error + kV_tilt ln(kV / 60), and mu that of xraylib moved by shares of its differences to two
-other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)). The layers t are those in the beam, the inherent
-filtration, and micrometres of the anode's own metal (a rough or worn anode). A tube voltage that varies during an exposure, by
-a relative variance v about its mean, adds v / 2 kV^2 d2 Phi / d kV2.
+for energy-integrating detectors; a counting detector has m1 = m2 = D and l = 1. gamma is in DN per keV absorbed, s how much
+steeper than SpekPy's a spectrum falls to its end point (E below 0.98 kV), e = kV_error + kV_tilt ln(kV / 60), and mu that of
+xraylib moved by shares of its differences to two other tables: mu (1 + c (Chantler / xraylib - 1) + p (PENELOPE / xraylib - 1)).
+The layers t are those in the beam, the inherent filtration, and micrometres of the anode's own metal (a rough or worn anode). A
+tube voltage that varies during an exposure, by a relative variance v about its mean, adds v / 2 kV^2 d2 Phi / d kV2.
 
 c(E) is what covers, glue and dead layers let through, l(E) the light for each keV that stays, over that at 50 keV: the
 scintillator's own (`spectra.light_per_keV`), a power of energy, and the depth at which photons of each energy are stopped
@@ -55,7 +55,7 @@ FIXED_PARAMETERS = (
     "yield_exponent",
     "hardness_exponent",
     "kV_tilt",
-    "spectrum_model",
+    "end_exponent",
     "escape_scale",
     "scintillator_table",
     "anode_roughness_um",
@@ -94,6 +94,8 @@ KV_STEP = 0.02  # relative, of the second difference that a varying voltage take
 _TILT_STEP = 0.002  # relative, of the derivative by the voltage: both sides of a node
 _LOG_THICKNESS = np.linspace(-1.6, 1.6, 33)  # nodes of the scintillator thickness
 _LARGEST_DEPARTURE = 0.1  # between attenuation tables; more is an edge at another place
+_NEAREST_TO_END = 0.02  # of the kV: nearer to the end point it is the voltage that shapes a spectrum
+_OTHER_MODEL = "spectrum_model"  # of twins calibrated before 0.3: a share of the other of SpekPy's models
 _LARGEST_MODEL_RATIO = 0.15  # logarithm of one spectrum model over the other; more is the last bin at the end point
 _Term = tuple[NDArray[np.float64], NDArray[np.float64]]  # error of the tube voltage, relative, and weight (draw,) each
 _DRAWS_KEPT = 4  # sets of draws whose moments a model remembers: a twin asks with the same ones again and again
@@ -376,7 +378,7 @@ class SpectralModel:
                 if name in self._index:
                     factors.append(amount * self._column(samples, name))
                     rows.append(-depth * self._departure(material, table)[:top])
-        for name in ("hardness_exponent", "hardness_tilt", "spectrum_model", "anode_roughness_um"):
+        for name in ("hardness_exponent", "hardness_tilt", "end_exponent", _OTHER_MODEL, "anode_roughness_um"):
             row = self._row_of(name, beam, top) if name in self._index else None
             if row is not None:
                 factors.append(self._column(samples, name))
@@ -681,7 +683,9 @@ class SpectralModel:
             return np.log(self.energies_keV[:top] / REFERENCE_KEV)
         if name == "hardness_tilt":
             return math.log(beam.kV / REFERENCE_KV) * np.log(self.energies_keV[:top] / REFERENCE_KEV)
-        if name == "spectrum_model":
+        if name == "end_exponent":
+            return np.log(2.0 * np.maximum(1.0 - self.energies_keV[:top] / beam.kV, _NEAREST_TO_END))
+        if name == _OTHER_MODEL:
             return self._towards_other_model(beam.kV)[:top]
         if name == "anode_roughness_um":
             return -1e-3 * _levelled(self.mu(self.anode), self.energies_keV)[:top]

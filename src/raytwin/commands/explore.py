@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..explore.seen_size import read_networks_observer
     from ..explore.state import first_state
     from ..explore.view import Explorer
-    from ..spectra import MODELS, is_packaged
+    from ..spectra import is_packaged
 
     twin = as_twin(arguments.twin)
     networks = None
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     pods = [read_known_pod(path) for path in arguments.pod]
     explorer = Explorer(twin, name=arguments.twin, pods=pods, networks=networks)
     tube = twin.spectral
-    if tube is not None and not all(is_packaged(tube.anode, tube.anode_angle_deg, model) for model in MODELS):
+    if tube is not None and not is_packaged(tube.anode, tube.anode_angle_deg, tube.model):
         say(
             f"warning: no spectra are packaged for {tube.anode} at {tube.anode_angle_deg:g} degrees: a voltage that nobody"
             " asked for before takes seconds, once"

@@ -9,10 +9,10 @@ from threadpoolctl import threadpool_limits
 from ..acquisition.acquisition_io import AcquisitionFile
 from ..errors import InputError
 from ..generator.line.twin import Twin
-from .checks.preparation import calibrated_twin, mislabelled, prepare_session
+from .checks.preparation import calibrated_twin, mislabelled, prepare_session, suspects_left
 from .checks.readings import Suspect
 from .inference.inference import UNKNOWN, Hypothesis
-from .judgement.answer import EXPLAINED, Diagnosis, in_pixels
+from .judgement.answer import Diagnosis, in_pixels
 from .judgement.judgement import judge
 from .problem.assemble import problem_of
 from .session.coarse import unseen_in_squares
@@ -62,14 +62,14 @@ def _diagnosed(
             raise mislabelled(acquisition, session.suspects) from error
         raise
     result = replace(result, warnings=(*session.left_out, *result.warnings), notes=(*session.notes, *result.notes))
-    cleared = [item for item in session.suspects if _clears(result, item)]
-    notes = tuple(
-        f"{item.text}, or with {' and '.join(result.named)}, which explains the rest as well" for item in cleared
-    )
-    result = replace(result, notes=(*result.notes, *notes))
-    suspects = tuple(item for item in session.suspects if item not in cleared)
+    suspects = session.suspects
+    if suspects and result.added:
+        suspects = suspects_left(session, problem.explained_by(result.added))
     if suspects:
         result = _doubted(result, session.twin, suspects)
+    elif session.suspects:
+        cleared = (f"{item.text}; what was found makes it look so" for item in session.suspects)
+        result = replace(result, notes=(*result.notes, *cleared))
     if session.factor == 1:
         return result
     if twin is None:
@@ -77,11 +77,6 @@ def _diagnosed(
             progress("calibration with all pixels")
         twin = calibrated_twin(session.all_pixels, rng=rng)
     return in_pixels(result, twin=twin, factor=session.factor)
-
-
-def _clears(diagnosis: Diagnosis, suspect: Suspect) -> bool:
-    """Whether an explanation of the whole session says why a label looks wrong."""
-    return diagnosis.verdict in EXPLAINED and not set(suspect.or_effects).isdisjoint(diagnosis.named)
 
 
 def _doubted(diagnosis: Diagnosis, twin: Twin, suspects: tuple[Suspect, ...]) -> Diagnosis:

@@ -12,7 +12,7 @@ from raytwin.cli import main
 from raytwin.diagnosis.checks.label_suspects import LEAST_EVIDENCE
 from raytwin.diagnosis.checks.map_suspects import _inherent_mm_Al, _scaled
 from raytwin.diagnosis.checks.plausibility import check_plausibility
-from raytwin.diagnosis.checks.readings import _without_common, reading_of
+from raytwin.diagnosis.checks.readings import Explained, _without_common, reading_of
 from raytwin.diagnosis.session.session import calibrating_names
 
 SIZE = ["--size", "48", "--frames", "10"]
@@ -252,6 +252,30 @@ def test_output_of_the_tube_is_no_noise_of_an_object_that_covers_half_the_field(
         assert np.mean(values**2) == pytest.approx(wanted, rel=4.0 * np.sqrt(2.0 / values.size) + 2.0 / 4800)
 
 
+def test_what_an_explanation_does_to_frames_makes_no_label_look_wrong(changed):
+    passed = np.ones((48, 48))
+    passed[:, 24:] = 0.3
+
+    def change(file):
+        # a plate before half of the panel in the last flat, and two objects whose labels are exchanged
+        flat, dark = (file["series"][name]["frames"] for name in (FLAT_90 + "_2", "dark_25ms"))
+        dark_DN = dark[:].mean(axis=0)
+        flat[:] = np.rint(dark_DN + passed * (flat[:] - dark_DN)).astype(np.uint16)
+        exchange("product1_40kV_25ms", "product1_90kV_25ms", "kV")(file)
+
+    path = changed(change)
+    with open_acquisition(path) as acquisition:
+        names = calibrating_names(acquisition.series)
+        open_DN = next(item for item in acquisition.series if item.name == FLAT_90).read_frames(0, 8).mean(axis=0)
+        dark_DN = next(item for item in acquisition.series if item.name == "dark_25ms").read_frames(0, 8).mean(axis=0)
+        plate = Explained(mean_DN=(passed - 1.0) * (open_DN - dark_DN), variance=passed**2)
+        before = check_plausibility(acquisition, calibrating=names).suspects
+        after = check_plausibility(acquisition, calibrating=names, explained={FLAT_90 + "_2": plate}).suspects
+    blamed = [{name for item in found for name in item.series} for found in (before, after)]
+    assert FLAT_90 + "_2" in blamed[0] and "stood in the beam" in " ".join(item.text for item in before)
+    assert blamed[1] == {"product1_40kV_25ms", "product1_90kV_25ms"}
+
+
 def factors_of(*, harder=None, **wanted):
     """Suspects among scenes of two series each, 40 and 90 kV, at a distance (mm) with a factor on their path lengths.
 
@@ -272,8 +296,6 @@ def factors_of(*, harder=None, **wanted):
     for scene, factor in (harder or {}).items():
         scales[scene].append(4 * [float(np.log(factor))])
     found = _scaled(scales, placements)
-    # light that did not come straight makes paths look shorter, never longer
-    assert all((suspect.or_effects != ()) == (wanted[suspect.series[0][:7]][1] < 1.0) for suspect in found)
     return [name for suspect in found for name in suspect.series]
 
 

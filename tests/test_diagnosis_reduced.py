@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -13,8 +12,6 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.checks.plausibility import check_plausibility
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.checks.readings import Suspect
-from raytwin.diagnosis.diagnose_session import _clears
 from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
@@ -573,19 +570,6 @@ def test_a_saturated_series_is_not_judged_but_has_left_its_charge(tmp_path, brig
     loads = [item.request.previous[-1].setting.tube_load_mAs for item in (with_it[-1], without_it[-1])]
     assert loads == pytest.approx([bright_DN / 2e4, 0.1])
     assert session_conditions([with_it[-1].request])["after_s"] == pytest.approx(0.6)
-
-
-def test_an_explanation_clears_a_label_that_its_effect_makes_look_wrong():
-    like_scatter = Suspect(series=("wedge",), text="paths too long", evidence=100.0, or_effects=("object_scatter",))
-    swapped = Suspect(series=("wedge",), text="kV exchanged", evidence=100.0)
-
-    def clears(suspect, verdict, *named):
-        return _clears(SimpleNamespace(verdict=verdict, named=named), suspect)
-
-    assert clears(like_scatter, "explained", "image_lag", "object_scatter")
-    assert not clears(like_scatter, "explained", "image_lag")
-    assert not clears(like_scatter, "unknown_effect")
-    assert not clears(swapped, "explained", "object_scatter")
 
 
 @pytest.mark.slow

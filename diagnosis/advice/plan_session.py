@@ -10,7 +10,7 @@ from ...acquisition.acquisition_io import AcquisitionFile
 from ...generator.effects import EFFECTS
 from ...generator.line.twin import Twin
 from ...results import Result, Table, axes_or_new, frame, plain
-from ..checks.preparation import mislabelled, prepare_session
+from ..checks.preparation import prepare_session
 from ..problem.assemble import problem_of
 from ..session.coarse import unseen_in_squares
 from .plan import Distinguishability, distinguishability
@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 class SessionPlan(Result):
     """Which effects a session distinguishes.
 
-    Fields: distinguishability; cannot_be_judged (effect -> reason).
+    Fields: distinguishability; cannot_be_judged (effect -> reason); mislabelled: lines on series whose frames contradict a label, by
+    which the plan goes all the same.
     """
 
     distinguishability: Distinguishability
     cannot_be_judged: Mapping[str, str]
+    mislabelled: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """What `raytwin diagnose --plan --json` prints."""
@@ -42,6 +44,7 @@ class SessionPlan(Result):
                 "seen_from": found.seen_from,
                 "between": found.between,
                 "cannot_be_judged": self.cannot_be_judged,
+                "mislabelled": self.mislabelled,
             }
         )
         return answer
@@ -79,7 +82,10 @@ class SessionPlan(Result):
                 answer["effects"], answer["since"], answer["seen_from"], answer["units"], strict=True
             )
         )
-        notes = tuple(f"{effect} cannot be judged: {reason}" for effect, reason in self.cannot_be_judged.items())
+        notes = (
+            *(f"{effect} cannot be judged: {reason}" for effect, reason in self.cannot_be_judged.items()),
+            *(f"label in doubt: {line}" for line in self.mislabelled),
+        )
         title = f"{len(rows)} effects that these series can show"
         return Table(title=title, header=("effect", "since", "seen from"), rows=rows, notes=notes)
 
@@ -98,12 +104,9 @@ def plan_session(
         acquisition, twin, rng, without, progress: as `diagnose`.
 
     Raises:
-        InputError: nothing in the session can be judged, or its labels contradict the frames.
+        InputError: nothing in the session can be judged.
     """
     session = prepare_session(acquisition, twin=twin, rng=rng)
-    suspects = tuple(item for item in session.suspects if not item.or_effects)
-    if suspects:
-        raise mislabelled(acquisition, suspects)
     unseen = unseen_in_squares() if session.factor > 1 else {}
     problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
     found = distinguishability(problem)
@@ -111,4 +114,5 @@ def plan_session(
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),
         cannot_be_judged={**problem.missing_effects, **unseen},
+        mislabelled=tuple(item.text for item in session.suspects),
     )

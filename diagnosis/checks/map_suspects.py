@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ...generator.effects import EFFECTS
 from .label_model import DEEPEST, INHERENT, LabelModel, measured_depth
 from .readings import FloatArray, Reading, Suspect
 
@@ -226,9 +225,6 @@ def _scaled(
                     text=f"the thickness maps of {scene} fit its frames only if all path lengths are {math.exp(middle):.2f}"
                     " times as long",
                     evidence=100.0,
-                    or_effects=tuple(
-                        name for name, effect in EFFECTS.items() if middle < 0.0 and effect.shows.like_thinner
-                    ),
                 )
             )
     return found

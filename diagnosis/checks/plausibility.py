@@ -21,6 +21,7 @@ from .label_suspects import relabelled
 from .map_suspects import wrong_maps
 from .readings import (
     FRAMES_READ,
+    Explained,
     FloatArray,
     Reading,
     Suspect,
@@ -61,6 +62,7 @@ def check_plausibility(
     *,
     calibrating: frozenset[str],
     dark_DN: Callable[[float | None], NDArray[np.floating]] | None = None,
+    explained: Mapping[str, Explained] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Plausibility:
     """Series of a session that do not show what their labels say.
@@ -69,6 +71,7 @@ def check_plausibility(
         acquisition: open file.
         calibrating: names of the series that calibrate; effects may have set in after them.
         dark_DN: exposure_ms -> dark frame (row, column) of a twin, for sessions without darks.
+        explained: what an explanation does to series, by name; it is taken off them first.
         progress: called with the name of the stage.
 
     Raises:
@@ -80,6 +83,9 @@ def check_plausibility(
         return Plausibility(suspects=(), unusable={})
     stride = max(1, math.ceil(min(shapes.pop()) / _PIXELS))
     found = _read(acquisition, calibrating, stride)
+    for item in found.readings:
+        if explained and item.name in explained:
+            item.without(explained[item.name], stride)
     darks = [item for item in found.readings if item.series.kind == "dark"]
     lit = [item for item in found.readings if item.series.kind in ("flat", "object")]
     refuse_fractions(lit)

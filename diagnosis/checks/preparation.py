@@ -1,7 +1,7 @@
 """What happens to a session before its gap is looked for: series that cannot be used, labels in doubt, the twin."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +18,8 @@ from ..session.coarse import LEAST_SIDE, coarse_factor
 from ..session.coarse_twin import twin_in_squares
 from ..session.origin import made_of
 from ..session.session import calibrating_names
-from .plausibility import check_plausibility
-from .readings import Suspect
+from .plausibility import Plausibility, check_plausibility
+from .readings import Explained, Suspect
 
 _OF_THIS_SESSION = (
     "the twin was calibrated from series of this session: the first of each kind and setting, or those whose role says so, count"
@@ -85,13 +85,7 @@ def prepare_session(
     factor = coarse_factor(all_pixels.series[0].shape)
     twin = None if twin is None else twin_in_squares(twin, factor)
     acquisition = coarser(all_pixels, factor)
-    names = calibrating_names(acquisition.series)
-    found = check_plausibility(
-        acquisition,
-        calibrating=names,
-        dark_DN=None if twin is None else twin.maps.dark_at,
-        progress=progress,
-    )
+    found = _plausibility(acquisition, twin, progress=progress)
     left_out += [f"{name}: {reason}" for name, reason in found.unusable.items()]
     kept = tuple(item for item in acquisition.series if item.name not in found.unusable)
     if not kept:
@@ -125,6 +119,32 @@ def prepare_session(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
         ),
     )
+
+
+def _plausibility(
+    acquisition: AcquisitionFile,
+    twin: Twin | None,
+    *,
+    explained: Mapping[str, Explained] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Plausibility:
+    """Labels of a session's series; twin: one from elsewhere, whose darks stand in for those that are not there."""
+    return check_plausibility(
+        acquisition,
+        calibrating=calibrating_names(acquisition.series),
+        dark_DN=None if twin is None else twin.maps.dark_at,
+        explained=explained,
+        progress=progress,
+    )
+
+
+def suspects_left(session: PreparedSession, explained: Mapping[str, Explained]) -> tuple[Suspect, ...]:
+    """Those of the session's suspects whose series look mislabelled still once what an explanation does is taken off the frames."""
+    given = session.twin if session.calibrated_elsewhere else None
+    again = _plausibility(session.acquisition, given, explained=explained).suspects
+    again = again or _without_spectrum(session.acquisition, session.twin)
+    blamed = {name for item in again for name in item.series}
+    return tuple(item for item in session.suspects if not blamed.isdisjoint(item.series))
 
 
 def _spectral_point(

@@ -22,14 +22,23 @@ _LEAST_BRIGHTEST_DN = 30.0  # of frames that are no whole numbers; 8 bits averag
 class Suspect:
     """Series whose frames contradict a label.
 
-    Fields: series: their names; text: what they look like; evidence (natural logarithm); or_effects: effects that show the same, and
-    whose explanation of the whole session clears the label.
+    Fields: series: their names; text: what they look like; evidence (natural logarithm).
     """
 
     series: tuple[str, ...]
     text: str
     evidence: float
-    or_effects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explained:
+    """What an explanation of the whole session does to a series, (row, column) or (1, 1) where all pixels are alike.
+
+    Fields: mean_DN: added to its mean; variance: noise variance of a frame over that without it.
+    """
+
+    mean_DN: FloatArray
+    variance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +89,12 @@ class Reading:
     @property
     def name(self) -> str:
         return self.series.name
+
+    def without(self, explained: Explained, stride: int) -> None:
+        """Take off what an explanation does to the series."""
+        self.mean_DN = self.mean_DN - explained.mean_DN[::stride, ::stride]
+        if self.variance_DN2 is not None:
+            self.variance_DN2 = self.variance_DN2 / explained.variance[::stride, ::stride]
 
 
 def reading_of(item: Series, frames: FloatArray, acquisition: AcquisitionFile, *, since: bool) -> Reading:

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.twin import Twin
+from ..checks.readings import Explained
 from ..inference.observed import Point
 from ..inference.seen import Blocks
 from ..inference.unknown import Families
 from ..model.changes import Variant
 from ..model.curves import Curve
+from ..model.forward_model import ForwardModel
 from ..probes.probes import ProbeName
-from ..session.even_maps import Map
+from ..session.even_maps import Map, full_size
 from ..session.session import SessionSeries
 from ..session.summaries import SeriesSummary
 from .asked_again import AskedAgain
@@ -145,6 +147,19 @@ class Problem:
             costs[self.blocks[first]] += 1.0 if scene else _WITHOUT_SCENE
         return Blocks(of=self.blocks, costs=costs)
 
+    def explained_by(self, effects: Sequence[AppliedEffect]) -> dict[str, Explained]:
+        """What effects do to each series that they can show in, by its name."""
+        own_maps = any(view.session.calibrates and view.session.series.kind == "flat" for view in self.views)
+        model = ForwardModel(base=self.base, conditions=self.conditions, own_maps=own_maps)
+        change = model.with_found(effects)
+        return {
+            view.session.name: _difference(
+                view.expected, model.under(change, view.session.request), shape=view.residual_DN.shape
+            )
+            for view in self.views
+            if change.touches(view.session.request)
+        }
+
     def released(self) -> "Problem":
         """Without the frames' projections, so that nothing can be asked again."""
         return replace(self, again=None)
@@ -177,6 +192,15 @@ class Problem:
         return replace(
             self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
         )
+
+
+def _difference(before: ExpectedSeries, after: ExpectedSeries, *, shape: tuple[int, ...]) -> Explained:
+    """What has been added to a series' mean, and by what its frames' variance was multiplied (row, column)."""
+    variances = [item.quantum_variance_DN2 + item.white_variance_DN2 for item in (before, after)]
+    return Explained(
+        mean_DN=full_size(after.mean_DN - before.mean_DN, shape),
+        variance=full_size(variances[1] / np.maximum(variances[0], 1e-12), shape),
+    )
 
 
 def read_exactly() -> frozenset[str]:

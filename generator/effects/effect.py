@@ -93,14 +93,12 @@ class Shows:
     """Where an effect, or what is wrong with its law, can show.
 
     Fields: series: kinds of series that it can move; axis: of the answer, under which pictures like its own are listed; flats
-    (False: it leaves the detector-median level and noise of a flat alone); like_thinner (it brightens behind an object as a
-    thickness map that is too thick does).
+    (False: it leaves the detector-median level and noise of a flat alone).
     """
 
     series: tuple[str, ...]
     axis: str
     flats: bool = True
-    like_thinner: bool = False
 
     def __post_init__(self) -> None:
         if not self.series or not set(self.series) <= set(KINDS):

@@ -54,8 +54,9 @@ def _cover(state: LineState, parameters: Mapping[str, float], context: LineConte
     if model is None or context.project is None or context.weights is None or context.energies_keV is None:
         raise InputError("effect grey_absorber", received="a twin without spectral part", expected="a twin with one")
     energies = context.energies_keV
-    mu = model.mu(_SHEET)[: energies.size]
-    relative = mu / float(np.interp(_STATED_KEV, energies, mu))
+    mu = model.mu(_SHEET)
+    # a beam of less than the stated energy has no such photons, and the sheet is the same
+    relative = (mu / float(np.interp(_STATED_KEV, model.energies_keV, mu)))[: energies.size]
     # the same sheets at every strength, so that scenes are projected once
     sheets = np.exp(-np.outer((0.0, *_DEPTHS), relative))
     rows = (context.weights[:2, None, :] * sheets).reshape(-1, energies.size)

@@ -301,7 +301,7 @@ OBJECT_SCATTER = Effect(
     change=_add_scatter,
     needs=("spectral", "scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="a slab at two gaps to the detector, or a beam stop",
-    shows=Shows(series=("object",), axis="level", flats=False, like_thinner=True),
+    shows=Shows(series=("object",), axis="level", flats=False),
     absorbed="nothing",
     grid=Grid(
         shares=(0.8,),

@@ -74,7 +74,7 @@ VEILING_GLARE = Effect(
     change=_add_glare,
     needs=("pixel_mm",),
     isolated_by="opaque discs of several sizes",
-    shows=Shows(series=LIT_SERIES, axis="sharpness", like_thinner=True),
+    shows=Shows(series=LIT_SERIES, axis="sharpness"),
     either_onset=True,
     absorbed="noise",
     grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5}, {"length_mm": 4.5, "even_share": 0.5})),

@@ -111,6 +111,8 @@ def run(arguments: argparse.Namespace) -> int:
             progress=bar,
         )
     if isinstance(found, SessionPlan):
+        for line in found.mislabelled:
+            say(f"label in doubt: {line}")
         missing = [f"{effect} cannot be judged: {reason}" for effect, reason in found.cannot_be_judged.items()]
         text = "\n".join([table_text(found.distinguishability), *missing])
         answer(found.to_dict(), as_json=arguments.json, text=text)

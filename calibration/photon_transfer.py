@@ -418,6 +418,7 @@ def spread_estimate(fit: SpreadFit) -> SpreadEstimate:
     return SpreadEstimate(
         value=fit.spread,
         family=fit.family,
+        others=fit.others,
         intervals={
             name: estimate_from_sd(getattr(fit.spread, name), sd, lowest=0.0)
             for name, sd in fit.spread_sd.items()

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
+from ..generator.line.twin import OtherSpread
 from ..generator.spread.psf import CLEAR_LAYER, Spread
 from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, spread_of_bins, usable
 
@@ -70,6 +71,7 @@ _MOST_SD = 0.15  # of the share between such steps, which then reach over most o
 # deviation of the mean adds an eighth to that, while a spread without a tail is quicker wherever it is used.
 _AS_LIKELY = 2.0 * math.log(10.0)
 _NEAR_THE_MEAN = 0.5
+_LEAST_LIKELY = 0.01  # of a family to be kept: its difference from the chosen one counts by the root of this, a tenth
 _WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
 _TAIL = ("tail_share", "log_tail_px")
 _LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
@@ -94,21 +96,21 @@ _CORES = tuple(family for family, (*_, names) in _FAMILIES.items() if not set(na
 class SpreadFit:
     """Spread, gains and read noise of several series.
 
-    Fields: spread; family (in words); spread_sd (parameter -> standard deviation, of sigma_px, aspect, tail_share and
-    tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the spread's share restored;
-    slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and slope_sd_DN;
-    shared_gain_sd: relative standard deviation of gain over slope, by which all gains are off alike; white_fraction (group,): the
-    white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets in it, read_sd_DN2, most_read_DN2
-    that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees; excess_DN2: slow changes left, one a
-    series; series_ratio: noise of each series over the fitted, with its standard deviation; other_route: gains by extrapolated
-    power over those of the fit, with its standard deviation; criteria (family -> twice the logarithm of the best family's
-    evidence over its own); expected_DN2: power of
-    each series as squares show it; quanta_DN2: that of what follows the signal, not smeared; slow_DN2:
-    that of slow changes, which expected_DN2 leaves out.
+    Fields: spread; family (in words); others: families that are likely as well; spread_sd (parameter -> standard deviation, of
+    sigma_px, aspect, tail_share and tail_px); gain_DN (group,): quantum and signal-following white variance per signal with the
+    spread's share restored; slope_DN (group,): variance of one pixel per signal; their standard deviations gain_sd_DN and
+    slope_sd_DN; shared_gain_sd: relative standard deviation of gain over slope, by which all gains are off alike;
+    white_fraction (group,): the white part over the quantum part; read_variance_DN2 of a pixel, rows' and columns' offsets in
+    it, read_sd_DN2, most_read_DN2 that it can be; row_variance_DN2, column_variance_DN2: of these; chi_square, degrees;
+    excess_DN2: slow changes left, one a series; series_ratio: noise of each series over the fitted, with its standard
+    deviation; other_route: gains by extrapolated power over those of the fit, with its standard deviation; criteria (family ->
+    twice the logarithm of the best family's evidence over its own); expected_DN2: power of each series as squares show it;
+    quanta_DN2: that of what follows the signal, not smeared; slow_DN2: that of slow changes, which expected_DN2 leaves out.
     """
 
     spread: Spread
     family: str
+    others: tuple[OtherSpread, ...]
     spread_sd: dict[str, float]
     gain_DN: FloatArray
     gain_sd_DN: FloatArray
@@ -847,6 +849,7 @@ def _fit_of(series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: f
     return SpreadFit(
         spread=chosen.spread,
         family=chosen.family,
+        others=_other_families(candidates, weights, chosen.family),
         spread_sd={name: math.sqrt(value) for name, value in spread_variance.items()},
         gain_DN=gain,
         gain_sd_DN=np.sqrt(gain_variance),
@@ -946,6 +949,25 @@ def _representative(
     if not near:
         near = [min(likely, key=lambda place: abs(scale[place] - mean))]
     return candidates[min(near, key=lambda place: (len(candidates[place].names), -weights[place]))]
+
+
+def _other_families(candidates: Sequence[_Candidate], weights: FloatArray, chosen: str) -> tuple[OtherSpread, ...]:
+    """Families beside the chosen one that are likely enough to matter, each with the mean of its parameters."""
+    found = []
+    for family in dict.fromkeys(item.family for item in candidates):
+        own = [
+            (float(share), item.spread)
+            for share, item in zip(weights, candidates, strict=True)
+            if item.family == family
+        ]
+        together = sum(share for share, _ in own)
+        if family != chosen and together >= _LEAST_LIKELY:
+            means = {
+                name: sum(share * getattr(spread, name) for share, spread in own) / together
+                for name in ("sigma_px", "aspect", "tail_share", "tail_px")
+            }
+            found.append(OtherSpread(family=family, probability=together, value=replace(own[0][1], **means)))
+    return tuple(sorted(found, key=lambda item: -item.probability))
 
 
 def _log_ratio(first: FloatArray, second: FloatArray) -> FloatArray:

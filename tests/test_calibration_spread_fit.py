@@ -102,6 +102,21 @@ def test_the_family_follows_the_evidence():
     assert tailed.criteria["Gaussian, light collected in pixels"] > 100.0
 
 
+def test_families_that_the_noise_leaves_open_are_kept_with_their_probability():
+    tailed = Spread(sigma_px=0.9, tail_share=0.15, tail_px=1.4, tail_order=1.5)
+    fit = fit_spread(powers(tailed, seed=3), group=GROUPS)
+    left = 1.0 - sum(item.probability for item in fit.others)
+    assert 0.0 < left < 1.0 and all(item.probability >= 0.01 for item in fit.others)
+    # its own form is one of them, about as wide and as strong as it is
+    own = next(item for item in (fit, *fit.others) if "exponential" in item.family)
+    spread = fit.spread if own is fit else own.value
+    assert spread.tail_order == 1.5 and spread.variance_share == pytest.approx(tailed.variance_share, rel=0.2)
+    assert spread.sigma_px == pytest.approx(0.9, rel=0.05) and 0.05 < spread.tail_share < 0.3
+    # where there is nothing to be said of a tail, none is kept
+    clear = fit_spread(powers(SPREADS["Lorentzian tail"], seed=3), group=GROUPS)
+    assert all(item.value.tail_share > 0.2 for item in clear.others)
+
+
 @pytest.mark.slow
 def test_stated_standard_deviations_are_those_of_repetition():
     """Spread of 16 repetitions against the stated one: chi-square with 15 degrees below its 99.9 %; the white part's prior and

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.api._given import as_twin
 from raytwin.calibration.priors import PRIORS
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
-from raytwin.diagnosis.model.changes import catalogue_variants, departures_found
+from raytwin.diagnosis.model.changes import catalogue_variants, departures_found, twin_changes
 from raytwin.diagnosis.model.forward_model import Change, ForwardModel, strength_rows
 from raytwin.diagnosis.model.placing import inside
 from raytwin.diagnosis.probes.registration import Placement
@@ -24,6 +25,8 @@ from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px
 from raytwin.generator.line.series_request import SeriesRequest
+from raytwin.generator.line.twin import OtherSpread
+from raytwin.generator.spread.psf import Spread
 
 SHAPE = (12, 16)
 GOOD = np.ones(SHAPE, dtype=bool)
@@ -61,6 +64,20 @@ def maps_of(kept, means_DN, expected, copies=0):
         if item.name in means_DN
     }
     return calibrated_maps(kept, expected, looks, twin=twin(), good=GOOD)
+
+
+def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_it_is_probable():
+    plain = as_twin("virtual_lab")
+    other = OtherSpread(
+        family="exponential", probability=0.25, value=Spread(sigma_px=0.5, tail_share=0.2, tail_order=1.5)
+    )
+    known = replace(plain.noise.spread, others=(other,))
+    named = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=known)))}
+    step = named["optical spread as exponential"]
+    assert step.twin.noise.spread.value == other.value
+    # the mean square difference from the chosen one is a quarter of the step's: the step is two standard deviations
+    assert step.step_sd == 2.0
+    assert set(named) - {item.name for item in twin_changes(plain)} == {step.name}
 
 
 def test_flats_without_light_make_no_gain_map():

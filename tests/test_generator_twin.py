@@ -21,6 +21,7 @@ from raytwin.generator.line.twin import (
     Estimate,
     Level,
     NoiseModel,
+    OtherSpread,
     SpectralPosterior,
     Twin,
     estimate_from_sd,
@@ -147,6 +148,13 @@ def same(first, second):
 @pytest.mark.parametrize("with_spectrum", [True, False])
 def test_a_twin_comes_back_from_its_file_as_it_was(tmp_path, twin, with_spectrum):
     written = twin if with_spectrum else make_twin(spectral=None, instrument=Instrument())
+    other = Spread(sigma_px=0.4, aspect=1.1, tail_share=0.2, tail_px=1.5, tail_order=1.5)
+    tailed = replace(
+        gaussian_spread("aperture", estimate_from_sd(0.4, 0.01)),
+        value=Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0),
+        others=(OtherSpread(family="two widths with an exponential tail", probability=0.2, value=other),),
+    )
+    written = replace(written, noise=replace(written.noise, spread=tailed))
     write_twin(tmp_path / "twin.h5", written)
     same(written, read_twin(tmp_path / "twin.h5"))
     assert [path.name for path in tmp_path.iterdir()] == ["twin.h5"]

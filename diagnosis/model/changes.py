@@ -323,6 +323,16 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
         )
     )
     result += _tail_changes(twin)
+    result += [
+        TwinChange(
+            name=f"optical spread as {other.family}",
+            twin=replace(twin, noise=replace(twin.noise, spread=replace(spread, value=other.value))),
+            parameters=None,
+            # of a mixture: its mean square difference from the chosen one
+            step_sd=1.0 / math.sqrt(other.probability),
+        )
+        for other in spread.others
+    ]
     read = twin.noise.read_noise_DN
     sd = max(READ_NOISE_SD * read.value, (read.high - read.low) / (2 * 1.959964), 1e-3)
     noisier = Estimate(value=read.value + sd, low=read.low, high=max(read.high, read.value + sd))

@@ -109,15 +109,26 @@ class Level(ByValue):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OtherSpread:
+    """What the spread may be instead: the kernel family in words, its probability, and its mean parameters."""
+
+    family: str
+    probability: float
+    value: Spread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SpreadEstimate:
     """The optical spread: its most probable parameters, the kernel family in words, and intervals of the parameters.
 
-    intervals: of `sigma_px` always, of `aspect`, `tail_share` and `tail_px` where the data were asked for them.
+    intervals: of `sigma_px` always, of `aspect`, `tail_share` and `tail_px` where the data were asked for them; others: families
+    that the data leave open.
     """
 
     value: Spread
     family: str = "Gaussian"
     intervals: Mapping[str, Estimate] = field(default_factory=dict)
+    others: tuple[OtherSpread, ...] = ()
 
     @property
     def gaussian_px(self) -> Estimate | None:

@@ -1,5 +1,6 @@
 """The answer of a calibration: what a twin knows, in plain numbers, and as a short table."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
             for name in ("sigma_px", "aspect", "tail_share", "tail_px")
         },
         "variance_share": value.variance_share,
+        "others": [asdict(item) for item in spread.others],
     }
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import sys
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from ..line.twin import (
     Estimate,
     Level,
     NoiseModel,
+    OtherSpread,
     SpectralPosterior,
     SpreadEstimate,
     Twin,
@@ -125,6 +126,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         spread = twin.noise.spread
         noise.attrs["psf_model"] = spread.value.model
         noise.attrs["spread_family"] = spread.family
+        noise.attrs["spread_others"] = json.dumps([asdict(item) for item in spread.others])
         for name in ("aspect", "tail_share", "tail_px", "tail_order"):
             noise.attrs[name] = getattr(spread.value, name)
             if name in spread.intervals:
@@ -330,6 +332,14 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
         value=Spread(model=model, sigma_px=sigma.value, **shape),
         family=_text(noise.attrs["spread_family"]),
         intervals={"sigma_px": sigma} | {name: known for name, known in found.items() if known is not None},
+        others=tuple(
+            OtherSpread(
+                family=str(item["family"]),
+                probability=float(item["probability"]),
+                value=Spread(**{name: item["value"][name] for name in ("model", "sigma_px", *shape)}),
+            )
+            for item in json.loads(_text(noise.attrs.get("spread_others", "[]")))
+        ),
     )
 
 

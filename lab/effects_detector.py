@@ -172,6 +172,7 @@ def _k_fluorescence(request: Asked, site: Site) -> Planted:
         "photons above the K edges leave 29.8 keV in one of eight places around, on two rings",
         {"range_mm": range_mm, "places": [list(place) for place in offsets]},
         rates=split,
+        in_screen=True,
         stages=(("-photons", Stage(name="photons", apply=stop)),),
     )
 

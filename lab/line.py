@@ -64,6 +64,8 @@ def fine_rates(
 
 def rates_of_map(rates: NDArray[np.float32], like: FineRates) -> FineRates:
     """Rates (fine row, fine column, class) that no two sub-pixels share any more."""
+    if like.remote is not None:
+        raise ValueError("photons that were split in the screen are not moved any more")
     shape = rates.shape[:2]
     cell = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(shape)
     return fine_rates(cell, np.ascontiguousarray(rates.reshape(-1, rates.shape[2])), like.deposit_keV)
@@ -91,11 +93,12 @@ class Exposure:
 class Planted:
     """An effect as it acts: any of these hooks, each None where the effect does not act there.
 
-    Fields: id, strength, unit, since (`always` or `calibration`: after the calibration series); law (in words);
-    parameters (inner ones, for the truth); system, maps: change the truth of the line; pose: of an object, with the
-    size of a pixel in its plane in mm; layers: further path lengths in the beam; rates: change what arrives;
-    per_exposure_ms: `rates` depends on the exposure time; load: factor on the tube's output at a time (s); stages:
-    (name of the base stage that it follows or, with a leading `-`, replaces; stage).
+    Fields: id, strength, unit, since (`always` or `calibration`: after the calibration series); law (in words); parameters
+    (inner ones, for the truth); system, maps: change the truth of the line; pose: of an object, with the size of a pixel in
+    its plane in mm; layers: further path lengths in the beam; rates: change what arrives; in_screen: they do so where
+    photons stop, after all that happens to the beam before; per_exposure_ms: `rates` depends on the exposure time; load:
+    factor on the tube's output at a time (s); stages: (name of the base stage that it follows or, with a leading `-`,
+    replaces; stage).
     """
 
     id: str
@@ -109,6 +112,7 @@ class Planted:
     pose: Callable[[Posed, float], Posed] | None = None
     layers: Callable[[Exposure], Mapping[str, FineMap]] | None = None
     rates: Callable[[FineRates, Exposure], FineRates] | None = None
+    in_screen: bool = False
     per_exposure_ms: bool = False
     load: Callable[[float], float] | None = None
     stages: tuple[tuple[str, Stage], ...] = ()
@@ -292,7 +296,7 @@ class Line:
         else:
             open_field = incidence.rates_per_mAs()[None].astype(np.float32)
             rates = fine_rates(np.zeros(shape, dtype=np.int32), open_field, incidence.deposit_keV)
-        for effect in self.active:
+        for effect in sorted(self.active, key=lambda effect: effect.in_screen):
             if effect.rates is not None:
                 rates = effect.rates(rates, exposure)
         return rates

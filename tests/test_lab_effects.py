@@ -312,6 +312,19 @@ def test_k_fluorescence_leaves_the_level_and_takes_variance_from_the_pixel_above
     assert binned(with_it) / binned(without) == pytest.approx(1.0 - 0.02, abs=5 * math.sqrt(2) * error)
 
 
+@pytest.mark.parametrize("other", ["crosstalk=20", "off_focal=5"])
+def test_k_photons_are_split_off_where_quanta_stop_and_none_is_lost(other):
+    system = system_on("fine")
+    requests = [request_from_text("k_fluorescence=40"), request_from_text(other)]
+    both = Line(system, rng=np.random.default_rng(7), planted=plant(requests, site_of(system, "fine")))
+    both.calibration_is_over()
+    bare = line_with(None, "fine", system=system)
+    setting = setting_of(bare, 60.0, geometry="fine")
+    lengths = {"Al": np.full(thickness_on_fine_grid(system, Edge(angle=0.0))["W"].shape, 1.0, dtype=np.float32)}
+    means = [frames_of(line, setting, 4, scene="plate", thickness_mm=lengths).mean() for line in (both, bare)]
+    assert means[0] == pytest.approx(means[1], rel=2e-3)
+
+
 def test_crosstalk_moves_its_share_of_the_quanta_out_of_their_pixel_and_loses_none():
     system = system_on("fine")
     line, bare = line_with("crosstalk=20", "fine", system=system), line_with(None, "fine", system=system)

@@ -105,8 +105,8 @@ def _mtf_tail(request: Asked, site: Site) -> Planted:
 
 # --- photons that are caught elsewhere -----------------------------------------------------------------------------------
 
-K_EDGE_KEV = 34.5  # between iodine's 33.2 and caesium's 36.0
-K_LINE_KEV = 29.8
+# K edge and K photon, keV: between iodine's 33.2 and caesium's 36.0, and gadolinium's
+K_OF_SCINTILLATOR = {"CsI": (34.5, 29.8), "Gd2O2S@7.32": (50.2, 42.8)}
 # Share of the K photons, distance over the mean range, and direction of the first of four, in quarter turns.
 RINGS = ((0.55, 0.5, 0.0), (0.45, 1.6, 0.5))
 
@@ -114,6 +114,7 @@ RINGS = ((0.55, 0.5, 0.0), (0.45, 1.6, 0.5))
 def _k_fluorescence(request: Asked, site: Site) -> Planted:
     share = request.strength / 100.0
     range_mm = float(site.rng.uniform(0.12, 0.4))
+    edge_keV, line_keV = K_OF_SCINTILLATOR[site.system.scintillator]
     fine_mm = site.system.pixel_mm / SUBPIXELS
     offsets: list[tuple[float, int, int]] = []
     for weight, distance, start in RINGS:
@@ -123,11 +124,11 @@ def _k_fluorescence(request: Asked, site: Site) -> Planted:
             offsets.append((0.25 * weight, round(y), round(x)))
 
     def split(rates: FineRates, exposure: Exposure) -> FineRates:
-        above = rates.deposit_keV > K_EDGE_KEV
+        above = rates.deposit_keV > edge_keV
         if not above.any():
             return rates
         remote = rates.rates[:, above].sum(axis=1) * np.float32(share)
-        kept_keV = rates.rates[:, above] @ (rates.deposit_keV[above] - K_LINE_KEV) * share / np.maximum(remote, 1e-30)
+        kept_keV = rates.rates[:, above] @ (rates.deposit_keV[above] - line_keV) * share / np.maximum(remote, 1e-30)
         left = np.where(above, np.float32(1.0 - share), np.float32(1.0)) * rates.rates
         return replace(
             fine_rates(rates.cell, left.astype(np.float32), rates.deposit_keV),
@@ -164,12 +165,12 @@ def _k_fluorescence(request: Asked, site: Site) -> Planted:
             light += quanta * kept_keV
             from_row = np.clip(np.arange(rows) - down, 0, rows - 1)
             from_column = np.clip(np.arange(columns) - right, 0, columns - 1)
-            light += np.float32(K_LINE_KEV) * quanta[from_row][:, from_column]
+            light += np.float32(line_keV) * quanta[from_row][:, from_column]
         return light
 
     return _told(
         request,
-        "photons above the K edges leave 29.8 keV in one of eight places around, on two rings",
+        f"photons above the K edges leave {line_keV:g} keV in one of eight places around, on two rings",
         {"range_mm": range_mm, "places": [list(place) for place in offsets]},
         rates=split,
         in_screen=True,

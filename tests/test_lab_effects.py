@@ -292,6 +292,19 @@ def covariance(frames, row, column):
     return (left[:, : rows - row, : columns - column] * left[:, row:, column:]).mean() * n / (n - 1)
 
 
+def test_k_photons_of_gadolinium_come_above_its_own_edge():
+    system = replace(system_on("fine"), scintillator="Gd2O2S@7.32", scintillator_mm=0.15)
+    line = line_with("k_fluorescence=40", "fine", system=system)
+    arrivals = line.arrivals(setting_of(line, 60.0, geometry="fine"))
+    bare = line_with(None, "fine", system=system).arrivals(setting_of(line, 60.0, geometry="fine"))
+    split = bare.rates.sum() - arrivals.rates.sum()
+    above = bare.rates[:, bare.deposit_keV > 50.2].sum()
+    assert split == pytest.approx(0.4 * above, rel=1e-4) and 0.0 < above < 0.3 * bare.rates.sum()
+    assert arrivals.remote.sum() == pytest.approx(split, rel=1e-4)
+    # what stays where such a photon stops is all above gadolinium's line
+    assert 50.2 - 42.8 < float(arrivals.remote_keV[0]) < 60.0 - 42.8
+
+
 def test_k_fluorescence_leaves_the_level_and_takes_variance_from_the_pixel_above_the_edge_only():
     system = system_on("fine", psf_sigma_px=0.35)
     line, bare = line_with("k_fluorescence=40", "fine", system=system), line_with(None, "fine", system=system)

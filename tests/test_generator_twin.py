@@ -203,6 +203,19 @@ DAMAGES = {
         lambda file: replaced(file, "spectral/best", file["spectral/best"][()] * 1j),
         "values of type complex128; expected real numbers",
     ),
+    "another spread without a probability": (
+        lambda file: file["noise"].attrs.update(
+            spread_others='[{"family": "exponential", "probability": 0, "value": {"model": "aperture", "sigma_px": 0.5,'
+            ' "aspect": 1, "tail_share": 0.1, "tail_px": 1, "tail_order": 1.5}}]'
+        ),
+        "exponential with a probability of 0; expected a probability above 0",
+    ),
+    "another spread of no shape": (
+        lambda file: file["noise"].attrs.update(
+            spread_others='[{"family": "exponential", "probability": 0.2, "value": 3}]'
+        ),
+        "a damaged file",
+    ),
     "draws that no exponent holds": (
         lambda file: replaced(file, "spectral/samples", 1e7 * file["spectral/samples"][()]),
         "all below 710",

@@ -19,7 +19,7 @@ from ..model.forward_model import ForwardModel
 from ..probes.probes import ProbeName
 from ..session.even_maps import Map, full_size
 from ..session.session import SessionSeries
-from ..session.summaries import SeriesSummary
+from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from .asked_again import AskedAgain
 
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
@@ -196,10 +196,12 @@ class Problem:
 
 def _difference(before: ExpectedSeries, after: ExpectedSeries, *, shape: tuple[int, ...]) -> Explained:
     """What has been added to a series' mean, and by what its frames' variance was multiplied (row, column)."""
-    variances = [item.quantum_variance_DN2 + item.white_variance_DN2 for item in (before, after)]
+    variances = [
+        np.maximum(item.quantum_variance_DN2 + item.white_variance_DN2, LEAST_NOISE_DN2) for item in (before, after)
+    ]
     return Explained(
         mean_DN=full_size(after.mean_DN - before.mean_DN, shape),
-        variance=full_size(variances[1] / np.maximum(variances[0], 1e-12), shape),
+        variance=full_size(variances[1] / variances[0], shape),
     )
 
 

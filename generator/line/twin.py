@@ -116,6 +116,14 @@ class OtherSpread:
     probability: float
     value: Spread
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.probability <= 1.0:
+            raise InputError(
+                "optical spread",
+                received=f"{self.family} with a probability of {self.probability:g}",
+                expected="a probability above 0, up to 1",
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpreadEstimate:

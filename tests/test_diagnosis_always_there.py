@@ -11,7 +11,7 @@ from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import CalibratedMaps
 from raytwin.diagnosis.model.defects import new_outliers
 from raytwin.diagnosis.problem.line_noise import usual_line_noise
-from raytwin.diagnosis.problem.nuisance_columns import _shapes
+from raytwin.diagnosis.problem.nuisance_columns import _of_field, _shapes
 from raytwin.diagnosis.session.summaries import BLOCK_PX, LAGS, summarise_series
 from raytwin.lab.protocols import run_protocol
 
@@ -65,6 +65,22 @@ def test_smooth_changes_of_shape_add_up_to_their_limit():
     assert np.sqrt(variance) == pytest.approx(scales.SHAPE_SD)
     # no level, which has a nuisance of its own
     assert np.all(np.abs(shapes.mean(axis=(1, 2))) < 0.05 * np.sqrt(np.mean(shapes**2, axis=(1, 2))))
+
+
+def test_what_changes_slowly_is_one_change_for_all_series_since_the_calibration():
+    def images(name, calibrates):
+        request = SimpleNamespace(exposure_ms=100.0)
+        series = SimpleNamespace(kV=60.0, filters=(), current_mA=1.0, power_W=None, exposure_ms=100.0)
+        item = SimpleNamespace(name=name, calibrates=calibrates, request=request, series=series, divided=False)
+        return _of_field(item, np.full(SHAPE, 1000.0), 1.0)
+
+    before, first, second = images("before", True), images("first", False), images("second", False)
+    shared = {name for name in first if name.endswith("since the calibration")}
+    assert len(shared) == len(_shapes(SHAPE)) and shared == set(first) & set(second) - set(before)
+    # in either series it looks as a change of its own does
+    for number in range(len(shared)):
+        own = first[f"shape {number} of first"]
+        assert np.array_equal(first[f"shape {number} since the calibration"], own)
 
 
 def test_dust_on_a_flat_is_left_out_and_makes_no_bad_pixel():

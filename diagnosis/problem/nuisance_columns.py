@@ -185,6 +185,9 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
         images["length of exposures"] = scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal
     for number, shape in enumerate(_shapes(signal.shape)):
         images[f"shape {number} of {item.name}"] = shape * signal
+        if not item.calibrates:
+            # what changes slowly is much the same in series that follow each other
+            images[f"shape {number} since the calibration"] = shape * signal
     if item.divided:
         images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
         images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal

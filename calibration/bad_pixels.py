@@ -13,6 +13,7 @@ from .dark_frames import DarkFrames
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
+_COMMON_CODE = 1e-3  # share of the pixels that show a code: single ones may have been mended
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 
@@ -22,10 +23,11 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
 
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
     closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
+    step_DN = max((_code_step(item) for item, _ in darks.sums), default=1.0)
     for key, mean in darks.by_exposure.items():
         local = mean - median_filter(mean, size=5, mode="nearest")
         centre, spread = _robust_spread(local)
-        limit = _DARK_NOISE_SIGMAS * max(spread, 0.5)
+        limit = _DARK_NOISE_SIGMAS * max(spread, 0.5 * step_DN)
         frames = sum(
             total.frames * item.averaged for item, total in darks.sums if (item.session, item.exposure_ms) == key
         )
@@ -39,7 +41,7 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
 
         centre = float(np.median(darks.variance)) * darks.effective / float(chdtri(darks.effective, 0.5))
-        limit = centre * float(chdtri(darks.effective, _NOISY_CHANCE)) / darks.effective + 1.0
+        limit = centre * float(chdtri(darks.effective, _NOISY_CHANCE)) / darks.effective + step_DN**2
         code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])
@@ -53,6 +55,13 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     np.maximum(closest, departure, out=closest)
     code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
     return _with_clusters(code, closest)
+
+
+def _code_step(item: Series) -> float:
+    """Distance of the ADC's codes in a dark, DN, 1 at least: noise far below it shows in pixels that lie between two codes alone."""
+    codes, counts = np.unique(item.read_frames(0, 1), return_counts=True)
+    common = codes[counts >= _COMMON_CODE * counts.sum()].astype(np.float64)
+    return max(float(np.diff(common).min()), 1.0) if common.size > 1 else 1.0
 
 
 def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:

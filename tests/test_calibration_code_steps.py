@@ -1,0 +1,46 @@
+"""Bad pixels of a panel whose codes lie far apart: pixels between two codes are good ones."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from raytwin.calibration.bad_pixels import _code_step, find_bad_pixels
+from raytwin.calibration.dark_frames import DarkFrames
+from raytwin.generator.line.twin import BAD_PIXEL_CODES
+
+SHAPE = (48, 48)
+
+
+def series(frames):
+    return SimpleNamespace(
+        session=0,
+        exposure_ms=10.0,
+        averaged=1,
+        corrected=frozenset(),
+        read_frames=lambda first, last: frames[first:last],
+    )
+
+
+def frames_in_steps(step_DN, rng, *, count=20):
+    """Darks of levels that differ by some DN from pixel to pixel, read noise 8 DN, and one hot pixel."""
+    level = 1220.0 + 10.0 * rng.standard_normal(SHAPE)
+    level[20, 30] += 2000.0
+    exact = level + 8.0 * rng.standard_normal((count, *SHAPE))
+    return np.rint(step_DN * np.floor(exact / step_DN)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("step_DN", [1.0, 16.0, 60.12])
+def test_pixels_between_two_codes_are_not_bad(step_DN):
+    rng = np.random.default_rng(5)
+    frames = frames_in_steps(step_DN, rng)
+    item = series(frames)
+    assert _code_step(item) == pytest.approx(step_DN, abs=1.0)
+    mean = frames.mean(axis=0)
+    sums = SimpleNamespace(mean_DN=mean, frames=len(frames), pairs=len(frames) - 1)
+    darks = DarkFrames(
+        {(0, 10.0): mean}, [(item, sums)], np.zeros(SHAPE), frames.var(axis=0, ddof=1), len(frames) - 1.0
+    )
+    lit = mean + 20000.0 * (1.0 + 0.01 * rng.standard_normal(SHAPE))
+    found = find_bad_pixels(darks, [(item, SimpleNamespace(mean_DN=lit))])
+    assert found[20, 30] == BAD_PIXEL_CODES["hot"] and np.count_nonzero(found) == 1

@@ -9,11 +9,11 @@ from ..acquisition.acquisition_io import Series
 from ..generator.line.twin import BAD_PIXEL_CODES
 from ._kept_sums import KeptSums
 from .dark_frames import DarkFrames
+from .frame_signs import least_change
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
-_COMMON_CODE = 1e-3  # share of the pixels that show a code: single ones may have been mended
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 
@@ -23,7 +23,8 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
 
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
     closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
-    step_DN = max((_code_step(item) for item, _ in darks.sums), default=1.0)
+    # noise far below the distance of the codes shows in pixels that lie between two of them alone: half of it in a mean
+    step_DN = max((least_change(item.read_frames(0, min(item.n_frames, 2))) for item, _ in darks.sums), default=1.0)
     for key, mean in darks.by_exposure.items():
         local = mean - median_filter(mean, size=5, mode="nearest")
         centre, spread = _robust_spread(local)
@@ -55,13 +56,6 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     np.maximum(closest, departure, out=closest)
     code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
     return _with_clusters(code, closest)
-
-
-def _code_step(item: Series) -> float:
-    """Distance of the ADC's codes in a dark, DN, 1 at least: noise far below it shows in pixels that lie between two codes alone."""
-    codes, counts = np.unique(item.read_frames(0, 1), return_counts=True)
-    common = codes[counts >= _COMMON_CODE * counts.sum()].astype(np.float64)
-    return max(float(np.diff(common).min()), 1.0) if common.size > 1 else 1.0
 
 
 def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:

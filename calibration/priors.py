@@ -209,7 +209,9 @@ MEASURED_SPECTRUM: dict[str, Prior] = {
         centre=0.0, sd=0.1, low=0.0, high=12.0, reason="beyond the measured spectrum: its own error, as mm Al"
     ),
     "end_exponent": Prior(
-        centre=0.0, sd=0.04, reason="in the measured spectrum up to 0.85 of its kV; the end beyond it stays"
+        centre=0.0,
+        sd=0.02,
+        reason="in the measured spectrum: SpekPy's models change theirs by so much between voltages",
     ),
     "hardness_exponent": Prior(
         centre=0.0, sd=0.03, reason="of the measured spectrum: the spectrometer's own efficiency"

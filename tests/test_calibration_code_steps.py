@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.calibration.bad_pixels import _code_step, find_bad_pixels
+from raytwin.calibration.bad_pixels import find_bad_pixels
 from raytwin.calibration.dark_frames import DarkFrames
+from raytwin.calibration.frame_signs import least_change
 from raytwin.generator.line.twin import BAD_PIXEL_CODES
 
 SHAPE = (48, 48)
@@ -17,6 +18,7 @@ def series(frames):
         session=0,
         exposure_ms=10.0,
         averaged=1,
+        n_frames=len(frames),
         corrected=frozenset(),
         read_frames=lambda first, last: frames[first:last],
     )
@@ -35,7 +37,7 @@ def test_pixels_between_two_codes_are_not_bad(step_DN):
     rng = np.random.default_rng(5)
     frames = frames_in_steps(step_DN, rng)
     item = series(frames)
-    assert _code_step(item) == pytest.approx(step_DN, abs=1.0)
+    assert least_change(frames[:2]) == pytest.approx(step_DN, abs=1.0)
     mean = frames.mean(axis=0)
     sums = SimpleNamespace(mean_DN=mean, frames=len(frames), pairs=len(frames) - 1)
     darks = DarkFrames(
@@ -44,3 +46,18 @@ def test_pixels_between_two_codes_are_not_bad(step_DN):
     lit = mean + 20000.0 * (1.0 + 0.01 * rng.standard_normal(SHAPE))
     found = find_bad_pixels(darks, [(item, SimpleNamespace(mean_DN=lit))])
     assert found[20, 30] == BAD_PIXEL_CODES["hot"] and np.count_nonzero(found) == 1
+
+
+def test_frames_that_tell_no_distance_of_codes_have_one_of_1_DN():
+    rng = np.random.default_rng(6)
+    still = np.full((2, 16, 16), 1200, np.uint16)
+    averaged = 1200.0 + rng.standard_normal((2, 16, 16))
+    wide = (20000.0 + 3000.0 * rng.standard_normal((2, 64, 64))).astype(np.uint16)
+    lost = averaged.copy()
+    lost[0, :, 3:] = np.nan
+    for frames in (still, still[:1], averaged, wide, lost):
+        assert least_change(frames) == 1.0
+    # a mended pixel among many is no code
+    mended = (60 * rng.integers(0, 3, (2, 64, 64))).astype(np.uint16)
+    mended[:, 5, 5] = 17, 40
+    assert least_change(mended) == 60.0

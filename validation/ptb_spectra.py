@@ -312,6 +312,8 @@ def main() -> int:
         print(
             f"exponents of 1 - E / kV of the six: mean {np.mean(ends):.3f}, standard deviation {np.std(ends, ddof=1):.3f}"
         )
+        changes = [0.0, *(np.var([row["end"] for row in rows if row["model"] == name]) for name in SPEKPY_MODELS)]
+        print(f"their change from voltage to voltage: standard deviation {np.sqrt(np.mean(changes)):.3f}")
         if arguments.json is not None:
             arguments.json.parent.mkdir(parents=True, exist_ok=True)
             arguments.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")

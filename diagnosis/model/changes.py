@@ -53,7 +53,7 @@ READ_TEXTURE_SD = (
 )
 TEXTURE_OF_BEAM_SHARE = 1.0  # of this that may differ from kV to kV
 # always there a little, without being an effect: limits of the catalogue's table; beyond them the effect of that kind begins
-SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape in a series
+SHAPE_SD = 0.0005  # rms over the field of the smooth change of the open field's shape: of a series, and of all since the calibration
 SHAPE_ORDER = 4  # of the polynomials that stand for it, each order half as likely as the one of half its number
 LINE_NOISE_LIMIT = 0.1  # rms of row and of column offsets over the read noise
 READ_NOISE_SD = (

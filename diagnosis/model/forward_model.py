@@ -1,7 +1,7 @@
 """The base twin as series ask it, and the changes of it that a diagnosis tries: what each can move at all."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -240,6 +240,11 @@ class ForwardModel:
         return LineModel(
             change.twin, effects=effects, parameters=change.parameters, cache=self.cache, use_measured_level=False
         ).expect(request)
+
+
+def own_maps(series: Iterable[SessionSeries]) -> bool:
+    """Whether flats of the session make the gain map."""
+    return any(item.calibrates and item.series.kind == "flat" for item in series)
 
 
 def strength_rows(variants: Sequence[Variant]) -> list[range]:

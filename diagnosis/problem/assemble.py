@@ -31,7 +31,7 @@ from ..model.changes import (
 )
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
-from ..model.forward_model import Change, ForwardModel, draft_cache, strength_rows
+from ..model.forward_model import Change, ForwardModel, draft_cache, own_maps, strength_rows
 from ..model.placing import place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
@@ -97,8 +97,7 @@ def build_problem(
         back = dict(zip(base.spectral.names, map(float, away), strict=True))
         base = replace(base, spectral=replace(base.spectral, best=spectral_point))
     conditions |= beam_conditions(base, requests, cache=cache)
-    own_maps = any(item.calibrates and item.series.kind == "flat" for item in session)
-    model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps, cache=cache)
+    model = ForwardModel(base=base, conditions=conditions, own_maps=own_maps(session), cache=cache)
     measured = _measured(session, acquisition, twin, model, side=side, tell=tell)
     expected = measured.expected
     tell("responses")

@@ -184,10 +184,11 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
     if item.request.exposure_ms > 0:
         images["length of exposures"] = scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal
     for number, shape in enumerate(_shapes(signal.shape)):
-        images[f"shape {number} of {item.name}"] = shape * signal
+        changed = shape * signal
+        images[f"shape {number} of {item.name}"] = changed
         if not item.calibrates:
             # what changes slowly is much the same in series that follow each other
-            images[f"shape {number} since the calibration"] = shape * signal
+            images[f"shape {number} since the calibration"] = changed
     if item.divided:
         images[f"open field of {item.name}"] = scales.DIVIDED_LEVEL_SD * signal
         images[f"open field of {item.name}, x"] = scales.DIVIDED_TILT_SD * x * signal

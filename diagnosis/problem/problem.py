@@ -15,7 +15,7 @@ from ..inference.seen import Blocks
 from ..inference.unknown import Families
 from ..model.changes import Variant
 from ..model.curves import Curve
-from ..model.forward_model import ForwardModel
+from ..model.forward_model import ForwardModel, own_maps
 from ..probes.probes import ProbeName
 from ..session.even_maps import Map, full_size
 from ..session.session import SessionSeries
@@ -149,8 +149,8 @@ class Problem:
 
     def explained_by(self, effects: Sequence[AppliedEffect]) -> dict[str, Explained]:
         """What effects do to each series that they can show in, by its name."""
-        own_maps = any(view.session.calibrates and view.session.series.kind == "flat" for view in self.views)
-        model = ForwardModel(base=self.base, conditions=self.conditions, own_maps=own_maps)
+        made_here = own_maps(view.session for view in self.views)
+        model = ForwardModel(base=self.base, conditions=self.conditions, own_maps=made_here)
         change = model.with_found(effects)
         return {
             view.session.name: _difference(

@@ -37,13 +37,14 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         departure = np.abs(local - centre) / np.maximum(limit, own)
         np.maximum(closest, departure, out=closest)
         code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["hot"]
-    if darks.effective > 0 and np.all(np.isfinite(darks.variance)):
+    variance, effective = (darks.variance, darks.effective) if darks.effective > 0 else darks.variance_between_series()
+    if effective > 0 and np.all(np.isfinite(variance)):
         # a variance from few frames has long tails (chi-square): cutting them off would lower the pooled variance
         from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
 
-        centre = float(np.median(darks.variance)) * darks.effective / float(chdtri(darks.effective, 0.5))
-        limit = centre * float(chdtri(darks.effective, _NOISY_CHANCE)) / darks.effective + step_DN**2
-        code[(darks.variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
+        centre = float(np.median(variance)) * effective / float(chdtri(effective, 0.5))
+        limit = centre * float(chdtri(effective, _NOISY_CHANCE)) / effective + step_DN**2
+        code[(variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])
     if not np.median(signal) > 0:

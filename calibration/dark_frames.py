@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,23 @@ class DarkFrames:
     def repeated(self) -> list[tuple[Series, KeptSums]]:
         """Series of two frames or more."""
         return [(item, total) for item, total in self.sums if total.pairs > 0]
+
+    def variance_between_series(self) -> tuple[NDArray[np.float64], float]:
+        """Variance of one exposure (DN^2; row, column) from successive series of a session and exposure, and of how many
+        independent frames; NaN and 0 where no two are of one.
+
+        What changed in single pixels from series to series is in it. The level of each difference, its median, is not.
+        """
+        total, effective = np.zeros(self.per_ms.shape), 0.0
+        for key in self.by_exposure:
+            some = [(item, sums) for item, sums in self.sums if (item.session, item.exposure_ms) == key]
+            share = effective_frames(len(some)) / max(len(some) - 1, 1)
+            for (first, first_sums), (second, second_sums) in pairwise(some):
+                change = second_sums.mean_DN - first_sums.mean_DN
+                counts = (first_sums.frames * first.averaged, second_sums.frames * second.averaged)
+                total += share * (change - np.median(change)) ** 2 / sum(1.0 / count for count in counts)
+                effective += share
+        return (total / effective, effective) if effective else (np.full(total.shape, np.nan), 0.0)
 
     def of(self, item: Series) -> NDArray[np.float64]:
         """The dark frame (row, column) of a series, DN: of its own session where that has darks; 0 where it is taken off."""

@@ -321,3 +321,27 @@ def test_two_averaged_darks_bound_the_read_variance_whatever_their_pattern():
     # 9900 differences: their median is known to 2 %
     assert most_read_variance(darks, good) == pytest.approx(1.2 * READ_DN**2, rel=0.08)
     assert most_read_variance(darks[:1], good) is None
+
+
+def test_pixels_that_jump_from_one_averaged_dark_to_the_next_are_noisy(tmp_path):
+    rng = np.random.default_rng(3)
+    jumping = {(20, 20): 30.0, (40, 7): 45.0}  # DN; the noise of a mean dark is a quarter of READ_DN
+    pattern = 1.0 + 0.03 * rng.standard_normal(SHAPE)
+
+    def mean_frame(level, number):
+        frame = averaged(level * pattern, rng)
+        for place, size in jumping.items():
+            frame[0][place] += size * (-1.0) ** number
+        return frame
+
+    with write_acquisition(tmp_path / "pairs.h5", Instrument(bits=16, pixel_mm=0.15)) as writer:
+        words = {"exposure_ms": 20.0, "averaged": AVERAGED}
+        for number in range(4):
+            writer.add_series(f"dark_{number}", kind="dark", frames=mean_frame(0.0, number), **words)
+            for level in (500.0, 2000.0, 8000.0):
+                flat = {"kV": 40.0, "power_W": level / 400.0, **words}
+                writer.add_series(f"flat_{number}_{level:g}", kind="flat", frames=mean_frame(level, number), **flat)
+    with open_acquisition(tmp_path / "pairs.h5") as acquisition:
+        found = compute_photon_transfer(acquisition)
+    assert {tuple(place) for place in np.argwhere(found.maps.bad_pixels)} == set(jumping)
+    assert found.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.05)

@@ -4,21 +4,27 @@ import copy
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from raytwin.acquisition import DatasetRow, write_dataset
+from raytwin.acquisition.setting import Setting
 from raytwin.campaign import table as table_module
+from raytwin.campaign import table_effects as effects_module
 from raytwin.campaign import trial as trial_module
 from raytwin.campaign._plain import plain
 from raytwin.campaign.chain import claim_folder
 from raytwin.campaign.demo import PAPER_PLAN, run_demo
 from raytwin.campaign.table import alarms_at, equivalence_of, half_width, networks_text, plan_of, reason_text, run_table
+from raytwin.campaign.table_effects import EffectsPlan
 from raytwin.campaign.table_page import table_page
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.files import only_one
+from raytwin.generator.twins.shipped import shipped_calibration
+from raytwin.generator.twins.twin_io import read_twin
 from raytwin.reports import write_result_page
 from raytwin.segmentation import Detection, write_detections
 
@@ -295,6 +301,9 @@ def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
         (["--margin", "0"], "--margin: got 0.0"),
         (["--size", "96"], "--size: got 96"),
         (["--workers", "0"], "--workers: got 0"),
+        (["--effect", "motion=3"], "--effect: got 'motion'; expected an effect's id, such as motion_blur"),
+        (["--effect", "motion_blur"], "--effect: got 'motion_blur'"),
+        (["--effect-networks", "0"], "networks of lines with an effect: got 0"),
     ],
 )
 def test_bad_options_are_one_line_and_make_no_folder(words, message, tmp_path, capsys):
@@ -310,6 +319,91 @@ def test_the_networks_are_the_starter_or_the_papers():
     assert networks_text(random).startswith(
         "10 networks an exposure, DeepLabV3Plus with the encoder efficientnet-b0, 600 steps"
     )
+
+
+TASK = {
+    "a90_before": 0.10,
+    "a90_before_95": {"low": 0.09, "high": 0.11},
+    "a90_after": 0.13,
+    "a90_after_95": {"low": 0.12, "high": 0.15},
+    "a90_real": 0.14,
+    "a90_real_95": {"low": 0.12, "high": 0.17},
+    "compare": {
+        "before_against_real": {"difference_a90": {"value": -0.04, "low": -0.07, "high": -0.02}},
+        "after_against_real": {"difference_a90": {"value": -0.01, "low": -0.04, "high": 0.02}},
+    },
+    "curves": {"before_on_before": {"objects": 110}},
+    "warnings": ["one thing"],
+}
+CAUSE = {
+    "effect": "motion_blur",
+    "probability": 0.99,
+    "parameters": {"strength": {"value": 3.9, "low": 3.7, "high": 4.2, "unit": "px"}},
+}
+DIAGNOSIS = {"verdict": "explained", "causes": [CAUSE], "gap": {"before": 5.0, "after": 1.1, "floor": 1.0}}
+
+
+@pytest.fixture
+def line_with_effect(monkeypatch):
+    """Commands of a line with an effect in it: the twin, its products and the task are stood in for."""
+    ran, shipped = [], read_twin(shipped_calibration("virtual_lab"))
+    pairs = [tuple(Setting(kV=kV, power_W=40, exposure_ms=ms) for kV in (40, 90)) for ms in (25, 100)]
+    monkeypatch.setattr(effects_module, "read_twin", lambda path: shipped)
+    monkeypatch.setattr(effects_module, "_settings", lambda products: pairs)
+    monkeypatch.setattr(effects_module, "run_task", lambda *words, **options: TASK)
+
+    def run_line(words):
+        if words[0] not in ("lab", "diagnose") or ("--effect" not in words and words[0] == "lab"):
+            return run(words)
+        ran.append(words)
+        out = Path(words[words.index("-o") + 1])
+        for path in (out,) if words[0] == "lab" else (out / "twin.h5",):
+            path.parent.mkdir(exist_ok=True, parents=True)
+            path.write_bytes(b"")
+        planted = {"motion_blur": {"strength": 4.0, "unit": "px"}}
+        print(json.dumps({"effects": planted} if words[0] == "lab" else DIAGNOSIS))
+        return 0
+
+    return run_line, ran
+
+
+def test_a_line_with_an_effect_stands_beside_the_table_before_and_after(line_with_effect, tmp_path):
+    run_line, ran = line_with_effect
+    plan, parts = EffectsPlan(effects=("motion_blur=4",)), []
+    words = {"run": run_line, "version": "1", "effects": plan}
+    result = run_table(PLAN, tmp_path / "t", **words, each=lambda part: parts.append(copy.deepcopy(part)))
+    assert [one["effects_pending"] for one in parts] == [["motion_blur"]] * 3 + [[]]
+    (line,) = result["effects"]
+    assert [row["exposure_ms"] for row in line["rows"]] == [25.0, 100.0]
+    assert line["found"]["strength"]["value"] == 3.9
+    page = table_page(result)
+    section = next(part for part in page.sections if part.title == "Lines with an effect in them")
+    assert section.table.rows[1][1:] == (
+        "3.9 (3.7 to 4.2) px",
+        "100 ms",
+        "0.100 (0.090 to 0.110)",
+        "0.130 (0.120 to 0.150)",
+        "0.140 (0.120 to 0.170)",
+        "-0.040 (-0.070 to -0.020)",
+        "-0.010 (-0.040 to +0.020)",
+    )
+    assert "Lines with an effect are still to come" in " ".join(table_page(parts[-2]).answer)
+    # again: nothing is measured or diagnosed a second time; another plan of a line is refused
+    assert len(ran) == 3
+    assert run_table(PLAN, tmp_path / "t", **words) == result
+    assert len(ran) == 3
+    with pytest.raises(InputError, match="a line of another plan"):
+        run_table(PLAN, tmp_path / "t", **{**words, "effects": dataclasses.replace(plan, networks=4)})
+
+
+def test_an_effect_that_was_not_named_is_said_to_be(line_with_effect, tmp_path, monkeypatch):
+    monkeypatch.setitem(DIAGNOSIS, "verdict", "no_gap")
+    monkeypatch.setitem(DIAGNOSIS, "causes", [])
+    plan = EffectsPlan(effects=("motion_blur=4",))
+    result = run_table(PLAN, tmp_path / "t", run=line_with_effect[0], version="1", effects=plan)
+    assert result["effects"][0]["found"] == {"verdict": "no_gap", "named": [], "strength": None, "probability": None}
+    section = next(part for part in table_page(result).sections if part.title.startswith("Lines"))
+    assert section.table.rows[0][1] == "no gap"
 
 
 @pytest.mark.slow

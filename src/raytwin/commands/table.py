@@ -1,12 +1,14 @@
 """The paper's table on the virtual lab's line: contrast at POD 90 %, generated against measured test images, at each exposure.
 
 Networks learn from images that the twin generated and are tried on measured and on generated images of the same products, at
-the same rate of false alarms; differences come with their 95 % intervals, and equivalence at a margin is stated or refused. A
+the same rate of false alarms; differences come with their 95 % intervals, and equivalence at a margin is stated or refused. Lines
+with an effect in them follow: a90 as the twin has it before the effect was found, with it added, and as measured. A
 table that was stopped goes on with the same command; the page and the numbers are written after every row.
 """
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alarm-share", type=float, help="rate of false alarms that thresholds are set for (0.05)")
     parser.add_argument("--without-published", action="store_true", help="without images generated as published")
     parser.add_argument(
+        "--effect",
+        metavar="ID=STRENGTH",
+        action="append",
+        help="an effect that stands in a line of its own; repeatable"
+        " (object_scatter=20, motion_blur=4, veiling_glare=3)",
+    )
+    parser.add_argument("--effect-networks", type=int, help="networks of each kind there (3)")
+    parser.add_argument("--effect-products", type=int, help="products measured there, half of them to test on (240)")
+    parser.add_argument("--without-effects", action="store_true", help="without lines with an effect")
+    parser.add_argument(
         "--workers",
         type=int,
         default=1,
@@ -59,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run `raytwin table`."""
     from .. import __version__
     from ..campaign.table import plan_of, run_table
+    from ..campaign.table_effects import EffectsPlan
     from ..campaign.table_page import table_page
     from ..cli import main
     from ..reports import write_result_page
@@ -67,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise InputError("--workers", received=arguments.workers, expected="1 or more")
     plan = plan_of(**_plan_words(arguments))
+    effects = None if arguments.without_effects else EffectsPlan(**_effects_words(arguments))
     device = choose_device(arguments.device)  # says at once how to install torch where it is missing
     started = time.monotonic()
 
@@ -78,12 +92,14 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.output,
         run=main,
         version=__version__,
+        effects=effects,
         workers=arguments.workers,
         device=device,
         tell=lambda line: say(f"[{time.monotonic() - started:5.0f} s] {line}"),
         each=page,
     )
     lines = [_line(row) for row in result["rows"]]
+    lines += [_effect_line(line, row) for line in result["effects"] for row in line["rows"]]
     answer(result, as_json=arguments.json, text="\n".join([*lines, f"report: {arguments.output / 'report.html'}"]))
     return 0
 
@@ -116,6 +132,26 @@ def _plan_words(arguments: argparse.Namespace) -> dict[str, Any]:
                 "--exposures-ms", received=repr(arguments.exposures_ms), expected="times in ms joined by commas"
             ) from None
     return {**words, "line": line, "published": not arguments.without_published}
+
+
+def _effects_words(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The changes of the usual lines with an effect that the options ask for."""
+    given = {
+        "effects": None if arguments.effect is None else tuple(arguments.effect),
+        "networks": arguments.effect_networks,
+        "products": arguments.effect_products,
+        "seed": arguments.seed,
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _effect_line(line: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+    """One exposure of a line with an effect in a line of text."""
+    told = ", ".join(
+        f"{label} {_text(row[key]['a90'])}"
+        for label, key in (("twin as calibrated", "before"), ("with what was found", "after"), ("measured", "real"))
+    )
+    return f"{line['effect']}, {row['exposure_ms']:g} ms: {told}"
 
 
 def _line(row: dict[str, Any]) -> str:

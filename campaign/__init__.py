@@ -12,7 +12,7 @@ Files:
     decision           whether a setting meets a requirement; decision_report: its part of the page
     trial              networks trained on one file and tried on another
     ensemble           networks of one recipe in several processes
-    table              the paper's table; table_page: its page
+    table              the paper's table; table_effects: lines with an effect beside it; table_page: its page
     fresh_noise        training with new noise at every look
     task               POD before and after a diagnosis; object_material: what its objects are made of
     starter            images of the starter network

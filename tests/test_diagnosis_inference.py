@@ -19,6 +19,7 @@ from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
+from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
 from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
@@ -840,12 +841,59 @@ def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_act
         assert effects == (("effect0", "effect1") if both else ("effect0",))
 
 
+@pytest.mark.parametrize(("steady", "named"), [(True, ("effect0", "effect1")), (False, ("effect0",))])
+def test_a_steady_law_leaves_nothing_in_the_noise_of_frames_beyond_its_share_of_what_it_does_there(steady, named):
+    rng = np.random.default_rng(8)
+    of_noise = np.arange(PROBES) % 20 >= 16  # the last probes of each series
+    made = independent((300, 1.0), *[(10, 1.0)] * 9)
+    strong = one_node(
+        "effect0", made[0].response(1.0) * np.where(of_noise, 0.003, 1.0), low=0.01, high=5000.0, steady=steady
+    )
+    shape = np.where(of_noise & (GROUPS < 15), rng.choice((-1.0, 1.0), PROBES), 0.0)
+    weak = one_node("effect1", shape / np.linalg.norm(shape), low=0.01, high=5000.0)
+    off = 1.0 + 0.2 * rng.standard_normal(PROBES)
+    residual = 800.0 * strong.response(1.0) * off + 16.0 * weak.response(1.0) + rng.standard_normal(PROBES)
+    observed = replace(seen(residual), aspects=2 * GROUPS + of_noise)
+    chosen = [strong, weak, *(replace(one, high=5000.0) for one in made[2:])]
+    found = weigh_hypotheses(
+        [(observed, fit_effects(observed, chosen))], families=Families(of=GROUPS, names=NAMES), rests=False
+    )
+    assert found[0].effects == named
+
+
+def test_of_an_effect_a_steady_law_could_leave_what_is_in_proportion_in_series_of_one_beam_and_scene():
+    rng = np.random.default_rng(4)
+    factors = rng.standard_normal((PROBES, 6)) * (GROUPS < 3)[:, None]
+    whitening = Whitening(factors, GROUPS // 3)
+    beam = np.repeat(np.arange(10), 3)[GROUPS]  # three series each
+    alike = np.where(
+        beam < 9, 20 * beam + np.arange(PROBES) % 20, 1000 + np.arange(PROBES)
+    )  # nothing known of the last
+    light = rng.uniform(1.0, 10.0, 30)[GROUPS]
+    steady = [
+        one_node(str(number), light * rng.standard_normal(180 + 20)[alike % 200], steady=True) for number in range(5)
+    ]
+    other = one_node("other", rng.standard_normal(PROBES))
+    found = Steady([*steady, other], alike, whitening)
+    for curve in whitening.curves(steady[:2]):
+        np.testing.assert_allclose(found.of(curve).responses[:, beam < 9], curve.responses[:, beam < 9], atol=1e-9)
+    (white,) = whitening.curves([replace(other, spread=rng.standard_normal((PROBES, 2)))])
+    left = found.of(white)
+    for vector, before in ((left.responses, white.responses), (left.spread.T, white.spread.T)):
+        share = whitening.undo(vector) / light
+        for number in range(9 * 20):
+            assert np.ptp(share[:, alike == number], axis=1) == pytest.approx(0.0, abs=1e-9)
+        np.testing.assert_allclose(vector[:, beam == 9], before[:, beam == 9], atol=1e-9)
+    again = found.of(left)
+    np.testing.assert_allclose(again.responses, left.responses, atol=1e-9)
+
+
 def test_what_a_curve_moves_in_a_series_is_what_it_would_move_there_alone_whatever_nuisances_series_share():
     rng = np.random.default_rng(11)
     (curve,) = independent((300, 1.0))
     common = 3.0 * rng.standard_normal((PROBES, 2))  # moves all series together
     observed = seen(noise(rng, common), common)
-    squares = observed.squares_by_series(curve, 20.0)
+    squares = observed.squares_by_part(curve, 20.0, observed.series)
     covariance = np.eye(PROBES) + common @ common.T
     alone = np.where(GROUPS == 4, curve.response(20.0), 0.0)
     assert squares[4] == pytest.approx(alone @ np.linalg.solve(covariance, alone), rel=1e-9)

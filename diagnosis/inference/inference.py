@@ -161,10 +161,12 @@ def _left_by_given(
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
-    squares = np.sum([observed.squares_by_series(one.curve, one.strength) for one in observed.given], axis=0)
+    parts = observed.parts(steady=all(one.curve.steady for one in observed.given))
+    squares = np.sum([observed.squares_by_part(one.curve, one.strength, parts) for one in observed.given], axis=0)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
-        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, squares, levels)
+        weighed[effect].log_evidence
+        + left_in_place(observed, singles[effect].best, singles[effect].best, parts, squares, levels)
         for effect in others
     )
 

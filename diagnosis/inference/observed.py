@@ -12,6 +12,7 @@ from scipy.sparse import csc_array
 from ..model.curves import Curve
 from .discrepancy import LEAST_FACTOR, credible, law_factors, own_variance
 from .nuisances import Nuisances
+from .steady import Steady
 
 # of the logarithm of a strength beside which something else is sought: wide against what the probes tell of it
 FREE_SD = 1.0
@@ -38,8 +39,10 @@ class Observed:
 
     Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
     one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law leaves
-    nothing that shows in a series, or in a part of it, that it does not move; root (probe,): standard deviations of the probes in
-    the units of the first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
+    nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what their mean shows and
+    each kind of what their frames differ by apart (None: `series`): a steady law leaves no more in one than it moves there; steady:
+    what of an effect such a law could leave (None: all of it); root (probe,): standard deviations of the probes in the units of the
+    first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
     """
 
     residual: NDArray[np.float64]
@@ -47,6 +50,8 @@ class Observed:
     groups: NDArray[np.intp]
     places: NDArray[np.intp]
     series: NDArray[np.intp]
+    aspects: NDArray[np.intp] | None = None
+    steady: Steady | None = None
     root: NDArray[np.float64] | None = None
     given: tuple[Point, ...] = ()
 
@@ -65,6 +70,11 @@ class Observed:
         """Of the residual, but for a constant that all that come from the same probes share."""
         squares = float(self.residual @ self.left)
         return -0.5 * (self.nuisances.log_determinant + squares) - float(np.sum(np.log(self.units)))
+
+    @cached_property
+    def _projected_alone(self) -> NDArray[np.float64]:
+        """What nuisances make of each probe by itself (probe, factor), as `Nuisances.project` has it."""
+        return self.nuisances.project(np.eye(len(self.residual)))
 
     @cached_property
     def _standing(self) -> dict[frozenset[str], "Observed"]:
@@ -149,6 +159,8 @@ class Observed:
             groups=self.groups[probes],
             places=self.places[probes],
             series=self.series[probes],
+            aspects=None if self.aspects is None else self.aspects[probes],
+            steady=None,
             root=None if self.root is None else self.root[probes],
         )
 
@@ -160,20 +172,23 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def squares_by_series(self, curve: Curve, strength: float) -> NDArray[np.float64]:
-        """The square of `length` in each series (series,), were the curve (in these units) to move that series and no other.
+    def parts(self, *, steady: bool) -> NDArray[np.intp]:
+        """Part of the session (probe,) in which a law, steady or not, leaves no more than a share of what it moves there."""
+        return self.aspects if steady and self.aspects is not None else self.series
 
-        So a nuisance that series share brings nothing into series that the curve does not move.
+    def squares_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
+        """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.
+
+        So a nuisance that parts share brings nothing into those that the curve does not move.
         """
         moved = self._moved(curve, strength)
         squares = np.sum(moved**2, axis=0)
         if curve.jitter is not None:
             squares = squares + strength**2 * curve.jitter
-        found = np.bincount(self.series, weights=squares)
-        for row in moved:
-            alone = np.zeros((len(found), len(row)))
-            alone[self.series, np.arange(len(row))] = row
-            found -= np.sum(self.nuisances.project(alone) ** 2, axis=1)
+        found = np.bincount(parts, weights=squares)
+        for part in range(len(found)):
+            own = np.flatnonzero(parts == part)
+            found[part] -= float(np.sum((moved[:, own] @ self._projected_alone[own]) ** 2))
         return np.maximum(found, 0.0)
 
     @staticmethod

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..model.curves import Curve
 from .curve_fits import CurveFit, fit_curve, log_integral, log_mean_exp, refined
-from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency
+from .discrepancy import FARTHEST_LEVEL, LEVELS, at_most_off, leak_below, leak_density, log_frequency, only
 from .observed import Observed, Point
 
 _IN_FULL = 3  # pairs, the likeliest at first sight, that are settled: with ten the same are named (notebook, ablation)
@@ -144,41 +144,57 @@ def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
 def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     """Which of two moves the probes more, and how much likelier its law's leaving the other's shape is than that effect: log of it.
 
-    The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior.
+    The likelihood of the weaker one's strength is integrated over what such a law leaves in place of that effect's prior. Of that
+    shape a steady law leaves what is steady.
     """
     weak, strong = sorted(
         pair.fits, key=lambda effect: observed.length(pair.fits[effect].curve, pair.fits[effect].best)
     )
-    first = pair.fits[strong]
-    squares = observed.squares_by_series(first.curve, first.best)
+    first, second = pair.fits[strong], pair.fits[weak]
+    left = second
+    if first.curve.steady and not second.curve.steady and observed.steady is not None:
+        _, beside = _beside_first(observed, first.point, weak)
+        second, left = (
+            replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
+            for curve in (second.curve, observed.steady.of(second.curve))
+        )
+    parts = observed.parts(steady=first.curve.steady)
+    squares = observed.squares_by_part(first.curve, first.best, parts)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)
-    return strong, left_in_place(observed, pair.fits[weak], squares, list(zip(shares, levels, strict=False)))
+    return strong, left_in_place(observed, second, left, parts, squares, list(zip(shares, levels, strict=False)))
 
 
 def left_in_place(
-    observed: Observed, second: CurveFit, squares: NDArray[np.float64], levels: Sequence[tuple[float, float]]
+    observed: Observed,
+    second: CurveFit,
+    shape: CurveFit,
+    parts: NDArray[np.intp],
+    squares: NDArray[np.float64],
+    levels: Sequence[tuple[float, float]],
 ) -> float:
     """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
 
     Args:
         observed: what is weighed.
         second: the effect's fit beside that law.
-        squares: how far the law moves the probes of each series, squared standard deviations (series,).
+        shape: the fit of what such a law could leave of the effect's shape.
+        parts: of the session (probe,), in each of which the law leaves its own share.
+        squares: how far the law moves the probes of each part, squared standard deviations (part,).
         levels: by which it is off, each after its probability.
     """
-    own = observed.squares_by_series(second.curve, second.best)
-    # of what it would have to leave in a series over what it does there, as much as the effect shows there; a series that a law does
-    # not move is left as it is to a standard deviation
+    own = observed.squares_by_part(shape.curve, second.best, parts)
+    # of what it would have to leave in a part over what it does there, as much as the effect shows there; a part that a law does not
+    # move is left as it is to a standard deviation
     ratio = max(math.sqrt(float(np.sum(own**2 / (squares + 1.0))) / max(float(np.sum(own)), 1e-12)), 1e-12)
-    ratios = ratio * second.strengths / second.best
-    least = ratio / max(observed.length(second.curve, second.best), 1.0)  # a standard deviation
+    ratios = ratio * shape.strengths / second.best
+    least = ratio / max(observed.length(shape.curve, second.best), 1.0)  # a standard deviation
     density = sum(share * leak_density(ratios, level, least) for share, level in levels)
     low = sum(share * leak_below(float(ratios[0]), level, least) for share, level in levels)
-    top = float(second.log_likelihood.max())
-    likelihood = np.exp(second.log_likelihood - top)
-    left = float(np.trapezoid(likelihood * density, np.log(second.strengths))) + float(likelihood[0]) * low
+    top = float(shape.log_likelihood.max())
+    likelihood = np.exp(shape.log_likelihood - top)
+    left = float(np.trapezoid(likelihood * density, np.log(shape.strengths))) + float(likelihood[0]) * low
     there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
     return top + math.log(max(left, 1e-300)) - there
 

@@ -42,6 +42,13 @@ class Whitening:
                 result[np.ix_(there, members)] = solve_triangular(lower, own[there].T, lower=True, check_finite=False).T
         return result
 
+    def undo(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vectors (vector, probe) as they were before `apply`."""
+        result = np.zeros(whitened.shape)
+        for members, lower in zip(self._members, self._lower, strict=True):
+            result[:, members] = whitened[:, members] @ lower.T
+        return result
+
     def variances(self, variances: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances (probe,) of independent extra noise of the probes, as they are in whitened ones."""
         from scipy.linalg import solve_triangular

@@ -20,6 +20,7 @@ from ..inference.local_nuisances import LocalNuisances
 from ..inference.nuisances import Nuisances
 from ..inference.observed import Observed
 from ..inference.refine import SEEN_FROM, refine
+from ..inference.steady import Steady
 from ..inference.whitening import Whitening
 from ..model.curves import Curve
 from ..problem.known_effects import with_found
@@ -174,6 +175,8 @@ def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]
         nuisances=Nuisances(whitening.factors),
         groups=problem.groups,
         series=problem.left_apart,
+        aspects=problem.aspects,
+        steady=Steady(problem.curves, problem.alike, whitening),
         places=problem.places,
         given=tuple(replace(point, curve=curve) for point, curve in zip(problem.given, given, strict=True)),
     )

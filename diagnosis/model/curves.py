@@ -27,7 +27,8 @@ class Curve:
     strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
     the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
     probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %); beside: id of
-    another effect beside which it responds so (empty: none need be there).
+    another effect beside which it responds so (empty: none need be there); steady: what the effect changes of the noise of frames
+    follows from what it changes of their mean.
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -47,6 +48,7 @@ class Curve:
     log_prior: float = 0.0
     most: float = math.inf
     beside: str = ""
+    steady: bool = False
 
     @property
     def reach(self) -> tuple[float, float]:

@@ -22,6 +22,7 @@ from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 from .asked_again import AskedAgain
 
+_OF_FRAMES = ("noise", "texture", "time")  # axes of what frames of a series differ by
 _WITHOUT_SCENE = 0.07  # time that a series without a scene takes, over that of one with a scene
 
 
@@ -128,6 +129,23 @@ class Problem:
     def left_apart(self) -> NDArray[np.intp]:
         """Series of each probe (probe,), what one effect alone can make apart: a law leaves nothing where it moves nothing."""
         return self._numbered(["" for _ in self.names])
+
+    @property
+    def aspects(self) -> NDArray[np.intp]:
+        """The same (probe,), with what a series' mean frame shows and each kind of what its frames differ by apart."""
+        return self._numbered([name.axis if name.axis in _OF_FRAMES else "mean frame" for name in self.names])
+
+    @property
+    def alike(self) -> NDArray[np.intp]:
+        """Number (probe,) that one probe of the mean frame has in all series of one beam and scene, before calibration or after."""
+        keys = []
+        for number, (view, name) in enumerate(zip(self.series_of, self.names, strict=True)):
+            own = self.views[view].session
+            beam = own.series.kind, own.series.scene, own.series.kV, own.series.filters, own.request.source_object_mm
+            alone = name.statistic != "mean frame" or own.series.kind == "dark"
+            keys.append(str(number) if alone else f"{beam} {own.calibrates} {name.location}")
+        _, found = np.unique(keys, return_inverse=True)
+        return np.asarray(found, dtype=np.intp)
 
     def _numbered(self, kinds: Sequence[str]) -> NDArray[np.intp]:
         exact = read_exactly()

@@ -50,6 +50,7 @@ COMPOSITION_ERROR = Effect(
     stage="beam",
     reference="mu t (1 + d) of one material",
     after_calibration=False,
+    steady=True,
     change=_scale_attenuation,
     needs=("spectral", "scene"),
     options={

@@ -95,6 +95,7 @@ CROSSTALK = Effect(
     stage="object_blur",
     reference="noise of quanta stays whiter than the picture's transfer function tells: Lubberts (1968), doi:10.1364/JOSA.58.001475",
     after_calibration=False,
+    steady=True,
     change=_move_quanta,
     needs=("scene",),
     isolated_by="an edge close to the detector, with the noise power of flats",

@@ -38,6 +38,7 @@ FILTRATION_ERROR = Effect(
     stage="beam",
     reference="Beer-Lambert with aluminium",
     after_calibration=True,
+    steady=True,
     change=_shift_filtration,
     needs=("spectral",),
     isolated_by="flats at two tube voltages with and without a known filter",

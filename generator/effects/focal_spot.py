@@ -84,6 +84,7 @@ FOCAL_SPOT = Effect(
     stage="object_blur",
     reference="geometric unsharpness, EN 12543; Gaussian to even brightness",
     after_calibration=False,
+    steady=True,
     change=_blur_by_focal_spot,
     needs=("scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="an edge at two magnifications",

@@ -105,6 +105,7 @@ K_FLUORESCENCE = Effect(
     stage="optics",
     reference="Metz and Vyborny (1983), doi:10.1088/0031-9155/28/5/008",
     after_calibration=False,
+    steady=True,
     change=_spread_k_photons,
     needs=("spectral", "pixel_mm"),
     isolated_by="the same at a tube voltage below the scintillator's K edge (30 kV) and above it (60 kV)",

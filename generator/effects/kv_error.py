@@ -63,6 +63,7 @@ KV_ERROR = Effect(
     stage="beam",
     reference="spectrum model at kV (1 + d)",
     after_calibration=True,
+    steady=True,
     change=_shift_kV,
     needs=("spectral",),
     isolated_by="flats and two materials of known thickness at several tube voltages",

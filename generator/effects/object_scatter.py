@@ -298,6 +298,7 @@ OBJECT_SCATTER = Effect(
     stage="arrivals",
     reference="convolution model of scatter: Ohnesorge, Flohr, Klingenbeck-Regn (1999), doi:10.1007/s003300050710",
     after_calibration=False,
+    steady=True,
     change=_add_scatter,
     needs=("spectral", "scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="a slab at two gaps to the detector, or a beam stop",

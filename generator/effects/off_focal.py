@@ -82,6 +82,7 @@ OFF_FOCAL = Effect(
     stage="object_blur",
     reference="Birch, Br. J. Radiol. 49 (1976) 951-955; a second source behind the same object",
     after_calibration=False,
+    steady=True,
     change=_add_source,
     needs=("scene", "pixel_mm", "source_object_mm", "source_detector_mm"),
     isolated_by="an opaque disc at two magnifications",

@@ -71,6 +71,7 @@ VEILING_GLARE = Effect(
     stage="optics",
     reference="Seibert, Nalcioglu, Roeck (1984), doi:10.1118/1.595527",
     after_calibration=False,
+    steady=True,
     change=_add_glare,
     needs=("pixel_mm",),
     isolated_by="opaque discs of several sizes",

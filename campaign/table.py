@@ -195,9 +195,10 @@ def run_table(
         for exposure in exposures[1:] if plan.published else ():
             rows[exposure]["published"] = work.arm(exposure, "published")
             each(work.answer(rows, exposures))
-        for asked in () if effects is None else effects.effects:
-            work.effects.append(run_effect(effects, asked, chain=chain, device=device))
-            each(work.answer(rows, exposures))
+        if effects is not None:
+            for asked in effects.effects:
+                work.effects.append(run_effect(effects, asked, chain=chain, device=device))
+                each(work.answer(rows, exposures))
         return work.answer(rows, exposures)
 
 

@@ -6,6 +6,7 @@ Files:
     curve_fits        evidence and strength of one effect
     in_series         in which series an effect acts
     pairs             two effects at once
+    steady            what a law that does the same to every frame may leave beside itself
     unknown           what no catalogue entry explains
     discrepancy       how far laws of a kind depart from ours (`discrepancy.toml`)
     nuisances         factor model of the nuisances, integrated out

@@ -841,13 +841,17 @@ def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_act
         assert effects == (("effect0", "effect1") if both else ("effect0",))
 
 
-@pytest.mark.parametrize(("steady", "named"), [(True, ("effect0", "effect1")), (False, ("effect0",))])
-def test_a_steady_law_leaves_nothing_in_the_noise_of_frames_beyond_its_share_of_what_it_does_there(steady, named):
+@pytest.mark.parametrize(
+    ("course", "named"), [("steady", ("effect0", "effect1")), ("random", ("effect0", "effect1")), ("", ("effect0",))]
+)
+def test_a_law_of_known_course_leaves_nothing_in_the_noise_of_frames_beyond_its_share_of_what_it_does_there(
+    course, named
+):
     rng = np.random.default_rng(8)
     of_noise = np.arange(PROBES) % 20 >= 16  # the last probes of each series
     made = independent((300, 1.0), *[(10, 1.0)] * 9)
     strong = one_node(
-        "effect0", made[0].response(1.0) * np.where(of_noise, 0.003, 1.0), low=0.01, high=5000.0, steady=steady
+        "effect0", made[0].response(1.0) * np.where(of_noise, 0.003, 1.0), low=0.01, high=5000.0, course=course
     )
     shape = np.where(of_noise & (GROUPS < 15), rng.choice((-1.0, 1.0), PROBES), 0.0)
     weak = one_node("effect1", shape / np.linalg.norm(shape), low=0.01, high=5000.0)
@@ -871,7 +875,8 @@ def test_of_an_effect_a_steady_law_could_leave_what_is_in_proportion_in_series_o
     )  # nothing known of the last
     light = rng.uniform(1.0, 10.0, 30)[GROUPS]
     steady = [
-        one_node(str(number), light * rng.standard_normal(180 + 20)[alike % 200], steady=True) for number in range(5)
+        one_node(str(number), light * rng.standard_normal(180 + 20)[alike % 200], course="steady")
+        for number in range(5)
     ]
     other = one_node("other", rng.standard_normal(PROBES))
     found = Steady([*steady, other], alike, whitening)

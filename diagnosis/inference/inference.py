@@ -161,7 +161,7 @@ def _left_by_given(
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
-    parts = observed.parts(steady=all(one.curve.steady for one in observed.given))
+    parts = observed.parts([one.curve for one in observed.given])
     squares = np.sum([observed.squares_by_part(one.curve, one.strength, parts) for one in observed.given], axis=0)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(

@@ -38,11 +38,11 @@ class Observed:
     """A residual and its covariance.
 
     Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
-    one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law leaves
-    nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what their mean shows and
-    each kind of what their frames differ by apart (None: `series`): a steady law leaves no more in one than it moves there; steady:
-    what of an effect such a law could leave (None: all of it); root (probe,): standard deviations of the probes in the units of the
-    first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
+    one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law
+    leaves nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what their mean shows and
+    each kind of what their frames differ by apart (None: `series`): a law of a known course leaves no more in one than it moves there;
+    steady: what of an effect a steady law could leave (None: all of it); root (probe,): standard deviations of the probes in the
+    units of the first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
     """
 
     residual: NDArray[np.float64]
@@ -172,9 +172,12 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def parts(self, *, steady: bool) -> NDArray[np.intp]:
-        """Part of the session (probe,) in which a law, steady or not, leaves no more than a share of what it moves there."""
-        return self.aspects if steady and self.aspects is not None else self.series
+    def parts(self, curves: Sequence[Curve]) -> NDArray[np.intp]:
+        """Part of the session (probe,) in which laws leave no more than a share of what they move there.
+
+        Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own.
+        """
+        return self.aspects if self.aspects is not None and all(one.course for one in curves) else self.series
 
     def squares_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.

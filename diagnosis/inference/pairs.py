@@ -152,14 +152,16 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     )
     first, second = pair.fits[strong], pair.fits[weak]
     left = second
-    if first.curve.steady and not second.curve.steady and observed.steady is not None:
+    if first.curve.course == "steady" != second.curve.course and observed.steady is not None:
         _, beside = _beside_first(observed, first.point, weak)
         second, left = (
             replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
             for curve in (second.curve, observed.steady.of(second.curve))
         )
-    parts = observed.parts(steady=first.curve.steady)
-    squares = observed.squares_by_part(first.curve, first.best, parts)
+    parts = observed.parts([first.curve])
+    # what is new to every frame does nothing to their mean but by chance, which the covariance holds
+    acting = replace(first.curve, spread=None, jitter=None) if first.curve.course == "random" else first.curve
+    squares = observed.squares_by_part(acting, first.best, parts)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)

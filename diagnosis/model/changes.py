@@ -125,7 +125,7 @@ class Variant:
             log_prior=self.log_prior,
             most=self.most,
             beside="" if self.beside is None else self.beside.id,
-            steady=EFFECTS[self.effect].steady,
+            course=EFFECTS[self.effect].course,
         )
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":

@@ -27,8 +27,8 @@ class Curve:
     strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
     the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
     probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %); beside: id of
-    another effect beside which it responds so (empty: none need be there); steady: what the effect changes of the noise of frames
-    follows from what it changes of their mean.
+    another effect beside which it responds so (empty: none need be there); course: what the effect is from frame to
+    frame, as `Effect` says.
     Between nodes and zero the response is interpolated (Lagrange through
     the four nearest points, 0 one of them).
     """
@@ -48,7 +48,7 @@ class Curve:
     log_prior: float = 0.0
     most: float = math.inf
     beside: str = ""
-    steady: bool = False
+    course: str = ""
 
     @property
     def reach(self) -> tuple[float, float]:

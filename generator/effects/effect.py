@@ -18,6 +18,7 @@ LIT_SERIES = ("flat", "object")
 # of a diagnosis' answer
 AXES = ("level", "noise", "sharpness", "texture", "time", "position", "energy", "tails", "task")
 
+COURSES = ("", "steady", "random")  # of an effect over the frames of one setting and scene
 ABSORBED = {
     "nothing": "a flat that calibrated shows it as any other flat does",
     "numbers": "level, gain or spectrum hold it whole: a constant one is no gap",
@@ -207,8 +208,8 @@ class Effect:
         needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`,
             `counting` (a photon counter).
         remembers_all: light of all earlier series acts, not that of the last ones alone.
-        steady: it does the same to every frame of one setting and scene, so that what it changes of their noise follows from what it
-            changes of their mean.
+        course: `steady`: it does the same to every frame of one setting and scene, so that what it changes of their noise follows from
+            what it changes of their mean; `random`: something new to every frame, and nothing to their mean; empty: neither, or both.
         options: words that an applied effect may carry, with what they mean.
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
             diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.
@@ -236,7 +237,7 @@ class Effect:
     options: Mapping[str, str] = field(default_factory=dict)
     timed: bool = False
     remembers_all: bool = False
-    steady: bool = False
+    course: str = ""
     reading: Reading = Reading()
     grid: Grid = Grid()
     variation: Variation = Variation()
@@ -253,6 +254,8 @@ class Effect:
             raise InputError(
                 f"effect {self.id}, absorbed", received=self.absorbed, expected="one of " + ", ".join(ABSORBED)
             )
+        if self.course not in COURSES:
+            raise InputError(f"effect {self.id}, course", received=self.course, expected=" or ".join(COURSES[1:]))
         if not self.parameters or self.parameters[0].name != "strength":
             raise InputError(f"effect {self.id}", received="no strength", expected="strength as first parameter")
         known = [item.name for item in self.parameters]

@@ -36,6 +36,7 @@ EXCESS_NOISE = Effect(
     stage="quanta",
     reference="Swank (1973), doi:10.1063/1.1662918",
     after_calibration=True,
+    course="random",
     change=_add_excess,
     isolated_by="flats of many frames at several levels",
     shows=Shows(series=LIT_SERIES, axis="position"),

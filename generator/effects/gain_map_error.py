@@ -69,7 +69,7 @@ GAIN_MAP_ERROR = Effect(
     stage="response",
     reference="fixed-pattern noise (PRNU), EMVA Standard 1288, release 4.0",
     after_calibration=True,
-    steady=True,
+    course="steady",
     change=_change_gain,
     isolated_by="flats repeated, and behind a filter",
     shows=Shows(series=EVERY_SERIES, axis="position", flats=False),

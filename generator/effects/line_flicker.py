@@ -62,6 +62,7 @@ LINE_FLICKER = Effect(
     stage="exposure",
     reference="rolling shutter under modulated light: Liang, Chang, Chen (2008), doi:10.1109/TIP.2008.925384",
     after_calibration=False,
+    course="random",
     change=_flicker,
     isolated_by="flats and darks of many frames: lines that darks do not show",
     shows=Shows(series=LIT_SERIES, axis="position"),

@@ -55,7 +55,7 @@ MTF_TAIL = Effect(
     stage="optics",
     reference="Lorentzian transfer function of screens: Burgess (1978), doi:10.1118/1.594387",
     after_calibration=True,
-    steady=True,
+    course="steady",
     change=_add_tail,
     isolated_by="an edge close to the detector, with flats",
     shows=Shows(series=LIT_SERIES, axis="sharpness"),

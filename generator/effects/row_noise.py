@@ -64,6 +64,7 @@ ROW_NOISE = Effect(
     stage="electronics",
     reference="correlated line noise of flat panels and CMOS; EMVA Standard 1288, release 4.0",
     after_calibration=False,
+    course="random",
     change=_add_row_noise,
     isolated_by="darks",
     shows=Shows(series=EVERY_SERIES, axis="position"),

@@ -37,12 +37,13 @@ class Point:
 class Observed:
     """A residual and its covariance.
 
-    Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is off by
-    one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,): a law
-    leaves nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what their mean shows and
-    each kind of what their frames differ by apart (None: `series`): a law of a known course leaves no more in one than it moves there;
-    steady: what of an effect a steady law could leave (None: all of it); root (probe,): standard deviations of the probes in the
-    units of the first (None: 1); given: effects that the twin has, which are still in the residual: `standing` takes them off.
+    Fields: residual (probe,), in standard deviations; nuisances, their factor model; groups (probe,), within which a law is
+    off by one factor; places (probe,), within which it is off by a share of no more than what is seen there; series (probe,):
+    a law leaves nothing that shows in a series, or in a part of it, that it does not move; aspects (probe,): series with what
+    their mean shows and each kind of what their frames differ by apart (None: `series`): a law of a known course leaves no
+    more in one than it moves there; steady: what of an effect a steady law could leave (None: all of it); root (probe,):
+    standard deviations of the probes in the units of the first (None: 1); given: effects that the twin has, which are still
+    in the residual: `standing` takes them off.
     """
 
     residual: NDArray[np.float64]

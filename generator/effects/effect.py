@@ -208,8 +208,8 @@ class Effect:
         needs: what must be known of instrument or series: `source_object_mm`, `source_detector_mm`, `pixel_mm`, `spectral`, `scene`,
             `counting` (a photon counter).
         remembers_all: light of all earlier series acts, not that of the last ones alone.
-        course: `steady`: it does the same to every frame of one setting and scene, so that what it changes of their noise follows from
-            what it changes of their mean; `random`: something new to every frame, and nothing to their mean; empty: neither, or both.
+        course: `steady`: it does the same to every frame of one setting and scene, so that what it changes of their noise follows
+            from what it changes of their mean; `random`: something new to every frame, and nothing to their mean; empty: neither.
         options: words that an applied effect may carry, with what they mean.
         after_calibration: usual onset: True, it set in after the calibration series; False, it was always there; either_onset: the
             diagnosis tries both. in_some_series: it may act in some series only, such as those on a moving belt.

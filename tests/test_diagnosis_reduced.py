@@ -662,6 +662,27 @@ def test_what_one_effect_alone_can_make_is_a_place_of_its_own(line):
     assert len(set(apart)) == len(set(series)) + np.count_nonzero(copies)
     assert set(apart[copies]).isdisjoint(apart[~copies])
     assert {problem.families.names[number] for number in problem.families.exact} == {"repeated frames"}
+    # of steady laws the mean frame and each kind of what frames differ by
+    assert len(set(problem.aspects)) > len(set(apart))
+    assert all(len(set(apart[problem.aspects == one])) == 1 for one in set(problem.aspects))
+
+
+def test_probes_are_alike_where_the_same_stood_in_the_same_beam(line):
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+    numbers, counts = np.unique(problem.alike, return_counts=True)
+    assert (counts > 1).sum() > 20
+    for number in numbers[counts > 1]:
+        members = np.flatnonzero(problem.alike == number)
+        stated = [problem.views[problem.series_of[one]].session for one in members]
+        assert len({problem.series_of[one] for one in members}) == len(members)
+        assert {problem.names[one].statistic for one in members} == {"mean frame"}
+        assert len({problem.names[one].location for one in members}) == 1
+        assert "dark" not in {one.series.kind for one in stated}
+        assert (
+            len({(one.series.scene, one.series.kV, one.request.panel_rotation_deg, one.calibrates) for one in stated})
+            == 1
+        )
 
 
 def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):

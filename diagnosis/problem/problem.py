@@ -137,13 +137,14 @@ class Problem:
 
     @property
     def alike(self) -> NDArray[np.intp]:
-        """Number (probe,) that one probe of the mean frame has in all series of one beam and scene, before calibration or after."""
+        """Number (probe,) that a probe of the mean frame has in all series of one beam, scene and geometry, calibrating or not."""
         keys = []
         for number, (view, name) in enumerate(zip(self.series_of, self.names, strict=True)):
-            own = self.views[view].session
-            beam = own.series.kind, own.series.scene, own.series.kV, own.series.filters, own.request.source_object_mm
+            own, asked = self.views[view].session, self.views[view].session.request
+            beam = own.series.kind, own.series.scene, own.series.kV, own.series.filters
+            geometry = asked.source_object_mm, asked.source_detector_mm, asked.panel_rotation_deg
             alone = name.statistic != "mean frame" or own.series.kind == "dark"
-            keys.append(str(number) if alone else f"{beam} {own.calibrates} {name.location}")
+            keys.append(str(number) if alone else f"{beam} {geometry} {own.calibrates} {name.location}")
         _, found = np.unique(keys, return_inverse=True)
         return np.asarray(found, dtype=np.intp)
 

@@ -32,6 +32,7 @@ WORN_SCREEN = Effect(
     isolated_by="a flat with the screen shifted",
     shows=Shows(series=LIT_SERIES, axis="position"),
     after_calibration=True,
+    course="steady",
     absorbed="maps",
     change=_wear,
     grid=Grid(shares=(0.8,)),

@@ -384,8 +384,13 @@ def test_a_line_with_an_effect_stands_beside_the_table_before_and_after(line_wit
         "0.100 (0.090 to 0.110)",
         "0.130 (0.120 to 0.150)",
         "0.140 (0.120 to 0.170)",
-        "-0.040 (-0.070 to -0.020)",
-        "-0.010 (-0.040 to +0.020)",
+    )
+    told = "difference from measured: before -0.040 (-0.070 to -0.020), after -0.010 (-0.040 to +0.020)."
+    assert section.items == (
+        f"motion blur, 25 ms, {told}",
+        f"motion blur, 100 ms, {told}",
+        "motion blur, 25 ms: one thing",
+        "motion blur, 100 ms: one thing",
     )
     assert "Lines with an effect are still to come" in " ".join(table_page(parts[-2]).answer)
     # again: nothing is measured or diagnosed a second time; another plan of a line is refused

@@ -266,7 +266,8 @@ def _effects(result: Mapping[str, Any]) -> Section:
         for row in line["rows"]
     ]
     differences = [
-        f"{name}, difference from measured: before {_signed(row['before_less_real'] or {})}, after {_signed(row['after_less_real'] or {})}."
+        f"{name}, difference from measured: before {_signed(row['before_less_real'] or {})},"
+        f" after {_signed(row['after_less_real'] or {})}."
         for name, row in told
     ]
     notes = [f"{name}: {warning}" for name, row in told for warning in row["warnings"]]

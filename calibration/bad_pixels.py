@@ -24,7 +24,10 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
     closest = np.zeros(darks.per_ms.shape)  # largest departure, in limits
     # noise far below the distance of the codes shows in pixels that lie between two of them alone: half of it in a mean
-    step_DN = max((least_change(item.read_frames(0, min(item.n_frames, 2))) for item, _ in darks.sums), default=1.0)
+    steps = [(least_change(item.read_frames(0, min(item.n_frames, 2))), item.averaged) for item, _ in darks.sums]
+    step_DN = max((step for step, _ in steps), default=1.0)
+    # what a step in a mean of exposures is in the variance of one
+    step_DN2 = max((averaged * step**2 for step, averaged in steps), default=1.0)
     for key, mean in darks.by_exposure.items():
         local = mean - median_filter(mean, size=5, mode="nearest")
         centre, spread = _robust_spread(local)
@@ -43,7 +46,7 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats would take 40 MB
 
         centre = float(np.median(variance)) * effective / float(chdtri(effective, 0.5))
-        limit = centre * float(chdtri(effective, _NOISY_CHANCE)) / effective + step_DN**2
+        limit = centre * float(chdtri(effective, _NOISY_CHANCE)) / effective + step_DN2
         code[(variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])

@@ -14,6 +14,7 @@ from ..acquisition.acquisition_io import open_acquisition
 from ..acquisition.pairs import object_pairs
 from ..acquisition.setting import Setting
 from ..errors import InputError
+from ..generator.effects import EFFECTS
 from ..generator.twins.twin_io import read_twin
 from ..lab.effects import request_from_text
 from ._plain import plain
@@ -22,7 +23,7 @@ from .task import TaskInput, TaskPlan, run_task
 
 SESSION, PRODUCTS, DIAGNOSIS = "session.h5", "products.h5", "diagnosis"
 USUAL_EFFECTS = ("object_scatter=20", "motion_blur=4", "veiling_glare=3")  # clear ones, within plausible ranges
-_BONES_MM = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
+_BONES_MM = "1,1.5,2,2.5,3,4"
 _TAKEN = ("before", "after", "real")
 
 
@@ -33,6 +34,10 @@ class EffectsPlan:
     Fields: effects (ID=STRENGTH[@always|@calibration] each, as `raytwin lab` takes them); networks of each kind at each exposure;
     products measured on another day, half of them to try networks on; size (pixels, side of the detector); frames a series of
     the session that is diagnosed; seed.
+
+    Example:
+        >>> EffectsPlan(effects=("motion_blur=4", "heel=5@calibration")).names
+        ('motion_blur', 'heel')
     """
 
     effects: tuple[str, ...] = USUAL_EFFECTS
@@ -50,9 +55,16 @@ class EffectsPlan:
                     received=getattr(self, name),
                     expected=f"a whole number, {least} or more",
                 )
-        names = self.names
-        if len(set(names)) < len(names):
-            raise InputError("--effect", received=", ".join(names), expected="each effect once")
+        asked = [request_from_text(one) for one in self.effects]
+        for one in asked:
+            if one.id not in EFFECTS or one.strength == 0.0:
+                raise InputError(
+                    "--effect",
+                    received=f"{one.id}={one.strength:g}",
+                    expected="an effect that a diagnosis can name, at a strength that is not 0",
+                )
+        if len(set(self.names)) < len(asked):
+            raise InputError("--effect", received=", ".join(self.names), expected="each effect once")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,28 +97,17 @@ def run_effect(plan: EffectsPlan, asked: str, *, chain: Chain, device: str) -> d
     claim_folder(folder, plain(asdict(one)), what="a line")
     own = replace(chain, directory=folder)
     at = own.path
-    words = [
-        "--family",
-        "none",
-        "--no-unkindness",
-        "--size",
-        str(plan.size),
-        "--seed",
-        str(plan.seed),
-        "--effect",
-        asked,
-    ]
+    words = ["--effect", asked, *f"--family none --no-unkindness --size {plan.size} --seed {plan.seed}".split()]
     truth = own.step(
         "lab_session",
         ["lab", "-o", at(SESSION), "--protocol", "full", "--frames", str(plan.frames), *words],
         outputs=[SESSION],
     )
-    own.step(
-        "lab_products",
-        ["lab", "-o", at(PRODUCTS), "--protocol", "products", "--session", "1", "--products", str(plan.products), "--frames", "20",
-         "--bones-mm", ",".join(f"{length:g}" for length in _BONES_MM), *words],
-        outputs=[PRODUCTS],
-    )  # fmt: skip
+    # a tenth of the frames for each product: two
+    of_products = (
+        f"--protocol products --session 1 --products {plan.products} --frames 20 --bones-mm {_BONES_MM}".split()
+    )
+    own.step("lab_products", ["lab", "-o", at(PRODUCTS), *of_products, *words], outputs=[PRODUCTS])
     answer = own.step(
         "diagnose",
         ["diagnose", at(SESSION), "-o", at(DIAGNOSIS), "--seed", str(plan.seed)],

@@ -250,6 +250,7 @@ def _published(pairs: Sequence[Mapping[str, Any]]) -> Section:
 def _effects(result: Mapping[str, Any]) -> Section:
     """Lines with an effect in them: the three a90 of every exposure, and how far the twin's lie from the measured one."""
     plan = result["effects_plan"]
+    every = [(line, row) for line in result["effects"] for row in line["rows"]]
     rows = [
         (
             f"{line['effect'].replace('_', ' ')}, {line['strength']:g} {line['unit']}",
@@ -257,14 +258,9 @@ def _effects(result: Mapping[str, Any]) -> Section:
             f"{row['exposure_ms']:g} ms",
             *(_a90(row[name]) for name in ("before", "after", "real")),
         )
-        for line in result["effects"]
-        for row in line["rows"]
+        for line, row in every
     ]
-    told = [
-        (f"{line['effect'].replace('_', ' ')}, {row['exposure_ms']:g} ms", row)
-        for line in result["effects"]
-        for row in line["rows"]
-    ]
+    told = [(f"{line['effect'].replace('_', ' ')}, {row['exposure_ms']:g} ms", row) for line, row in every]
     differences = [
         f"{name}, difference from measured: before {_signed(row['before_less_real'] or {})},"
         f" after {_signed(row['after_less_real'] or {})}."
@@ -281,14 +277,7 @@ def _effects(result: Mapping[str, Any]) -> Section:
             " half, in images of their own kind. Contrast at POD 90 % with its 95 % interval.",
         ),
         table=SortedTable(
-            header=(
-                "in the line",
-                "found",
-                "exposure",
-                "before",
-                "after",
-                "measured",
-            ),
+            header=("in the line", "found", "exposure", "before", "after", "measured"),
             rows=tuple(rows),
             words=frozenset({0, 1, 2}),
         ),

@@ -345,3 +345,28 @@ def test_pixels_that_jump_from_one_averaged_dark_to_the_next_are_noisy(tmp_path)
         found = compute_photon_transfer(acquisition)
     assert {tuple(place) for place in np.argwhere(found.maps.bad_pixels)} == set(jumping)
     assert found.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.05)
+
+
+def test_pixels_between_two_codes_of_an_averaged_dark_are_not_noisy(tmp_path):
+    """Means that are stored as whole numbers, their noise far below a code: most pixels never change, some do by one code."""
+    rng = np.random.default_rng(4)
+    level = rng.uniform(99.0, 103.0, SHAPE)
+
+    def mean_frame(signal):
+        exact = (
+            level + signal + 0.03 * rng.standard_normal(SHAPE) + np.sqrt(signal / AVERAGED) * rng.standard_normal(SHAPE)
+        )
+        return np.rint(exact)[None].astype(np.uint16)
+
+    with write_acquisition(tmp_path / "coarse.h5", Instrument(bits=16, pixel_mm=0.15)) as writer:
+        words = {"exposure_ms": 20.0, "averaged": AVERAGED}
+        for number in range(4):
+            writer.add_series(f"dark_{number}", kind="dark", frames=mean_frame(0.0), **words)
+            for signal in (500.0, 2000.0, 8000.0):
+                flat = {"kV": 40.0, "power_W": signal / 400.0, **words}
+                writer.add_series(f"flat_{number}_{signal:g}", kind="flat", frames=mean_frame(signal), **flat)
+    with open_acquisition(tmp_path / "coarse.h5") as acquisition:
+        darks = np.array([item.read_frames(0, 1)[0] for item in acquisition.of_kind("dark")], float)
+        found = compute_photon_transfer(acquisition)
+    assert 0.02 < np.mean(np.ptp(darks, axis=0) > 0) < 0.3
+    assert not found.maps.bad_pixels.any()

@@ -303,6 +303,12 @@ def test_equivalence_is_stated_or_refused_with_the_reason(test, state, reason):
         (["--workers", "0"], "--workers: got 0"),
         (["--effect", "motion=3"], "--effect: got 'motion'; expected an effect's id, such as motion_blur"),
         (["--effect", "motion_blur"], "--effect: got 'motion_blur'"),
+        (["--effect", "motion_blur=0"], "--effect: got motion_blur=0"),
+        (["--effect", "unknown:sharpening=20"], "expected an effect that a diagnosis can name"),
+        (["--effect", "heel=5", "--effect", "heel=6"], "expected each effect once"),
+        (["--effect", "motion_blur=nan"], "strength of motion_blur: got nan px"),
+        (["--effect", "heel=5", "--without-effects"], "--without-effects: got with options of lines"),
+        (["--effect-products", "3"], "products of lines with an effect: got 3"),
         (["--effect-networks", "0"], "networks of lines with an effect: got 0"),
     ],
 )

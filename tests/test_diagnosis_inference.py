@@ -893,6 +893,13 @@ def test_of_an_effect_a_steady_law_could_leave_what_is_in_proportion_in_series_o
     np.testing.assert_allclose(again.responses, left.responses, atol=1e-9)
 
 
+def test_each_probe_by_itself_is_projected_as_a_unit_vector_is(setup):
+    rng, factors, _ = setup
+    laws = group_factors(3.0 * rng.standard_normal(PROBES), GROUPS, 0.4)
+    for nuisances in (Nuisances(factors), Nuisances(factors, laws)):
+        np.testing.assert_allclose(nuisances.project_each(), nuisances.project(np.eye(PROBES)), atol=1e-12)
+
+
 def test_what_a_curve_moves_in_a_series_is_what_it_would_move_there_alone_whatever_nuisances_series_share():
     rng = np.random.default_rng(11)
     (curve,) = independent((300, 1.0))

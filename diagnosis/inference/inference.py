@@ -161,12 +161,10 @@ def _left_by_given(
     others = [effect for effect in singles if not observed.has(effect)]
     if not (observed.given and others):
         return None
-    parts = observed.parts([one.curve for one in observed.given])
-    squares = np.sum([observed.squares_by_part(one.curve, one.strength, parts) for one in observed.given], axis=0)
+    acting = observed.acting(observed.given)
     levels = [(1.0, at_most_off(observed.given[0].level))]
     return max(
-        weighed[effect].log_evidence
-        + left_in_place(observed, singles[effect].best, singles[effect].best, parts, squares, levels)
+        weighed[effect].log_evidence + left_in_place(observed, singles[effect].best, acting, levels)
         for effect in others
     )
 

@@ -47,13 +47,20 @@ class Nuisances:
 
     def project(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """z (vector, factor) with a^T C^-1 b = a.b - z_a.z_b for vectors (vector, probe)."""
+        return self._projected(self.factors.T @ vectors.T, None if self.of_laws is None else self.of_laws @ vectors.T)
+
+    def project_each(self) -> NDArray[np.float64]:
+        """The same (probe, factor) of each probe by itself."""
+        return self._projected(self.factors.T, None if self.of_laws is None else self.of_laws.toarray())
+
+    def _projected(self, of_factors: NDArray[np.float64], of_laws: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """z (vector, factor), from factors times vectors (factor, vector) of both kinds."""
         from scipy.linalg import solve_triangular
 
-        right = self.factors.T @ vectors.T
-        if self.of_laws is None:
-            return np.asarray(solve_triangular(self._cholesky, right, lower=True, check_finite=False).T)
-        own = self._laws.half(self.of_laws @ vectors.T)
-        right -= self._shared.T @ own
+        if of_laws is None:
+            return np.asarray(solve_triangular(self._cholesky, of_factors, lower=True, check_finite=False).T)
+        own = self._laws.half(of_laws)
+        right = of_factors - self._shared.T @ own
         return np.concatenate([own, solve_triangular(self._cholesky, right, lower=True, check_finite=False)]).T
 
     def inner(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

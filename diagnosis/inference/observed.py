@@ -75,7 +75,7 @@ class Observed:
     @cached_property
     def _projected_alone(self) -> NDArray[np.float64]:
         """What nuisances make of each probe by itself (probe, factor), as `Nuisances.project` has it."""
-        return self.nuisances.project(np.eye(len(self.residual)))
+        return self.nuisances.project_each()
 
     @cached_property
     def _standing(self) -> dict[frozenset[str], "Observed"]:
@@ -173,12 +173,25 @@ class Observed:
             squares += strength**2 * float(np.sum(curve.jitter))
         return math.sqrt(max(squares, 0.0))
 
-    def parts(self, curves: Sequence[Curve]) -> NDArray[np.intp]:
-        """Part of the session (probe,) in which laws leave no more than a share of what they move there.
+    def acting(self, points: Sequence[Point]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Part of the session (probe,) in which laws leave no more than a share of what they do there, and that: squares (part,).
 
-        Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own.
+        Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
+        every frame does nothing to their mean but by chance, which the covariance holds.
         """
-        return self.aspects if self.aspects is not None and all(one.course for one in curves) else self.series
+        known = all(point.curve.course for point in points)
+        parts = self.aspects if known and self.aspects is not None else self.series
+        squares = [
+            self.squares_by_part(
+                replace(point.curve, spread=None, jitter=None)
+                if known and point.curve.course == "random"
+                else point.curve,
+                point.strength,
+                parts,
+            )
+            for point in points
+        ]
+        return parts, np.sum(squares, axis=0)
 
     def squares_by_part(self, curve: Curve, strength: float, parts: NDArray[np.intp]) -> NDArray[np.float64]:
         """The square of `length` in each of some parts (part,), were the curve (in these units) to move that part and no other.

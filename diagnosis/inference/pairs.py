@@ -152,40 +152,39 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     )
     first, second = pair.fits[strong], pair.fits[weak]
     left = second
-    if first.curve.course == "steady" != second.curve.course and observed.steady is not None:
+    if first.curve.course == "steady" and second.curve.course != "steady" and observed.steady is not None:
         _, beside = _beside_first(observed, first.point, weak)
         second, left = (
             replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
             for curve in (second.curve, observed.steady.of(second.curve))
         )
-    parts = observed.parts([first.curve])
-    # what is new to every frame does nothing to their mean but by chance, which the covariance holds
-    acting = replace(first.curve, spread=None, jitter=None) if first.curve.course == "random" else first.curve
-    squares = observed.squares_by_part(acting, first.best, parts)
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
     shares = np.exp(shares - np.logaddexp.reduce(shares))
     levels = map(at_most_off, LEVELS.levels)
-    return strong, left_in_place(observed, second, left, parts, squares, list(zip(shares, levels, strict=False)))
+    acting = observed.acting([first.point])
+    return strong, left_in_place(observed, second, acting, list(zip(shares, levels, strict=False)), shape=left)
 
 
 def left_in_place(
     observed: Observed,
     second: CurveFit,
-    shape: CurveFit,
-    parts: NDArray[np.intp],
-    squares: NDArray[np.float64],
+    acting: tuple[NDArray[np.intp], NDArray[np.float64]],
     levels: Sequence[tuple[float, float]],
+    *,
+    shape: CurveFit | None = None,
 ) -> float:
     """How much likelier it is that a law leaves an effect's shape than that the effect is there: log of it.
 
     Args:
         observed: what is weighed.
         second: the effect's fit beside that law.
-        shape: the fit of what such a law could leave of the effect's shape.
-        parts: of the session (probe,), in each of which the law leaves its own share.
-        squares: how far the law moves the probes of each part, squared standard deviations (part,).
+        acting: parts of the session (probe,), in each of which the law leaves its own share, and how far it moves the probes of each,
+            squared standard deviations (part,).
         levels: by which it is off, each after its probability.
+        shape: the fit of what such a law could leave of the effect's shape; None: all of it.
     """
+    shape = second if shape is None else shape
+    parts, squares = acting
     own = observed.squares_by_part(shape.curve, second.best, parts)
     # of what it would have to leave in a part over what it does there, as much as the effect shows there; a part that a law does not
     # move is left as it is to a standard deviation

@@ -80,7 +80,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise InputError("--workers", received=arguments.workers, expected="1 or more")
     plan = plan_of(**_plan_words(arguments))
-    effects = None if arguments.without_effects else EffectsPlan(**_effects_words(arguments))
+    words = _effects_words(arguments)
+    if arguments.without_effects and words.keys() - {"seed"}:
+        raise InputError(
+            "--without-effects", received="with options of lines with an effect", expected="one or the other"
+        )
+    effects = None if arguments.without_effects else EffectsPlan(**words)
     device = choose_device(arguments.device)  # says at once how to install torch where it is missing
     started = time.monotonic()
 

@@ -15,10 +15,10 @@ from raytwin.campaign import table as table_module
 from raytwin.campaign import table_effects as effects_module
 from raytwin.campaign import trial as trial_module
 from raytwin.campaign._plain import plain
-from raytwin.campaign.chain import claim_folder
+from raytwin.campaign.chain import Chain, claim_folder
 from raytwin.campaign.demo import PAPER_PLAN, run_demo
 from raytwin.campaign.table import alarms_at, equivalence_of, half_width, networks_text, plan_of, reason_text, run_table
-from raytwin.campaign.table_effects import EffectsPlan
+from raytwin.campaign.table_effects import EffectsPlan, run_effect
 from raytwin.campaign.table_page import table_page
 from raytwin.cli import main
 from raytwin.errors import InputError
@@ -441,6 +441,31 @@ def test_a_small_table_is_the_same_bytes_with_two_workers_and_after_a_stop(tmp_p
     run_table(plan, tmp_path / "stopped", run=main, version="1", workers=2)
     for name in ("table.json", "hits_generated_50ms.csv", "hits_published_measured_50ms.csv"):
         assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_small_line_with_an_effect_goes_on_where_it_was_stopped(tmp_path):
+    plan = EffectsPlan(effects=("object_scatter=20",), networks=1, products=24, size=64, frames=8)
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(line):
+        if "task_100ms: networks of after" in line:
+            raise StoppedError
+
+    def made(name, tell=lambda line: None):
+        chain = Chain(directory=tmp_path / name, run=main, tell=tell)
+        return run_effect(plan, plan.effects[0], chain=chain, device="cpu")
+
+    whole = made("whole")
+    with pytest.raises(StoppedError):
+        made("stopped", stop)
+    assert made("stopped") == whole
+    assert [row["exposure_ms"] for row in whole["rows"]] == [25.0, 100.0]
+    assert whole["found"]["named"] == ["object_scatter"]
+    hits = "effects/object_scatter/task_100ms/hits_after_on_after.csv"
+    assert (tmp_path / "stopped" / hits).read_bytes() == (tmp_path / "whole" / hits).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,17 @@ from .dark_frames import DarkFrames
 from .frame_signs import least_change
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
+_DEAD = 0.5  # share of its neighbours' response below which a pixel is dead
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
 
 
 def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]]) -> NDArray[np.uint8]:
-    """Reason codes (row, column) from the darks' level and noise and from the flats' response."""
+    """Reason codes (row, column) from the darks' level and noise and from the flats' response.
+
+    The response is judged in the brightest flat, and what differs from that in each other one: a pixel may die in between.
+    """
     from scipy.ndimage import median_filter
 
     code = np.zeros(darks.per_ms.shape, dtype=np.uint8)
@@ -50,15 +54,26 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         code[(variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])
-    if not np.median(signal) > 0:
+    level = float(np.median(signal))
+    if not level > 0:
         return _with_clusters(code, closest)  # no response to judge; the caller says so
     local = median_filter(signal, size=5, mode="nearest")
     ratio = signal / np.where(local > 0, local, np.nan)
-    code[(~np.isfinite(ratio) | (ratio < 0.5)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
+    code[(~np.isfinite(ratio) | (ratio < _DEAD)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
     centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
     departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, 0.05))
     np.maximum(closest, departure, out=closest)
     code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    for item, total in flats:
+        if item is not brightest[0]:
+            judged = code == 0
+            change = np.where(judged, total.mean_DN - darks.of(item), 0.0) / np.where(judged, signal, 1.0) * level
+            centre, spread = _robust_spread(change[judged]) if np.any(judged) else (0.0, 0.0)
+            limit = max(_DARK_NOISE_SIGMAS * spread, 0.05 * centre)
+            if 0.0 < limit < _DEAD * centre:  # else it is too dim to tell a pixel that has lost half of its response
+                departed = judged & (np.abs(change - centre) > limit)
+                code[departed] = BAD_PIXEL_CODES["nonlinear"]
+                code[departed & (change < _DEAD * centre)] = BAD_PIXEL_CODES["dead"]
     return _with_clusters(code, closest)
 
 

@@ -1,5 +1,6 @@
 """Measured flats and darks -> a calibrated twin."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -31,9 +32,6 @@ from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
 
 __all__ = ["bad_pixel_counts", "calibrate_twin", "calibration_answer"]
-
-# relative, either way: draws of the posterior hardly go further than 0.05, and a varying voltage asks a step of 0.02 beyond
-_POSTERIOR_KV_ERROR = 0.07
 
 
 def calibrate_twin(
@@ -180,17 +178,17 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
     )
     materials = [layer.material for item in flats for layer in item.filters]
     # as far as errors of the voltage go, their tilt between voltages, and what a varying voltage takes to both sides
-    farthest = -PRIORS["kV_error"].low + 6.0 * PRIORS["kV_tilt"].sd + KV_STEP
-    wanted = dict.fromkeys(measured, farthest)
-    for kV in voltages_within_reach(measured, anode) if advise else ():
-        wanted.setdefault(kV, _POSTERIOR_KV_ERROR)
-    for highest_kV in sorted({measured[-1], max(wanted)}):
+    beyond = 6.0 * PRIORS["kV_tilt"].sd + KV_STEP
+    lowest, highest = PRIORS["kV_error"].low - beyond, PRIORS["kV_error"].high + beyond
+    wanted = sorted({*measured, *(voltages_within_reach(measured, anode) if advise else ())})
+    for highest_kV in sorted({measured[-1], wanted[-1]}):
         model = model_for(acquisition.instrument, materials=materials, highest_kV=highest_kV)
         stack = tuple(Filter(material=material, thickness_mm=0.1) for material in sorted({*materials, "Al", "Cu"}))
-        samples = np.repeat(model.default_parameters()[None, :], 25, axis=0)
-        for kV, largest in wanted.items():
-            samples[:, model.names.index("kV_error")] = np.linspace(-largest, largest, len(samples))
+        for kV in wanted:
             if kV <= model.highest_kV:
+                errors = np.linspace(lowest, highest, math.ceil((highest - lowest) * kV) + 2)  # one between any whole kV
+                samples = np.repeat(model.default_parameters()[None, :], len(errors), axis=0)
+                samples[:, model.names.index("kV_error")] = errors
                 model.log_derivatives(samples, OpenBeam(kV=kV, filters=stack), _shares(model.names))
 
 

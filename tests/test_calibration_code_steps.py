@@ -1,4 +1,4 @@
-"""Bad pixels of a panel whose codes lie far apart: pixels between two codes are good ones."""
+"""Bad pixels: of a panel whose codes lie far apart, and such as go bad between two flats."""
 
 from types import SimpleNamespace
 
@@ -46,6 +46,33 @@ def test_pixels_between_two_codes_are_not_bad(step_DN):
     lit = mean + 20000.0 * (1.0 + 0.01 * rng.standard_normal(SHAPE))
     found = find_bad_pixels(darks, [(item, SimpleNamespace(mean_DN=lit))])
     assert found[20, 30] == BAD_PIXEL_CODES["hot"] and np.count_nonzero(found) == 1
+
+
+def test_pixels_that_die_between_flats_are_found_in_any_but_the_dimmest():
+    rng = np.random.default_rng(8)
+    frames = frames_in_steps(1.0, rng)
+    mean = frames.mean(axis=0)
+    dark = series(frames)
+    sums = SimpleNamespace(mean_DN=mean, frames=len(frames), pairs=len(frames) - 1)
+    darks = DarkFrames(
+        {(0, 10.0): mean}, [(dark, sums)], np.zeros(SHAPE), frames.var(axis=0, ddof=1), len(frames) - 1.0
+    )
+    # each beam has a shape of its own; single flats are as noisy as 3 DN a quantum makes them
+    gain, tilt = 1.0 + 0.01 * rng.standard_normal(SHAPE), np.linspace(0.97, 1.03, SHAPE[1])
+
+    def flat(level_DN, shape=1.0):
+        lit = level_DN * gain * shape
+        return series(frames), lit + np.sqrt(3.0 * level_DN) * rng.standard_normal(SHAPE)
+
+    bright, other, dim, dimmest = flat(20000.0), flat(4000.0, tilt), flat(1000.0), flat(20.0)
+    other[1][5, 7] = 30.0
+    dim[1][9, 40] *= 0.3
+    dimmest[1][30, 30] = 0.0
+    flats = [(item, SimpleNamespace(mean_DN=mean + lit)) for item, lit in (bright, other, dim, dimmest)]
+    found = find_bad_pixels(darks, flats)
+    wrong = {tuple(int(at) for at in place): int(found[tuple(place)]) for place in np.argwhere(found)}
+    dead = BAD_PIXEL_CODES["dead"]
+    assert wrong == {(20, 30): BAD_PIXEL_CODES["hot"], (5, 7): dead, (9, 40): dead}
 
 
 def test_frames_that_tell_no_distance_of_codes_have_one_of_1_DN():

@@ -17,7 +17,7 @@ from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
 from raytwin.diagnosis.inference.refine_tasks import tasks_of
-from raytwin.diagnosis.inference.search import Slopes, _in_turn, searched
+from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
@@ -574,6 +574,23 @@ def test_a_search_asks_the_series_that_tell_most_for_what_they_cost():
     # what nuisances take back counts as nothing
     kept = blocks.telling(np.repeat([0.0, 50.0, -10.0, -5.0, 0.0, 30.0], 10))
     assert sorted(set(blocks.of[kept])) == [0, 1, 5]
+
+
+def test_a_parameter_at_the_end_of_its_range_leaves_the_others_where_they_are_wanted_then():
+    rng = np.random.default_rng(12)
+    rows = rng.standard_normal((4, 60)) + 2.0 * rng.standard_normal(60)  # what they do is much alike
+    normal, true = rows @ rows.T, np.array([1.0, 0.5, -0.4, 0.3])
+    wanted = normal @ true
+    free = np.array([[-np.inf, -1.0, -1.0, -1.0], [np.inf, 1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(_within(normal, wanted, free), true, atol=1e-9)
+    # the third stands at the low end of its range, the fourth has a little room
+    room = np.array([[-np.inf, -1.0, 0.0, -1.0], [np.inf, 1.0, 1.0, 0.2]])
+    found = _within(normal, wanted, room)
+    assert found[2] == pytest.approx(0.0, abs=1e-9) and found[3] == pytest.approx(0.2)
+    others = [0, 1]
+    best = np.linalg.solve(normal[np.ix_(others, others)], (wanted - normal @ [0.0, 0.0, 0.0, 0.2])[others])
+    np.testing.assert_allclose(found[others], best, rtol=1e-6)
+    assert np.abs(best - true[others]).max() > 0.05
 
 
 def test_curves_and_nuisances_of_some_probes_are_those_of_these():

@@ -245,6 +245,23 @@ def test_once_a_scene_is_found_its_size_and_turn_are_left_of_a_misregistration()
     assert shift.found_in_place() is shift  # nothing of it shows
 
 
+def test_how_far_a_moving_object_is_carried_is_told_against_the_base_twin():
+    def motion(strength, mean_place):
+        return AppliedEffect(
+            id="motion_blur", parameters={"strength": strength, "mean_place": mean_place}, since="always"
+        )
+
+    still = replace(as_twin("virtual_lab"), effects=())
+    seen = replace(request("object"), exposure_ms=100.0, belt_axis="column")
+    model = ForwardModel(base=still, conditions={})
+    # 4 px in 50 ms, half of them before the middle
+    assert model.carried_px(model.with_found([motion(4.0, 0.5)]), seen) == pytest.approx((0.0, 4.0))
+    assert model.carried_px(model.unchanged, seen) == (0.0, 0.0)
+    known = ForwardModel(base=replace(still, effects=(motion(4.0, 0.25),)), conditions={})
+    assert known.carried_px(known.with_found([motion(4.0, 0.5)]), seen) == pytest.approx((0.0, 2.0))
+    assert known.carried_px(known.without("motion_blur"), seen) == pytest.approx((0.0, -2.0))
+
+
 def test_an_effect_that_began_earlier_stands_for_a_later_one_unless_what_came_before_remembers():
     lag = {since: changed("image_lag", since=since, strength=0.01) for since in ("always", "calibration")}
     later = request("flat", previous=(request("flat"),))

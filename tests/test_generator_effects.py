@@ -519,6 +519,24 @@ def test_an_absorber_lies_between_its_two_borders(series_line, turn_deg, covers)
     np.testing.assert_allclose(passed[away], np.where(covers(row, column), 0.9, 1.0)[away], atol=2e-3)
 
 
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_glare_of_scattered_x_rays_makes_the_same_picture_and_moves_the_noise_with_it(series_line, share):
+    asked = request("object", thickness_mm=disc())
+    light = expect(series_line, asked, applied("veiling_glare", 4.0, length_mm=2.0))
+    found = expect(series_line, asked, applied("veiling_glare", 4.0, length_mm=2.0, xray_share=share))
+    np.testing.assert_allclose(found.signal_DN, light.signal_DN, atol=1e-3 * light.signal_DN.max())
+    flat, stays = (
+        float(np.mean(expect(series_line, request(), *effects).quantum_variance_DN2))
+        for effects in ((), [applied("veiling_glare", 4.0, length_mm=2.0, xray_share=share)])
+    )
+    assert stays / flat == pytest.approx((1.0 - 0.04 * (1.0 - share)) ** 2, rel=5e-3)
+    # in the middle of the shadow each DN that was scattered there has the noise of a DN of the beam
+    shadow, beam = (np.asarray(found.signal_DN)[20, place] for place in (20, 2))
+    in_shadow, in_beam = (np.asarray(found.quantum_variance_DN2)[20, place] for place in (20, 2))
+    scattered = in_shadow / in_beam * beam / shadow
+    assert scattered == pytest.approx(share, rel=0.15)
+
+
 def test_a_smaller_disc_lets_more_glare_into_its_middle(series_line):
     effect = applied("veiling_glare", 4.0, length_mm=2.0)
     small, large = (
@@ -594,8 +612,22 @@ def test_an_object_that_moves_unevenly_is_the_mean_of_where_it_stands(series_lin
     assert np.abs(even - stood)[inside].max() > 0.015 * step
 
 
-def test_a_standing_belt_blurs_nothing(series_line):
+@pytest.mark.parametrize("axis", ["row", "column"])
+def test_exposures_that_start_as_an_object_passes_have_it_half_a_path_further_on(series_line, axis):
+    plate = {"Al": np.where(np.indices(SHAPE).sum(axis=0) < 40, 8.0, 0.0)}
+    for exposure_ms in (20, 50):
+        setting = f"kv=90,power_w=45,exposure_ms={exposure_ms},filter=Cu:0.05"
+        asked = request("object", setting=setting, thickness_mm=plate, belt_axis=axis, source_object_mm=990.0)
+        found = expect(series_line, asked, applied("motion_blur", 6.0, mean_place=0.5))
+        away_px = 0.5 * 6.0 * exposure_ms / 50.0
+        moved = replace(asked, displacement_px=(away_px, 0.0) if axis == "row" else (0.0, away_px))
+        np.testing.assert_allclose(found.mean_DN, expect(series_line, moved, applied("motion_blur", 6.0)).mean_DN)
+
+
+def test_a_standing_belt_blurs_and_displaces_nothing(series_line):
     asked = request(**BEHIND, belt_speed_mm_s=0.0)
+    started = applied("motion_blur", 5.0, mean_place=0.5)
+    np.testing.assert_array_equal(expect(series_line, asked, started).mean_DN, expect(series_line, asked).mean_DN)
     np.testing.assert_array_equal(
         expect(series_line, asked, applied("motion_blur", 5.0)).mean_DN, expect(series_line, asked).mean_DN
     )

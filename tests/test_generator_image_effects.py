@@ -105,6 +105,17 @@ def test_the_mean_picture_with_any_effect_is_that_of_the_series_model(series_lin
         assert np.abs(wanted.signal_DN / plain.signal_DN - 1).max() > 4e-3
 
 
+def test_images_of_moving_objects_stay_where_their_masks_are(series_line):
+    thickness = hill()
+    found = []
+    for mean_place in (0.0, 0.5):
+        applied = AppliedEffect(id="motion_blur", parameters={"strength": 8.0, "mean_place": mean_place})
+        effects = channel(series_line, [applied]).image_effects
+        moments = fine_moments(series_line, HIGH, thickness)
+        found.append(effects.image(*moments, {"water_liquid": thickness}, focal_blur_px=0.0).charge.mean)
+    np.testing.assert_array_equal(found[0], found[1])
+
+
 @pytest.mark.parametrize(
     "effect", ["excess_noise", "mtf_tail", "k_fluorescence", "row_noise", "output_drift", "quantisation"]
 )

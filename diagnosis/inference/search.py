@@ -16,6 +16,9 @@ from .seen import Seen
 _CENTRINGS, _CENTRED = 3, 0.15  # times that nodes are laid anew, and logarithm of the strength that needs none
 _ROUNDS = 10  # of a search, at the most: it ends where nothing is gained
 _ENOUGH, _ENOUGH_SHARE = 1.0, 1e-5  # gain of log evidence, and share of it, below which the search ends
+# share of the gain that straight lines promise, below which slopes are asked anew
+# Source: Nocedal and Wright (2006), Numerical Optimization, algorithm 4.1
+_AS_HOPED = 0.25
 _STEP = 0.1  # of half a parameter's range: to find how responses change with it
 _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
@@ -118,22 +121,26 @@ class _Search:
                     here.fit.curve, here.variant, part, _plausible(here.fit, here.variant), self._seen
                 )
                 before = here
-                here = self._stepped(before, part, slopes)
+                here, hoped = self._stepped(before, part, slopes)
                 gained, evidence = here.fit.log_evidence - before.fit.log_evidence, before.fit.log_evidence
                 if gained >= max(_ENOUGH, _ENOUGH_SHARE * evidence):
-                    slopes = slopes.learnt(before.fit, here.fit, _step_of(part, before, here))
+                    as_hoped = gained > _AS_HOPED * hoped
+                    slopes = slopes.learnt(before.fit, here.fit, _step_of(part, before, here)) if as_hoped else None
                 elif learnt:
                     slopes = None
                 else:
                     break
         return replace(here, slopes=slopes)
 
-    def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "Slopes") -> _Found:
-        """The best along a step towards where the probes want some parameters; the start itself where none is better."""
+    def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "Slopes") -> tuple[_Found, float]:
+        """The best along a step towards where the probes want some parameters, the start itself where none is better.
+
+        With the log evidence that the whole step would gain were responses straight lines.
+        """
         # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
         # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
         shares = (1.0, 0.3, 0.1) if self._in_proportion else (1.0, _FURTHER, 0.3, 0.1)
-        steps = _newton(start.fit, start.variant, slopes, self._seen)
+        steps, hoped = _newton(start.fit, start.variant, slopes, self._seen)
         here = start
         for share in shares:
             helped = here is not start
@@ -148,7 +155,7 @@ class _Search:
             fit = self._tried(variant, here.strength)
             if fit is not None and fit.log_evidence > here.fit.log_evidence:
                 here = _Found(variant, fit.best, fit)
-        return here
+        return here, hoped
 
     def _tried(self, variant: Variant, strength: float) -> CurveFit | None:
         if not self._in_proportion:
@@ -232,11 +239,11 @@ def _plausible(here: CurveFit, variant: Variant) -> float:
     return min(max(here.best, variant.low), variant.high)
 
 
-def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> dict[str, float]:
-    """Steps of the inner parameters, each in half of its range, towards where the probes want them.
+def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> tuple[dict[str, float], float]:
+    """Steps of the inner parameters, each in half of its range, towards where the probes want them, and what they should gain.
 
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
-    as usual, each parameter within about its range.
+    as usual, each parameter within its range: what one would do beyond its end, the others do otherwise.
     """
     strength = _plausible(here, variant)
     at = np.asarray(here.curve.response(strength))
@@ -246,11 +253,35 @@ def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> dic
     normal = wide.inner(rows, rows)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12
-    solved = np.linalg.solve(normal, wide.inner(rows, left[None, :])[:, 0])
+    wanted = wide.inner(rows, left[None, :])[:, 0]
+    solved = _within(normal, wanted, _room(variant, slopes.names))
     # shortened as a whole: what parameters explain alike must keep its direction
     farthest = float(np.max(np.abs(solved[1:]), initial=0.0))
     solved *= min(1.0, _FARTHEST / max(farthest, 1e-12))
-    return {name: float(step) for name, step in zip(slopes.names, solved[1:], strict=True)}
+    gain = float(wanted @ solved - 0.5 * solved @ normal @ solved)
+    return {name: float(step) for name, step in zip(slopes.names, solved[1:], strict=True)}, gain
+
+
+def _room(variant: Variant, names: Sequence[str]) -> NDArray[np.float64]:
+    """Steps (2, 1 + parameter) of the strength, which is free, and of the inner parameters to the ends of their ranges."""
+    room = np.full((2, 1 + len(names)), np.inf) * np.array([[-1.0], [1.0]])
+    for item in EFFECTS[variant.effect].parameters:
+        if item.name in names and not _turns(item):
+            value = variant.parameters[item.name]
+            room[:, 1 + names.index(item.name)] = _way(item, value, item.low), _way(item, value, item.high)
+    return room
+
+
+def _within(normal: NDArray[np.float64], wanted: NDArray[np.float64], room: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The x of least x N x / 2 - w x within bounds (2, x)."""
+    solved = np.linalg.solve(normal, wanted)
+    if np.all((room[0] <= solved) & (solved <= room[1])):
+        return np.asarray(solved)
+    from scipy.optimize import lsq_linear
+
+    # where there is no room at all, as much as rounding needs
+    root, bounds = np.linalg.cholesky(normal).T, (np.minimum(room[0], -1e-12), np.maximum(room[1], 1e-12))
+    return np.asarray(lsq_linear(root, root @ solved, bounds=bounds, method="bvls").x)
 
 
 def _turns(item: Parameter) -> bool:

@@ -198,6 +198,17 @@ class ForwardModel:
         twin = replace(self.base, effects=rest) if had else self.base
         return Change(label=f"without {', '.join(effects)}", twin=twin, instead_of=had)
 
+    def carried_px(self, change: Change, request: SeriesRequest) -> tuple[float, float]:
+        """How much farther than in the base twin a scene lies on average under a change, along rows and columns."""
+        (down, right), (base_down, base_right) = (
+            _mean_shift_px(effects, twin, request)
+            for effects, twin in (
+                ((*change.twin.effects, *change.effects), change.twin),
+                (self.base.effects, self.base),
+            )
+        )
+        return down - base_down, right - base_right
+
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
         """The series as the base twin expects it.
 
@@ -240,6 +251,17 @@ class ForwardModel:
         return LineModel(
             change.twin, effects=effects, parameters=change.parameters, cache=self.cache, use_measured_level=False
         ).expect(request)
+
+
+def _mean_shift_px(effects: Sequence[AppliedEffect], twin: Twin, request: SeriesRequest) -> tuple[float, float]:
+    """How far effects displace a scene on average that registration finds, and that are no displacements themselves."""
+    down, right = 0.0, 0.0
+    for item in effects:
+        mean_shift = EFFECTS[item.id].mean_shift
+        if mean_shift is not None and (item.since == "always" or request.after_calibration):
+            of_one = mean_shift(item.parameters, request, twin)
+            down, right = down + of_one[0], right + of_one[1]
+    return down, right
 
 
 def own_maps(series: Iterable[SessionSeries]) -> bool:

@@ -32,13 +32,13 @@ class PlacedSeries:
     """Series with their scenes drawn where they were found.
 
     Fields: kept, in order of time, requests displaced; expected: of these, by name; placements: of series whose scene was
-    found, by name; telling: names of the series, one a place, that tell the displacement.
+    found, by name; telling: of each of these, the one of its place that tells the displacement.
     """
 
     kept: tuple[SessionSeries, ...]
     expected: Mapping[str, ExpectedSeries]
     placements: Mapping[str, Placement]
-    telling: frozenset[str]
+    telling: Mapping[str, SeriesRequest]
 
 
 def place_scenes(
@@ -63,21 +63,21 @@ def place_scenes(
     requests: dict[str, SeriesRequest] = {}
     drawn = dict(expected)
     placements: dict[str, Placement] = {}
-    telling: set[str] = set()
+    telling: dict[str, SeriesRequest] = {}
     for members in _places(kept).values():
         placement = _placement(members, expected, pictures, clean=clean, sharp=sharp, expect=expect)
         if placement is None:
             continue
-        telling.add(members[0].name)
         for item in members:
             placements[item.name] = placement
             requests[item.name] = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
+            telling[item.name] = requests[members[0].name]
             drawn[item.name] = expect(requests[item.name])
     return PlacedSeries(
         kept=tuple(replace(item, request=requests.get(item.name, item.request)) for item in kept),
         expected=drawn,
         placements=placements,
-        telling=frozenset(telling),
+        telling=telling,
     )
 
 

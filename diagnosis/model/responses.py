@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
+from ...generator.line.series_request import SeriesRequest
 from ..probes.fixed_pattern import OUTLIER_SD, pattern_noise, pattern_of
 from ..probes.line_scalars import bent_share
 from ..probes.model_scalars import expected_scalars
@@ -42,8 +43,8 @@ class SeriesModel:
     """One series as the base twin expects it.
 
     Fields: session; expected; context of its scalar probes; scalars_alone: expected scalar probes by name, without what line noise
-    leaves in dark and gain map; scalars: with that; placement of its scene (None: not found); tells_displacement: its scene's
-    displacement is among its probes.
+    leaves in dark and gain map; scalars: with that; placement of its scene, and place: the series that tells the displacement there
+    (None: not found).
     """
 
     session: SessionSeries
@@ -52,7 +53,12 @@ class SeriesModel:
     scalars_alone: dict[str, float]
     scalars: dict[str, float]
     placement: Placement | None
-    tells_displacement: bool
+    place: SeriesRequest | None
+
+    @property
+    def tells_displacement(self) -> bool:
+        """Its scene's displacement is among its probes."""
+        return self.place is self.session.request
 
     @property
     def name(self) -> str:
@@ -175,9 +181,8 @@ class SessionModel:
         if item.calibrates:
             moved, values = absorbed.mean_DN[one.name], absorbed.scalars[one.name]
         else:
-            shown = change if one.placement is None else change.found_in_place()
             try:
-                changed, moved, values = self._alone(one, shown, known)
+                changed, moved, values = self._alone(one, change, known)
             except InputError as error:
                 asked.failed = str(error)
                 return None
@@ -200,8 +205,23 @@ class SessionModel:
                 signals_DN=self.signals_DN,
             )
         if one.tells_displacement:
-            values = {**values, **_NO_DISPLACEMENT, **change.displacement}
+            values = {**values, **self._displacement(change, item.request)}
         return np.asarray(moved, dtype=np.float32), values
+
+    def _found(self, one: SeriesModel, change: Change) -> tuple[Change, SeriesRequest]:
+        """A change as a series shows it, and the series as it is asked, once registration has found where the scene lies."""
+        request = one.session.request
+        if one.place is None:
+            return change, request
+        carried, lies = self.model.carried_px(change, one.place), request.displacement_px
+        if carried != (0.0, 0.0):
+            request = replace(request, displacement_px=(lies[0] - carried[0], lies[1] - carried[1]))
+        return change.found_in_place(), request
+
+    def _displacement(self, change: Change, request: SeriesRequest) -> dict[str, float]:
+        """Where registration finds a scene under a change, px, by probe."""
+        carried = dict(zip((ALONG_ROWS, ALONG_COLUMNS), self.model.carried_px(change, request), strict=True))
+        return {name: away + change.displacement.get(name, 0.0) for name, away in carried.items()}
 
     def under(self, one: SeriesModel, asked: Asked) -> SeriesModel:
         """One series as it is expected under a change that can show there; what line noise leaves in maps aside.
@@ -209,14 +229,13 @@ class SessionModel:
         Raises:
             InputError: the twin knows too little for it.
         """
-        change = asked.change if one.placement is None else asked.change.found_in_place()
-        expected = self.model.under(change, one.session.request)
+        expected = self.model.under(*self._found(one, asked.change))
         return replace(one, expected=expected, scalars={**one.scalars, **expected_scalars(expected, one.context)})
 
     def with_scene(self, one: SeriesModel, thickness_mm: Mapping[str, NDArray[np.floating]], asked: Asked) -> Moved:
         """What another scene would show in a series (`under` the change that is asked), less what its own shows there."""
-        change = asked.change if one.placement is None else asked.change.found_in_place()
-        changed = self.model.under(change, replace(one.session.request, thickness_mm=dict(thickness_mm)))
+        change, request = self._found(one, asked.change)
+        changed = self.model.under(change, replace(request, thickness_mm=dict(thickness_mm)))
         moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
         return moved / asked.absorbed.divides, expected_scalars(changed, one.context)
 
@@ -226,10 +245,11 @@ class SessionModel:
         Raises:
             InputError: the twin knows too little for it.
         """
-        own = change.whenever_it_began(one.session.request)
+        shown, request = self._found(one, change)
+        own = shown.whenever_it_began(request)
         if own in known:
             return known[own]
-        changed = self.model.expect_changed(one.session.request, change, one.expected)
+        changed = self.model.expect_changed(request, shown, one.expected)
         if changed is one.expected:
             found = changed, NOWHERE, one.scalars_alone
         else:
@@ -287,7 +307,7 @@ def session_model(
             else (),
         )
         alone = expected_scalars(expected, context)
-        tells = item.name in placed.telling
+        place = placed.telling.get(item.name)
         series.append(
             SeriesModel(
                 session=item,
@@ -297,9 +317,9 @@ def session_model(
                 scalars=_with_patterns(
                     alone, lines, NOWHERE, item=item, context=context, maps=maps, signals_DN=signals_DN
                 )
-                | (_NO_DISPLACEMENT if tells else {}),
+                | (_NO_DISPLACEMENT if place is item.request else {}),
                 placement=placed.placements.get(item.name),
-                tells_displacement=tells,
+                place=place,
             )
         )
         if item.request.beam_on:

@@ -237,7 +237,7 @@ class ImageEffects:
         if self.twin.noise.spread.value.model == "aperture":
             state = replace(state, picture=FinePicture(fine=FineCells(cells), scale=level, signal_DN=means))
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
-        state = self._through(state, later, thickness_mm)
+        state = replace(self._through(state, later, thickness_mm), shift_px=(0.0, 0.0))  # masks stay with the picture
         if focal_blur_px > 0 and not any(effect_of(item).images.spot for item in self.effects):
             state = replace(state, object_transfers=(*state.object_transfers, _gaussian(focal_blur_px)))
         charge = self._charge(state)

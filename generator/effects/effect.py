@@ -10,7 +10,7 @@ from difflib import get_close_matches
 
 from ...errors import InputError
 from ..line.line_state import STAGES, Change
-from ..line.series_request import KINDS
+from ..line.series_request import KINDS, SeriesRequest
 from ..line.twin import Twin
 
 EVERY_SERIES = KINDS
@@ -196,6 +196,10 @@ class Placement:
     combined: Callable[[Mapping[str, float], Mapping[str, float]], dict[str, float]]
 
 
+# (parameters, series, twin) -> px along rows and along columns
+MeanShift = Callable[[Mapping[str, float], SeriesRequest, Twin], tuple[float, float]]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
     """An effect that a real line may have and the base model has not.
@@ -216,7 +220,8 @@ class Effect:
         absorbed: one of ABSORBED: what calibration takes in of one that was always there.
         shows, reading, grid, variation, images: see there.
         lost_in_squares: why it cannot be seen in squares of pixels; empty: it can.
-        always_a_little: what most lines have of it, if any; placement: of one that displaces scenes.
+        always_a_little: what most lines have of it, if any; placement: of one that displaces scenes; mean_shift: of one that does
+            other things to a scene, how far it displaces that on average, which registration finds.
         worked_in: (twin, strength) -> the twin whose own numbers are those of a line with it, and warnings; None: it stays an effect.
     """
 
@@ -245,6 +250,7 @@ class Effect:
     lost_in_squares: str = ""
     always_a_little: AlwaysALittle | None = None
     placement: Placement | None = field(default=None, repr=False)
+    mean_shift: MeanShift | None = field(default=None, repr=False)
     worked_in: Callable[[Twin, float], tuple[Twin, list[str]]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:

@@ -1,7 +1,10 @@
-"""Veiling glare: light that travels far inside the detector. It knows nothing of gap or thickness.
+"""Veiling glare: what travels far inside the detector. It knows nothing of gap or thickness.
 
 h = (1 - r) delta + r exp(-R / L) / (2 pi L R),    transfer function (1 - r) + r / sqrt(1 + (2 pi L f)^2)
 (`order` 1/2; other shapes: _light_spread.py). A share of r may be spread evenly over the whole panel, as by a cover or a housing.
+
+Light of a quantum that strays is shared by many pixels: noise of flats falls by (1 - r)^2. X rays that
+screen, cover or electronics scatter are quanta somewhere else: noise follows the signal (`xray_share` of r).
 """
 
 from collections.abc import Mapping
@@ -9,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..line.line_state import FloatArray, LineContext, LineState, needed
+from ..line.line_state import FloatArray, LineContext, LineState, Transfer, needed
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 
@@ -20,16 +23,40 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
     share = parameters["strength"] / 100.0
     if share == 0:
         return state
+    of_quanta = share * parameters["xray_share"]
+    of_light = share - of_quanta
     length_px = parameters["length_mm"] / needed(context.twin.instrument.pixel_mm, "pixel_mm", "veiling_glare")
 
-    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
+    def strayed(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
         spread = spread_transfer(
             f_row, f_column, reach_px=length_px, order=parameters["order"], usual_order=_USUAL_ORDER
         )
         even = (f_row == 0.0) & (f_column == 0.0)
-        return np.asarray((1.0 - share) + share * np.where(even, 1.0, (1.0 - parameters["even_share"]) * spread))
+        return np.where(even, 1.0, (1.0 - parameters["even_share"]) * spread)
 
-    return replace(state, optical_transfers=(*state.optical_transfers, transfer))
+    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
+        return np.asarray((1.0 - of_light) + of_light * strayed(f_row, f_column))
+
+    state = _moved(state, of_quanta, strayed)
+    return state if of_light == 0.0 else replace(state, optical_transfers=(*state.optical_transfers, transfer))
+
+
+def _moved(state: LineState, share: float, strayed: Transfer) -> LineState:
+    """A share of the quanta of each pixel moved, by the transfer function of those that move."""
+    if share == 0.0 or state.signal_DN.shape == (1, 1):
+        return state
+    from scipy.fft import dctn, idctn
+
+    f_row, f_column = (np.arange(length) / (2.0 * length) for length in state.signal_DN.shape)
+    transfer = strayed(f_row[:, None], f_column[None, :])
+    signal_DN, variance_DN2 = (
+        (1.0 - share) * one + share * idctn(dctn(one, type=2) * transfer, type=2)
+        for one in (state.signal_DN, state.variance_DN2)
+    )
+    fine = state.picture
+    if fine is not None:
+        fine = replace(fine, scale=(1.0 - share) * fine.scale, signal_DN=(1.0 - share) * fine.signal_DN)
+    return replace(state, signal_DN=signal_DN, variance_DN2=variance_DN2, picture=fine)
 
 
 VEILING_GLARE = Effect(
@@ -64,6 +91,16 @@ VEILING_GLARE = Effect(
             high=1.0,
             default=0.0,
             source="share of the glare that reaches all of the panel alike: light that a cover or a housing scatters back",
+            log=False,
+            sought_last=True,
+        ),
+        Parameter(
+            name="xray_share",
+            unit="",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            source="share of the glare that is scattered X rays, each a quantum; the rest is light",
             log=False,
             sought_last=True,
         ),

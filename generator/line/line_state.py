@@ -286,17 +286,12 @@ class LineContext:
     @property
     def source_detector_mm(self) -> float | None:
         """Distance from source to detector in this series, or None."""
-        request = self.request
-        stated = request.source_detector_mm
-        if stated is None and request.setting is not None:
-            stated = request.setting.source_detector_mm
-        return self.twin.instrument.source_detector_mm if stated is None else stated
+        return self.request.distances_mm(self.twin.instrument)[1]
 
     @property
     def source_object_mm(self) -> float | None:
         """Distance from source to object in this series, or None."""
-        stated = self.request.source_object_mm
-        return self.twin.instrument.source_object_mm if stated is None else stated
+        return self.request.distances_mm(self.twin.instrument)[0]
 
     @property
     def has_scene(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Setting
 from ...errors import InputError
 
@@ -74,6 +75,16 @@ class SeriesRequest:
     def exposures_per_frame(self) -> int:
         """Exposures averaged into one stored frame."""
         return self.averaged if self.setting is None else max(self.setting.averaged, self.averaged)
+
+    def distances_mm(self, instrument: Instrument) -> tuple[float | None, float | None]:
+        """From the source to the object and to the detector; the instrument's where the series does not state them."""
+        to_detector = self.source_detector_mm
+        if to_detector is None and self.setting is not None:
+            to_detector = self.setting.source_detector_mm
+        return (
+            instrument.source_object_mm if self.source_object_mm is None else self.source_object_mm,
+            instrument.source_detector_mm if to_detector is None else to_detector,
+        )
 
     def interval_s(self, readout_ms: float | None) -> float:
         """Time from the begin of one exposure to the next one's, s."""

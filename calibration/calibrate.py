@@ -186,7 +186,8 @@ def _prepare_spectra(acquisition: AcquisitionFile, *, tell: Callable[[str], None
         stack = tuple(Filter(material=material, thickness_mm=0.1) for material in sorted({*materials, "Al", "Cu"}))
         for kV in wanted:
             if kV <= model.highest_kV:
-                errors = np.linspace(lowest, highest, math.ceil((highest - lowest) * kV) + 2)  # one between any whole kV
+                # one between any two whole kV
+                errors = np.linspace(lowest, highest, math.ceil((highest - lowest) * kV) + 2)
                 samples = np.repeat(model.default_parameters()[None, :], len(errors), axis=0)
                 samples[:, model.names.index("kV_error")] = errors
                 model.log_derivatives(samples, OpenBeam(kV=kV, filters=stack), _shares(model.names))

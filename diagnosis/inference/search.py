@@ -264,7 +264,8 @@ def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> tup
 
 def _room(variant: Variant, names: Sequence[str]) -> NDArray[np.float64]:
     """Steps (2, 1 + parameter) of the strength, which is free, and of the inner parameters to the ends of their ranges."""
-    room = np.full((2, 1 + len(names)), np.inf) * np.array([[-1.0], [1.0]])
+    room: NDArray[np.float64] = np.full((2, 1 + len(names)), np.inf)
+    room[0] *= -1.0
     for item in EFFECTS[variant.effect].parameters:
         if item.name in names and not _turns(item):
             value = variant.parameters[item.name]

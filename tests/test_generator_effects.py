@@ -21,6 +21,7 @@ from raytwin.generator.frames._distortion import displacement_px, distorted
 from raytwin.generator.frames.conditions import beam_conditions, session_conditions, with_conditions
 from raytwin.generator.frames.line_model import LineMemory, LineModel
 from raytwin.generator.frames.model_cache import ModelCache
+from raytwin.generator.frames.response import light_of, responded
 from raytwin.generator.line.line_state import STAGES, LineState
 from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding
 from raytwin.generator.line.series_request import SeriesRequest
@@ -102,6 +103,12 @@ def applied(name, strength=None, since=None, options=None, **parameters):
             id=name, parameters={"strength": value, **parameters}, since=since or usual, options=options or {}
         ),
     )
+
+
+def state_with(bends):
+    """A state with a bent response."""
+    one = np.ones((1, 1))
+    return LineState(parameters=None, signal_DN=one, variance_DN2=one, flat_factor=one, bends=bends)
 
 
 COUNTERS = {}
@@ -928,14 +935,29 @@ def test_a_heel_that_calibration_saw_is_in_its_flat_but_its_hardness_shows_behin
 # ------------------------------------------------------------------------------------------------ response and readout
 
 
-def test_nonlinearity_departs_by_its_strength_at_half_of_the_highest_level(series_line):
-    effect = applied("nonlinearity", 2.0, highest_signal_DN=40000.0)
+@pytest.mark.parametrize("order", [0.5, 1.0, 3.0])
+def test_nonlinearity_departs_by_its_strength_at_half_of_the_highest_level(series_line, order):
+    effect = applied("nonlinearity", 2.0, highest_signal_DN=40000.0, order=order)
     asked = request(setting="kv=90,exposure_ms=20,filter=Cu:0.05", open_signal_DN=20000.0)
     base, found = expect(series_line, asked), expect(series_line, asked, effect)
     at = np.abs(base.signal_DN - 20000.0) < 100
-    np.testing.assert_allclose(found.signal_DN[at] / base.signal_DN[at], 0.98, rtol=2e-4)
+    np.testing.assert_allclose(found.signal_DN[at] / base.signal_DN[at], 0.98, rtol=2e-4 * order + 1e-4)
     # the slope of the response acts on the noise
-    np.testing.assert_allclose(found.quantum_variance_DN2[at] / base.quantum_variance_DN2[at], 0.96**2, rtol=1e-3)
+    sloped = (1.0 - 0.02 * (1.0 + order)) ** 2
+    np.testing.assert_allclose(
+        found.quantum_variance_DN2[at] / base.quantum_variance_DN2[at], sloped, rtol=2e-3 * order
+    )
+
+
+@pytest.mark.parametrize("bends", [((2e-6, 1.0),), ((1e-6, 1.0), (4e-4, 0.5)), ((1e-13, 3.0), (1e-6, 1.0))])
+def test_the_light_behind_a_bent_response_is_found_and_the_highest_beyond_its_end(bends):
+    state = state_with(bends)
+    far = np.linspace(0.0, 1e6, 200_001)
+    read = responded(state, far)
+    top = int(np.argmax(read))
+    light = np.linspace(-20.0, min(15000.0, 0.9 * far[top]), 400)
+    np.testing.assert_allclose(light_of(state, responded(state, light)), light, rtol=1e-10, atol=1e-9)
+    assert light_of(state, np.array([1.2 * read[top]]))[0] == pytest.approx(far[top], rel=0.05)
 
 
 def test_nonlinearity_refers_to_the_full_scale_of_the_adc_unless_told(series_line):

@@ -358,7 +358,7 @@ def test_a_bent_response_that_was_always_there_is_not_bent_twice(series_line, re
     model = channel(series_line, twin.effects)
     charge = model.open_signal_DN
     true = np.full(SHAPE, 0.4)
-    bend = model.image_effects._end.bend_per_DN
+    ((bend, _),) = model.image_effects._end.bends
     opened = charge * (1 - bend * charge)
     measured = 0.4 * charge * (1 - bend * 0.4 * charge) / opened
     np.testing.assert_allclose(model.image_effects.straightened(measured, open_signal_DN=opened), true, rtol=1e-9)

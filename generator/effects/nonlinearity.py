@@ -1,6 +1,7 @@
 """Nonlinearity: a response that bends.
 
-y = x (1 - s x / x_half), x_half half of the highest level: s is the departure from a line there
+y = x (1 - s (x / x_half)^p), x_half half of the highest level: s is the departure from a line there, and the response bends
+evenly (`order` p = 1), ever more towards the highest levels (above 1) or mostly at the lowest (below).
 """
 
 from collections.abc import Mapping
@@ -15,13 +16,15 @@ def _bend(state: LineState, parameters: Mapping[str, float], context: LineContex
     if highest <= 0:
         bits = context.twin.instrument.bits or 16
         highest = 2.0**bits - 1.0 - context.twin.dark_DN.value
-    return replace(state, bend_per_DN=state.bend_per_DN + parameters["strength"] / 100.0 / (0.5 * highest))
+    order = parameters["order"]
+    bend = parameters["strength"] / 100.0 / (0.5 * highest) ** order
+    return state if bend == 0.0 else replace(state, bends=(*state.bends, (bend, order)))
 
 
 NONLINEARITY = Effect(
     id="nonlinearity",
     title="response that bends",
-    law=r"y = x\,\left(1 - s\,\frac{x}{x_\mathrm{half}}\right)",
+    law=r"y = x\,\left[1 - s\,\left(\frac{x}{x_\mathrm{half}}\right)^p\right]",
     parameters=(
         Parameter(
             name="strength",
@@ -32,6 +35,15 @@ NONLINEARITY = Effect(
             source="departure from the initial line at half of the highest level",
             log=False,
             signed=True,
+        ),
+        Parameter(
+            name="order",
+            unit="",
+            low=0.4,
+            high=4.0,
+            default=1.0,
+            source="1: even bend, the first term of any; 2: a cubic term; 4: saturation close to full scale; 1/2: the first levels",
+            log=True,
         ),
         Parameter(
             name="highest_signal_DN",

@@ -201,7 +201,7 @@ class LineState:
         lag: traps, or None.
         blind_per_DN: pile-up k of z = x / (1 + k x), x above dark, before the nonlinearity.
         gain_memory: of the light before, or None.
-        bend_per_DN: nonlinearity b of y = x (1 - b x), x above dark.
+        bends: (b, p) of each term of the nonlinearity y = x (1 - sum b x^p), x above dark, DN.
         gain_pattern, tile_pattern: fixed patterns of the gain that calibration does not know, of pixels and of tiles.
         offsets: (DN, profile over the time in the session in s) added with or without beam.
         row_variance_DN2, column_variance_DN2: noise common to a row or column of one exposure; offsets_together_lines: over so many
@@ -234,7 +234,7 @@ class LineState:
     flicker: LineFlicker | None = None
     lag: LagLaw | None = None
     gain_memory: GainMemory | None = None
-    bend_per_DN: float = 0.0
+    bends: tuple[tuple[float, float], ...] = ()
     blind_per_DN: float = 0.0
     gain_pattern: FixedPattern | None = None
     tile_pattern: TilePattern | None = None

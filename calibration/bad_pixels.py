@@ -1,5 +1,6 @@
 """Bad pixels of a session, with the reason for each, and the clusters that they form."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +14,7 @@ from .frame_signs import least_change
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _DEAD = 0.5  # share of its neighbours' response below which a pixel is dead
+_SAMPLED = 100_000  # pixels that tell a middle and a spread to half a per cent
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
 _NOISY_CHANCE = 1e-9  # chance that a good pixel's noise looks as large as one called noisy
@@ -54,8 +56,7 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
         code[(variance > max(limit, 2.0 * centre)) & (code == 0)] = BAD_PIXEL_CODES["noisy"]
     brightest = max(flats, key=lambda pair: float(np.median(pair[1].mean_DN)))
     signal = brightest[1].mean_DN - darks.of(brightest[0])
-    level = float(np.median(signal))
-    if not level > 0:
+    if not np.median(signal) > 0:
         return _with_clusters(code, closest)  # no response to judge; the caller says so
     local = median_filter(signal, size=5, mode="nearest")
     ratio = signal / np.where(local > 0, local, np.nan)
@@ -64,17 +65,27 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, 0.05))
     np.maximum(closest, departure, out=closest)
     code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
+    del local, ratio, departure  # as large as the panel
     for item, total in flats:
         if item is not brightest[0]:
-            judged = code == 0
-            change = np.where(judged, total.mean_DN - darks.of(item), 0.0) / np.where(judged, signal, 1.0) * level
-            centre, spread = _robust_spread(change[judged]) if np.any(judged) else (0.0, 0.0)
-            limit = max(_DARK_NOISE_SIGMAS * spread, 0.05 * centre)
-            if 0.0 < limit < _DEAD * centre:  # else it is too dim to tell a pixel that has lost half of its response
-                departed = judged & (np.abs(change - centre) > limit)
-                code[departed] = BAD_PIXEL_CODES["nonlinear"]
-                code[departed & (change < _DEAD * centre)] = BAD_PIXEL_CODES["dead"]
+            _mark_changed(code, total.mean_DN - darks.of(item), signal)
     return _with_clusters(code, closest)
+
+
+def _mark_changed(code: NDArray[np.uint8], other: NDArray[np.float64], signal: NDArray[np.float64]) -> None:
+    """Mark pixels (row, column) whose response in another flat is not that of the brightest, less darks, DN."""
+    judged = code == 0
+    change = np.divide(other, signal, out=np.zeros_like(signal), where=judged)
+    every = max(math.isqrt(change.size // _SAMPLED), 1)
+    sample = change[::every, ::every][judged[::every, ::every]]
+    if not sample.size:
+        return
+    centre, spread = _robust_spread(sample)
+    limit = max(_DARK_NOISE_SIGMAS * spread, 0.05 * centre)
+    if 0.0 < limit < _DEAD * centre:  # else it is too dim to tell a pixel that has lost half of its response
+        departed = judged & (np.abs(change - centre) > limit)
+        code[departed] = BAD_PIXEL_CODES["nonlinear"]
+        code[departed & (change < _DEAD * centre)] = BAD_PIXEL_CODES["dead"]
 
 
 def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -1394,6 +1394,7 @@ def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series
     [
         ("off_focal", {"peakedness": -0.1}),
         ("motion_blur", {"acceleration": 1.2}),
+        ("veiling_glare", {"xray_share": 1.1}),
         ("burn_in", {"lasting_share": 1.1}),
         ("burn_in", {"lasting_share": -0.1}),
         ("random_telegraph", {"differ": 0.9}),

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, Transfer, needed
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
@@ -23,6 +24,8 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
     share = parameters["strength"] / 100.0
     if share == 0:
         return state
+    if not 0.0 <= parameters["xray_share"] <= 1.0:
+        raise InputError("xray_share of veiling_glare", received=parameters["xray_share"], expected="0 to 1")
     of_quanta = share * parameters["xray_share"]
     of_light = share - of_quanta
     length_px = parameters["length_mm"] / needed(context.twin.instrument.pixel_mm, "pixel_mm", "veiling_glare")

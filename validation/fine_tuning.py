@@ -192,9 +192,9 @@ def until_usable(rows: list[dict]) -> dict:
     enough = USABLE * longest["found"]
     seconds = {}
     for start in ("starter", "random"):
-        usable = [row for row in rows if row["start"] == start and row["found"] >= enough]
+        usable = [row for row in rows if row["start"] == start and row["found"] >= enough > 0]
         seconds[start] = min((row["processor_s_a_network"] for row in usable), default=None)
-    known = None not in seconds.values() and longest["found"] > 0
+    known = None not in seconds.values()
     return {"seconds": seconds, "random_over_starter": seconds["random"] / seconds["starter"] if known else None}
 
 

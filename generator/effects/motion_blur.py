@@ -113,6 +113,6 @@ MOTION_BLUR = Effect(
     absorbed="nothing",
     timed=True,
     mean_shift=_mean_shift,
-    grid=Grid(shares=(0.0, 0.25, 0.5, 0.75, 1.0)),
+    grid=Grid(shares=(0.0, 0.25, 0.5, 0.75, 1.0), variants=({"acceleration": -0.5}, {"acceleration": 0.5})),
     # as of a tail: two panels without effect, in squares of pixels, showed 6
 )

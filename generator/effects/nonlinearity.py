@@ -64,5 +64,5 @@ NONLINEARITY = Effect(
     shows=Shows(series=EVERY_SERIES, axis="level"),
     either_onset=True,
     absorbed="nothing",
-    grid=Grid(shares=(0.8,)),
+    grid=Grid(shares=(0.8,), variants=({"order": 1.0},)),
 )

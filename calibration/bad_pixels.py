@@ -14,6 +14,7 @@ from .frame_signs import least_change
 
 _DARK_NOISE_SIGMAS = 8.0  # how far a pixel must stand out to be called hot
 _DEAD = 0.5  # share of its neighbours' response below which a pixel is dead
+_LEAST_DEPARTURE = 0.05  # of its response, from which a pixel is nonlinear
 _SAMPLED = 100_000  # pixels that tell a middle and a spread to half a per cent
 _CLUSTER_SHARE = 0.6  # of those limits, in pixels that touch a bad one
 _CLUSTER_NEIGHBOURS = 5  # bad ones of the eight about a pixel that leave it nothing to be interpolated from
@@ -62,7 +63,7 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
     ratio = signal / np.where(local > 0, local, np.nan)
     code[(~np.isfinite(ratio) | (ratio < _DEAD)) & (code == 0)] = BAD_PIXEL_CODES["dead"]
     centre, spread = _robust_spread(ratio[np.isfinite(ratio)])
-    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, 0.05))
+    departure = np.nan_to_num(np.abs(ratio - centre) / max(_DARK_NOISE_SIGMAS * spread, _LEAST_DEPARTURE))
     np.maximum(closest, departure, out=closest)
     code[(departure > 1.0) & (code == 0)] = BAD_PIXEL_CODES["nonlinear"]
     del local, ratio, departure  # as large as the panel
@@ -73,7 +74,13 @@ def find_bad_pixels(darks: DarkFrames, flats: Sequence[tuple[Series, KeptSums]])
 
 
 def _mark_changed(code: NDArray[np.uint8], other: NDArray[np.float64], signal: NDArray[np.float64]) -> None:
-    """Mark pixels (row, column) whose response in another flat is not that of the brightest, less darks, DN."""
+    """Mark pixels (row, column) whose response in another flat is not that of the brightest; signals less darks, DN.
+
+    A part of the field that changed, as by something that stood in the beam, is no fault of its pixels: they change as their
+    neighbours do.
+    """
+    from scipy.ndimage import median_filter
+
     judged = code == 0
     change = np.divide(other, signal, out=np.zeros_like(signal), where=judged)
     every = max(math.isqrt(change.size // _SAMPLED), 1)
@@ -81,11 +88,14 @@ def _mark_changed(code: NDArray[np.uint8], other: NDArray[np.float64], signal: N
     if not sample.size:
         return
     centre, spread = _robust_spread(sample)
-    limit = max(_DARK_NOISE_SIGMAS * spread, 0.05 * centre)
-    if 0.0 < limit < _DEAD * centre:  # else it is too dim to tell a pixel that has lost half of its response
-        departed = judged & (np.abs(change - centre) > limit)
+    limit = max(_DARK_NOISE_SIGMAS * spread, _LEAST_DEPARTURE * centre)
+    if not 0.0 < limit < _DEAD * centre:
+        return  # too dim to tell a pixel that has lost half of its response
+    if np.any(departed := judged & (np.abs(change - centre) > limit)):
+        local = median_filter(np.where(judged, change, centre), size=5, mode="nearest")
+        departed &= np.abs(change - local) > limit
         code[departed] = BAD_PIXEL_CODES["nonlinear"]
-        code[departed & (change < _DEAD * centre)] = BAD_PIXEL_CODES["dead"]
+        code[departed & (change < _DEAD * local)] = BAD_PIXEL_CODES["dead"]
 
 
 def _with_clusters(code: NDArray[np.uint8], closest: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -64,7 +64,10 @@ def test_pixels_that_die_between_flats_are_found_in_any_but_the_dimmest():
         lit = level_DN * gain * shape
         return series(frames), lit + np.sqrt(3.0 * level_DN) * rng.standard_normal(SHAPE)
 
-    bright, other, dim, dimmest = flat(20000.0), flat(4000.0, tilt), flat(1000.0), flat(20.0)
+    # and something stood in a part of one of them
+    covered = np.ones(SHAPE)
+    covered[:, 30:42] = 0.6
+    bright, other, dim, dimmest = flat(20000.0), flat(4000.0, tilt * covered), flat(1000.0), flat(20.0)
     other[1][5, 7] = 30.0
     dim[1][9, 40] *= 0.3
     dimmest[1][30, 30] = 0.0

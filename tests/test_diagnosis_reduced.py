@@ -16,7 +16,7 @@ from raytwin.diagnosis.inference.nuisances import Nuisances
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
 from raytwin.diagnosis.inference.whitening import Whitening
-from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, catalogue_variants
+from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, POSITION_SD_PX, catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.diagnosis.session.session import measured_levels, read_session
@@ -778,3 +778,27 @@ def test_an_effect_beside_another_is_what_it_adds_to_that_one(line):
         np.testing.assert_allclose(found[1][0, probes], weaker * found[0][0, probes], rtol=0.01)
         seen += 1
     assert seen
+
+
+def test_what_registration_finds_of_a_moving_scene_is_in_its_place_and_in_no_picture_of_that_exposure(line):
+    """Where in its path an object is on average is told by its place, and by pictures of exposures of another length."""
+    variant = next(item for item in catalogue_variants() if item.effect == "motion_blur")
+    strength, along = 8.0, 0.3
+    started = replace(variant, parameters={"acceleration": 0.2, "mean_place": along}, strengths=(strength,))
+    centred = replace(started, parameters={"acceleration": 0.2, "mean_place": 0.0})
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=(centred,))
+        found = problem.respond([centred, started])
+    difference = found[1][0] - found[0][0]
+    exposures_ms = np.array([problem.views[number].session.request.exposure_ms for number in problem.series_of])
+    statistics = np.array([name.statistic for name in problem.names])
+    of_objects = np.array([problem.views[number].session.series.kind == "object" for number in problem.series_of])
+    # the brightest series, of 100 ms, tells the place: 2.4 of the 8 px in 50 ms, twice
+    (probe,) = np.flatnonzero(statistics == "displacement along rows")
+    assert exposures_ms[probe] == 100.0
+    assert difference[probe] == pytest.approx(along * strength * 2.0 / POSITION_SD_PX, rel=0.02)
+    assert difference[statistics == "displacement along columns"] == 0.0
+    pictures = of_objects & ~np.char.startswith(statistics, "displacement along")
+    assert np.abs(difference[pictures & (exposures_ms == 100.0)]).max() < 1e-3
+    assert np.abs(difference[pictures & (exposures_ms == 25.0)]).max() > 5.0
+    assert not difference[~of_objects].any()

@@ -635,9 +635,6 @@ def test_a_standing_belt_blurs_and_displaces_nothing(series_line):
     asked = request(**BEHIND, belt_speed_mm_s=0.0)
     started = applied("motion_blur", 5.0, mean_place=0.5)
     np.testing.assert_array_equal(expect(series_line, asked, started).mean_DN, expect(series_line, asked).mean_DN)
-    np.testing.assert_array_equal(
-        expect(series_line, asked, applied("motion_blur", 5.0)).mean_DN, expect(series_line, asked).mean_DN
-    )
 
 
 @pytest.mark.parametrize("name", ["focal_spot", "motion_blur"])
@@ -947,6 +944,12 @@ def test_nonlinearity_departs_by_its_strength_at_half_of_the_highest_level(serie
     np.testing.assert_allclose(
         found.quantum_variance_DN2[at] / base.quantum_variance_DN2[at], sloped, rtol=2e-3 * order
     )
+
+
+@pytest.mark.parametrize("bends", [((-2e-6, 1.0),), ((1e-5, 0.6), (-3e-7, 1.0))])
+def test_the_light_behind_a_response_that_rises_ever_more_is_found(bends):
+    state, light = state_with(bends), np.linspace(-20.0, 60000.0, 400)
+    np.testing.assert_allclose(light_of(state, responded(state, light)), light, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize("bends", [((2e-6, 1.0),), ((1e-6, 1.0), (4e-4, 0.5)), ((1e-13, 3.0), (1e-6, 1.0))])

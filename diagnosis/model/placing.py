@@ -71,14 +71,21 @@ def place_scenes(
         for item in members:
             placements[item.name] = placement
             requests[item.name] = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
-            telling[item.name] = requests[members[0].name]
             drawn[item.name] = expect(requests[item.name])
+        # the series with the most light says most of where the scene lies
+        tells = max(members, key=lambda item: _light_DN(item, expected[item.name]))
+        telling |= {item.name: requests[tells.name] for item in members}
     return PlacedSeries(
         kept=tuple(replace(item, request=requests.get(item.name, item.request)) for item in kept),
         expected=drawn,
         placements=placements,
         telling=telling,
     )
+
+
+def _light_DN(item: SessionSeries, expected: ExpectedSeries) -> float:
+    """Light of all exposures of a series, mean over the pixels."""
+    return item.series.n_frames * item.request.exposures_per_frame * float(np.mean(expected.signal_DN))
 
 
 def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[SessionSeries]]:

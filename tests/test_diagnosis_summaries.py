@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 from scipy.special import ndtr
 
 from raytwin.diagnosis.model.changes import variants_of
@@ -426,6 +426,22 @@ def test_a_sharp_edge_is_placed_by_drawing_it_also_where_it_is_blurred_more_than
     if whole_cells:
         assert found.row_px * 3 == pytest.approx(round(found.row_px * 3))
         assert found.row_sd_px >= 1 / (3 * math.sqrt(12))
+
+
+@pytest.mark.parametrize("blur_px", [(0.3, 1.5), (2.0, 2.0)])
+def test_a_blur_moves_no_edge_that_is_drawn_blurred_between_pixels(blur_px):
+    rows, columns = np.mgrid[:80, :80]
+    edge = np.where(columns + 0.06 * rows > 44.2, 10.0, 30_000.0)
+
+    def draw(at):
+        # by straight lines between points, which blur it
+        return [shift(edge, at, order=1, mode="nearest")]
+
+    measured = gaussian_filter(edge, blur_px, mode="nearest")
+    variance = np.maximum(measured, 1.0) / 10.0
+    start = Placement(row_px=1 / 3, column_px=-1 / 3, row_sd_px=0.1, column_sd_px=0.1)
+    found = register_drawn([measured], draw, [variance], np.ones((80, 80), bool), start, whole_cells=True)
+    assert (found.row_px, found.column_px) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("brighter", [0.9, 1.06])

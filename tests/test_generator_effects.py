@@ -1,5 +1,6 @@
 """The catalogue of effects: what each strength means, where each acts, and samples against expectation for all."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from raytwin.acquisition.setting import Filter, filters_from_text, setting_from_text
 from raytwin.errors import InputError
@@ -1395,7 +1397,7 @@ def test_counts_lost_to_pile_up_are_those_of_photons_that_come_one_by_one(series
 @pytest.mark.parametrize(
     ("name", "wrong"),
     [
-        ("off_focal", {"peakedness": -0.1}),
+        ("off_focal", {"peakedness": -0.6}),
         ("motion_blur", {"acceleration": 1.2}),
         ("veiling_glare", {"xray_share": 1.1}),
         ("burn_in", {"lasting_share": 1.1}),
@@ -1414,8 +1416,9 @@ def test_only_counters_lose_counts(series_line):
         LineModel(series_line, effects=applied("pile_up")).expect(request())
 
 
-@pytest.mark.parametrize("peakedness", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("source_object_mm", [990.0, 850.0])
+@pytest.mark.parametrize(
+    ("peakedness", "source_object_mm"), [(0.0, 990.0), (0.5, 850.0), (1.0, 990.0), (-1.0 / 3.0, 850.0), (-0.5, 850.0)]
+)
 def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_line, peakedness, source_object_mm):
     """Points are drawn on the source and shadows thrown one by one; no transfer function is used."""
     strength, width_mm, count = 15.0, 3.0, 4_000_000
@@ -1426,9 +1429,15 @@ def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_lin
     even = series_line.level_nearest(asked.setting).flat_shape
     known, plain = ((one.signal_DN / even).mean(axis=0) for one in (found, sharp))
     rng = np.random.default_rng(4)
-    # Gaussians of variances that differ fall from a peak with a long tail
-    size = np.sqrt(rng.gamma(1.0 / peakedness, peakedness, count)) if peakedness else 1.0
-    place_mm = width_mm * size * rng.standard_normal(count) * (rng.random(count) < strength / 100.0)
+    if peakedness < 0.0:
+        # an even disc, or its rim alone: of such radii that the standard deviation along a line is the width
+        radius = 2.0 * np.sqrt(rng.random(count)) if peakedness > -0.4 else math.sqrt(2.0)
+        along = radius * np.cos(2.0 * math.pi * rng.random(count))
+    else:
+        # Gaussians of variances that differ fall from a peak with a long tail
+        size = np.sqrt(rng.gamma(1.0 / peakedness, peakedness, count)) if peakedness else 1.0
+        along = size * rng.standard_normal(count)
+    place_mm = width_mm * along * (rng.random(count) < strength / 100.0)
     border = 20.0 - (1059.0 / source_object_mm - 1.0) / series_line.instrument.pixel_mm * place_mm
     column, luck = rng.uniform(0.0, 40.0, count), rng.random(count)
     landed = column + series_line.noise.spread.value.sigma_px * rng.standard_normal(count)
@@ -1446,6 +1455,61 @@ def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_lin
     np.testing.assert_array_equal(
         numbers(expect(series_line, request(), effect)), numbers(expect(series_line, request()))
     )
+
+
+def test_a_profile_of_off_focal_radiation_changes_steadily_with_its_peakedness(series_line):
+    plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
+    asked = request("object", thickness_mm=plate, source_object_mm=850.0)
+
+    def shown(peakedness):
+        return expect(series_line, asked, applied("off_focal", 15.0, width_mm=3.0, peakedness=peakedness)).signal_DN
+
+    pictures = [shown(peakedness) for peakedness in np.linspace(-0.05, 0.05, 11)]
+    changes = [np.abs(after - before).max() for before, after in itertools.pairwise(pictures)]
+    assert max(changes) < 1.3 * min(changes)
+
+
+def test_a_draft_knows_the_noise_of_light_that_comes_from_afar(series_line):
+    """What a model draws for comparisons must have the noise of the light that off-focal radiation brings into a shadow."""
+    shadow = {"Al": np.where(np.arange(40) < 20, 60.0, 0.0) * np.ones((40, 1))}
+    asked = request("object", thickness_mm=shadow, source_object_mm=850.0)
+    far = applied("off_focal", 15.0, width_mm=6.0, peakedness=0.0)
+    drafts, whole = (
+        [
+            LineModel(series_line, effects=effects, cache=ModelCache(draft=draft)).expect(asked).quantum_variance_DN2
+            for effects in ((), far)
+        ]
+        for draft in (True, False)
+    )
+    deep = np.s_[10:30, 10:16]
+    gained = [float((after - before)[deep].mean()) for before, after in (drafts, whole)]
+    assert gained[1] > 0.02 * float(whole[0].max())
+    assert gained[0] == pytest.approx(gained[1], rel=0.02)
+
+
+def test_light_from_beyond_a_border_is_that_of_a_field_that_goes_on_there(series_line):
+    """A slanted plate: the picture blurred with what lies beyond its borders drawn, against the same with mirrors there."""
+    row, column = np.indices((40, 40))
+    plate = {"Al": np.where(column + 0.4 * row < 30.0, 30.0, 0.0)}
+    asked = request("object", thickness_mm=plate, source_object_mm=850.0)
+    width_mm, strength = 2.0, 15.0
+    line = LineModel(series_line, effects=applied("off_focal", strength, width_mm=width_mm, peakedness=0.0))
+    found = line.from_beyond(asked)
+    state = LineModel(series_line).light(asked).at_load().state
+    width_px = width_mm * (1059.0 / 850.0 - 1.0) / series_line.instrument.pixel_mm
+    outside = np.pad(state.signal_DN, 40, mode="edge") - np.pad(state.signal_DN, 40, mode="symmetric")
+    own_px = series_line.noise.spread.value.sigma_px
+    wide, narrow = (ndimage.gaussian_filter(outside, sd_px) for sd_px in (math.hypot(width_px, own_px), own_px))
+    wanted = strength / 100.0 * (wide - narrow)[40:80, 40:80]
+    assert np.abs(wanted).max() > 0.004 * state.signal_DN.max()
+    # in the outermost pixels a border as sharp as pixels rings
+    inner = np.s_[3:-3, 3:-3]
+    np.testing.assert_allclose(found.sum(axis=0)[inner], wanted[inner], atol=0.04 * np.abs(wanted).max())
+    # each border's part lies beside it
+    beside = np.s_[:8, :], np.s_[32:, :], np.s_[:, :8], np.s_[:, 32:]
+    for part, there in zip(found, beside, strict=True):
+        assert np.abs(part).max() == np.abs(part[there]).max()
+    assert not LineModel(series_line).from_beyond(asked).any()
 
 
 @pytest.mark.parametrize(("strength", "sheet"), [(5.0, 0.0), (5.0, 1.0), (60.0, 1.0), (40.0, 0.5)])

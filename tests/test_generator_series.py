@@ -278,6 +278,8 @@ def test_a_scene_of_points_is_moved_without_ringing_beside_its_steps(series_line
     by_effect = LineModel(points, effects=(shifted,)).expect(request("object", thickness_mm=step)).signal_DN / flat
     np.testing.assert_allclose(by_effect, moved, rtol=1e-6)
     far = ndimage.distance_transform_edt(~((np.abs(row - 12.5) < 4.5) | (np.abs(column - 14.5) < 4.5))) > 0
+    # nothing is brighter than the open field, nor darker than the shadow
+    assert moved.max() <= still.max() * (1.0 + 1e-9) and moved.min() >= still.min() * (1.0 - 1e-9)
     # cosines of the pixels alone would leave half a per cent of the step ten pixels away from it
     np.testing.assert_allclose(moved[far], still[far], rtol=1e-4)
     # whole pixels move as they are, and the edge does move

@@ -44,6 +44,7 @@ EDGE_SD_PX4 = 0.02
 EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
 EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again those at one distance
 ROUGH_FIELDS = 24
+BEYOND_SD = 1.0  # of a picture that goes on beyond a border as it ends, over one that mirrors there
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
 TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect

@@ -242,15 +242,30 @@ class ForwardModel:
         Raises:
             InputError: the twin knows too little for it.
         """
+        line, shown = self._line(change, request)
+        return line.expect(shown)
+
+    def from_beyond(self, change: Change, request: SeriesRequest) -> NDArray[np.float64]:
+        """What each border would let into the field of a series under a change, see `LineModel.from_beyond`.
+
+        Raises:
+            InputError: the twin knows too little for it.
+        """
+        line, shown = self._line(change, request)
+        return line.from_beyond(shown)
+
+    def _line(self, change: Change, request: SeriesRequest) -> tuple[LineModel, SeriesRequest]:
+        """The line under a change, and the series as it is asked of it."""
         effects = (*change.twin.effects, *change.effects)
         in_maps = {item.id for item in effects if EFFECTS[item.id].absorbed == _IN_MAPS_OF_BEAMS}
         if self.own_maps and any(item.id in in_maps and item.since == "always" for item in effects):
             acting = (item for item in effects if item.since == "always" or request.after_calibration)
             effects = tuple(replace(item, since="calibration") if item.id in in_maps else item for item in acting)
             request = replace(request, after_calibration=True)
-        return LineModel(
+        line = LineModel(
             change.twin, effects=effects, parameters=change.parameters, cache=self.cache, use_measured_level=False
-        ).expect(request)
+        )
+        return line, request
 
 
 def _mean_shift_px(effects: Sequence[AppliedEffect], twin: Twin, request: SeriesRequest) -> tuple[float, float]:

@@ -28,6 +28,9 @@ _DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
 _LARGEST_STEP_PX = 0.25
 _SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
 _WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
+_SHARP_BLUR_PX = (
+    1.5  # standard deviation: the parabola through what a displaced edge leaves then errs by 0.004 px at most
+)
 CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
 
 
@@ -203,27 +206,35 @@ def register_drawn(
 ) -> Placement:
     """Placement of a scene by drawing it where it may lie: nothing that was measured is resampled.
 
-    In whole cells of the drawing first: from `start` or from no displacement, whichever leaves less, to the neighbour that
-    leaves least until none leaves less. Then by Gauss-Newton with slopes by differences of drawn pictures; a step is taken
+    First from `start` or from no displacement, whichever leaves less, to the neighbour that leaves least until none leaves less:
+    by cells of the drawing, or by whole pixels. Then by Gauss-Newton with slopes by differences of drawn pictures; a step is taken
     only where less is left after it.
 
     Args:
         measured, variance, mask: as in `register`.
         draw: pictures (row, column) of all series with the scene displaced along rows and columns, px.
         start: where splines have it.
-        whole_cells: no finer than that; a picture with little blur cannot be moved by a part of a cell without ringing.
+        whole_cells: pixels see no farther than themselves: to a cell, see `_vertex`; a picture with little blur cannot be moved by
+            a part of a cell without ringing, and moved by a part of a pixel it is blurred.
     """
+    from scipy.ndimage import gaussian_filter
+
     inner = mask.copy()
     for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
         edge[...] = False
     images = [fill(image, mask) for image in measured]
+    blur_px = _SHARP_BLUR_PX if whole_cells else 0.0
 
-    models = draw((0.0, 0.0))
+    def drawn(at: tuple[float, float]) -> list[NDArray[np.float64]]:
+        pictures = [np.asarray(model, dtype=np.float64) for model in draw(at)]
+        return [gaussian_filter(one, blur_px) for one in pictures] if blur_px else pictures
+
+    models = drawn((0.0, 0.0))
     # every pixel alike: with the noise of the shadow, or with edges taken as doubtful, a blur that the twin does not know
     # would pull an edge away; doubts of rendering are those that any number of series share
     doubts = [render_variance(model, far=False) / RENDER_SHARE**2 for model in models]
     fit = _LeftOver(
-        images=images,
+        images=[gaussian_filter(image, blur_px) for image in images],
         inner=inner,
         weights=[
             1.0 / len(images) / (float(np.max(noise[inner])) + _CAUTION[-1] ** 2 * float(np.max(doubt[inner])))
@@ -232,31 +243,33 @@ def register_drawn(
         away=[_away(inner / (noise + 100.0 * doubt)) for noise, doubt in zip(variance, doubts, strict=True)],
     )
     known: dict[tuple[int, int], float] = {}
+    parts = 1 if whole_cells else FINE
 
-    def left(cell: tuple[int, int]) -> float:
-        if cell not in known:
-            known[cell] = fit.of(draw((cell[0] / FINE, cell[1] / FINE)))
-        return known[cell]
+    def left(step: tuple[int, int]) -> float:
+        if step not in known:
+            known[step] = fit.of(drawn((step[0] / parts, step[1] / parts)))
+        return known[step]
 
-    most = round(LARGEST_PX * FINE)
-    cell = min(((0, 0), (round(start.row_px * FINE), round(start.column_px * FINE))), key=left)
+    most = round(LARGEST_PX * parts)
+    step = min(((0, 0), (round(start.row_px * parts), round(start.column_px * parts))), key=left)
     while True:
-        around = [(cell[0] + row, cell[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        around = [(step[0] + row, step[1] + column) for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1))]
         best = min((one for one in around if max(map(abs, one)) <= most), key=left)
-        if not left(best) < _WORTH_A_CELL * left(cell):
+        if not left(best) < _WORTH_A_CELL * left(step):
             break
-        cell = best
-    current = np.array(cell) / FINE
+        step = best
     if whole_cells:
+        current = np.round(FINE * (np.array(step) + _vertex(left, step))) / FINE
         sds = np.maximum([start.row_sd_px, start.column_sd_px], CELL_SD_PX)
         return _placement(current, np.diag(sds**2))
-    models = draw((float(current[0]), float(current[1])))
+    current = np.array(step) / FINE
+    models = drawn((float(current[0]), float(current[1])))
     rest = fit.of(models)
     covariance: NDArray[np.float64] = np.eye(2)
     slopes: list[NDArray[np.float64]] = []
     for _ in range(_DRAWN_ROUNDS):
         if not slopes:
-            moved = [draw((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
+            moved = [drawn((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
             slopes = [
                 np.stack([one - model for one in pair])[:, inner] / _DRAWN_STEP_PX
                 for model, *pair in zip(models, *moved, strict=True)
@@ -267,10 +280,10 @@ def register_drawn(
         weak = values < _WEAK * values[-1]
         inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
         covariance = np.asarray((vectors * np.where(weak, 1.0, inverse)) @ vectors.T, dtype=np.float64)
-        step = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        onward = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         for part in (1.0, 0.4, 0.1):
-            there = np.clip(current + part * step, -LARGEST_PX, LARGEST_PX)
-            pictures = draw((float(there[0]), float(there[1])))
+            there = np.clip(current + part * onward, -LARGEST_PX, LARGEST_PX)
+            pictures = drawn((float(there[0]), float(there[1])))
             after = fit.of(pictures)
             if after < rest:
                 break
@@ -283,6 +296,29 @@ def register_drawn(
         if moved_px > _SAME_SLOPES_PX:
             slopes = []
     return _placement(current, covariance)
+
+
+def _vertex(left: Callable[[tuple[int, int]], float], step: tuple[int, int]) -> NDArray[np.float64]:
+    """Where beside a whole displacement (2,), px, a parabola through what whole pixels around it leave is least.
+
+    Between pixels a picture would be drawn less sharply. A measured one that is blurred would be sought there, wherever it lies.
+    """
+    around = np.array([[left((step[0] + row, step[1] + column)) for column in (-1, 0, 1)] for row in (-1, 0, 1)])
+    cross = 0.25 * (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0])
+    curved = np.array(
+        [
+            [around[2, 1] + around[0, 1] - 2.0 * around[1, 1], cross],
+            [cross, around[1, 2] + around[1, 0] - 2.0 * around[1, 1]],
+        ]
+    )
+    slope = 0.5 * np.array([around[2, 1] - around[0, 1], around[1, 2] - around[1, 0]])
+    values, vectors = np.linalg.eigh(curved)
+    # along a single edge nothing shows the displacement
+    known = values > max(_WEAK * values[-1], 1e-30)
+    onward = -(vectors * np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)) @ (vectors.T @ slope)
+    if 0.5 * float(-slope @ onward) < (1.0 - _WORTH_A_CELL) * around[1, 1]:
+        return np.zeros(2)
+    return np.asarray(np.clip(onward, -0.5, 0.5), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from ..model.changes import Variant
 from ..model.forward_model import Change, strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
-from .nuisance_columns import Columns, nuisances_of_series
+from .nuisance_columns import Columns, light_from_beyond, nuisances_of_series
 from .series_probes import SeriesProbes
 
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
@@ -120,6 +120,8 @@ class AskedAgain:
         thicker = {
             material: self.session.with_scene(here.series, scene, found) for material, scene in one.thicker.items()
         }
+        if here.series.session.series.kind == "object":
+            columns |= light_from_beyond(here, self.session.from_beyond(one.probes.series, found))
         return columns | nuisances_of_series(self.session, here, signal, thicker)
 
 

@@ -19,7 +19,20 @@ from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, Parameter, Reading, Shows
 
-_GAUSSIAN = 1e-6  # peakedness below which a profile is a Gaussian to every digit that matters
+_NEAR_GAUSSIAN = 0.02  # peakedness up to which first order is enough: the transfer is off by less than 3e-4
+_RING = -0.5
+
+
+def _transfer_of_source(half: FloatArray, peakedness: float) -> FloatArray:
+    """P(h) of a profile, for h = 2 (pi s_d f)^2."""
+    if abs(peakedness) < _NEAR_GAUSSIAN:
+        return np.asarray(np.exp(-half) * (1.0 + 0.5 * peakedness * half**2))
+    if peakedness > 0.0:
+        return np.asarray((1.0 + peakedness * half) ** (-1.0 / peakedness))
+    from scipy.special import hyp0f1
+
+    order = -1.0 - 1.0 / peakedness
+    return np.asarray(hyp0f1(order, -order * half))
 
 
 def _add_source(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -33,13 +46,12 @@ def _add_source(state: LineState, parameters: Mapping[str, float], context: Line
     share = parameters["strength"] / 100.0
     width_px = parameters["width_mm"] * (magnification - 1.0) / pitch
     peakedness = parameters["peakedness"]
-    if peakedness < 0.0:
-        raise InputError("peakedness of off_focal", received=peakedness, expected="0 or more")
+    if peakedness < _RING:
+        raise InputError("peakedness of off_focal", received=peakedness, expected=f"{_RING:g} (a ring) or more")
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
         half = 0.5 * (2.0 * math.pi * width_px) ** 2 * (f_row**2 + f_column**2)
-        wide = np.exp(-half) if peakedness < _GAUSSIAN else (1.0 + peakedness * half) ** (-1.0 / peakedness)
-        return np.asarray(1.0 - share + share * wide)
+        return np.asarray(1.0 - share + share * _transfer_of_source(half, peakedness))
 
     return replace(state, object_transfers=(*state.object_transfers, transfer))
 
@@ -47,7 +59,7 @@ def _add_source(state: LineState, parameters: Mapping[str, float], context: Line
 OFF_FOCAL = Effect(
     id="off_focal",
     title="radiation from around the focal spot",
-    law=r"H(f) = 1 - w + w\,\left[1 + 2\,p\,(\pi s_d f)^2\right]^{-1/p},\quad s_d = s\,(M - 1)",
+    law=r"H(f) = 1 - w + w\,\left[1 + 2\,p\,(\pi s_d f)^2\right]^{-1/p}\ (p > 0),\quad s_d = s\,(M - 1)",
     parameters=(
         Parameter(
             name="strength",
@@ -71,10 +83,11 @@ OFF_FOCAL = Effect(
         Parameter(
             name="peakedness",
             unit="",
-            low=0.0,
+            low=_RING,
             high=2.0,
             default=0.5,
-            source="relative variance of the squared widths that make a profile: 0 Gaussian, 2/3 exponential, then a peak, a tail",
+            source="a third of the excess kurtosis of a profile: -1/2 a ring, -1/3 an even disc, 0 Gaussian, 2/3 exponential, then a"
+            " peak and a long tail",
             log=False,
             sought_last=True,
         ),

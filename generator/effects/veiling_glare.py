@@ -9,11 +9,12 @@ screen, cover or electronics scatter are quanta somewhere else: noise follows th
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ...errors import InputError
-from ..line.line_state import FloatArray, LineContext, LineState, Transfer, needed
+from ..line.line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
 
@@ -37,29 +38,14 @@ def _add_glare(state: LineState, parameters: Mapping[str, float], context: LineC
         even = (f_row == 0.0) & (f_column == 0.0)
         return np.where(even, 1.0, (1.0 - parameters["even_share"]) * spread)
 
-    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        return np.asarray((1.0 - of_light) + of_light * strayed(f_row, f_column))
+    def blur(f_row: FloatArray, f_column: FloatArray, moved: float) -> FloatArray:
+        return np.asarray((1.0 - moved) + moved * strayed(f_row, f_column))
 
-    state = _moved(state, of_quanta, strayed)
-    return state if of_light == 0.0 else replace(state, optical_transfers=(*state.optical_transfers, transfer))
-
-
-def _moved(state: LineState, share: float, strayed: Transfer) -> LineState:
-    """A share of the quanta of each pixel moved, by the transfer function of those that move."""
-    if share == 0.0 or state.signal_DN.shape == (1, 1):
-        return state
-    from scipy.fft import dctn, idctn
-
-    f_row, f_column = (np.arange(length) / (2.0 * length) for length in state.signal_DN.shape)
-    transfer = strayed(f_row[:, None], f_column[None, :])
-    signal_DN, variance_DN2 = (
-        (1.0 - share) * one + share * idctn(dctn(one, type=2) * transfer, type=2)
-        for one in (state.signal_DN, state.variance_DN2)
-    )
-    fine = state.picture
-    if fine is not None:
-        fine = replace(fine, scale=(1.0 - share) * fine.scale, signal_DN=(1.0 - share) * fine.signal_DN)
-    return replace(state, signal_DN=signal_DN, variance_DN2=variance_DN2, picture=fine)
+    if of_quanta:
+        state = replace(state, object_transfers=(*state.object_transfers, partial(blur, moved=of_quanta)))
+    if of_light:
+        state = replace(state, optical_transfers=(*state.optical_transfers, partial(blur, moved=of_light)))
+    return state
 
 
 VEILING_GLARE = Effect(

@@ -181,9 +181,9 @@ def spread_maps(
 ) -> tuple[FloatArray, FloatArray]:
     """Picture after all blur (DN), and quantum variance after blur of the object and spread of the quanta (DN^2).
 
-    draft: a third of the work for pictures that are compared with each other: the variance is not blurred (it is right
-    away from edges), and cosines that the spread leaves below 1e-3 are left out. kept: keeps transfer functions for calls
-    with the same blur and spread.
+    draft: a third of the work for pictures that are compared with each other: the variance is blurred by what stands before the
+    detector alone and not displaced (it is right away from edges), and cosines that the spread leaves below 1e-3 are left out.
+    kept: keeps transfer functions for calls with the same blur and spread.
     """
     if signal_DN.shape == (1, 1):
         return signal_DN, pattern.share * variance_DN2
@@ -238,11 +238,14 @@ def spread_maps(
         blurred = sampled_picture(pictures, shape, state.shift_px, state.course_px)
     radial_px, turn_px = state.distortion_px
     blurred = distorted(np.asarray(blurred, dtype=np.float64), radial_px=radial_px, turn_px=turn_px)
-    if draft:
-        return blurred, pattern.share * variance_DN2
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
-    power = pattern.squared_transfer(f_row, f_column)
     blur = _object_transfer(state, f_row, f_column)
+    if draft:
+        variance = (
+            variance_DN2 if blur is None else sampled_picture([(dctn(variance_DN2, type=2), blur)], shape, (0.0, 0.0))
+        )
+        return blurred, pattern.share * np.maximum(variance, 0.0)
+    power = pattern.squared_transfer(f_row, f_column)
     variance = sampled_picture(
         [(dctn(variance_DN2, type=2), power if blur is None else power * blur)],
         shape,
@@ -274,3 +277,36 @@ def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     ]
     floor = 1e-12 * max(float(signal.max()), 1e-300)
     return np.maximum(spread[0], floor), np.maximum(spread[1], 0.0)
+
+
+def from_beyond(state: LineState, spread: Spread) -> FloatArray:
+    """What pixels would get more (4, row, column), DN, if the picture went on as it ends beyond a border, and did not mirror there.
+
+    The borders: above, below, left, right. What effects blur alone: the calibrated spread ends within some pixels.
+    """
+    rows, columns = state.signal_DN.shape
+    result = np.zeros((4, rows, columns))
+    if not (state.object_transfers or state.optical_transfers or state.tails):
+        return result
+    from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
+
+    around = ((rows, rows), (columns, columns))
+    more = np.pad(state.signal_DN, around, mode="edge") - np.pad(state.signal_DN, around, mode="symmetric")
+    f_row, f_column = fftfreq(3 * rows)[:, None], rfftfreq(3 * columns)[None, :]
+    transfer = optical_transfer(state, spread, f_row, f_column)
+    blur = _object_transfer(state, f_row, f_column)
+    if blur is not None:
+        transfer = transfer * blur
+    transfer = transfer - spread.transfer(f_row, f_column)
+    inside = np.s_[rows : 2 * rows, columns : 2 * columns]
+    sides = (
+        np.s_[:rows, :],
+        np.s_[2 * rows :, :],
+        np.s_[rows : 2 * rows, :columns],
+        np.s_[rows : 2 * rows, 2 * columns :],
+    )
+    for image, side in zip(result, sides, strict=True):
+        there = np.zeros_like(more)
+        there[side] = more[side]
+        image[...] = irfft2(transfer * rfft2(there), s=more.shape)[inside]
+    return result

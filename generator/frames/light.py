@@ -339,6 +339,9 @@ def context_of(
 def _interpolated(picture: FloatArray, shift_px: tuple[float, float]) -> FloatArray:
     """A picture (row, column) moved on by a displacement, by cubic interpolation between its four nearest points a side.
 
+    No value lies beyond those of the two points on either side of it: beside a step nothing is brighter than the open beam, nor
+    darker than the shadow.
+
     Source: Keys (1981), cubic convolution, doi:10.1109/TASSP.1981.1163711.
     """
     for axis, along in enumerate(shift_px):
@@ -346,11 +349,14 @@ def _interpolated(picture: FloatArray, shift_px: tuple[float, float]) -> FloatAr
             continue
         whole = math.floor(along)
         length = picture.shape[axis]
-        moved = np.zeros(picture.shape)
-        for step in (-1, 0, 1, 2):
-            places = np.clip(np.arange(length) - whole - step, 0, length - 1)
-            moved += _cubic(abs(step - (along - whole))) * np.take(picture, places, axis=axis)
-        picture = moved
+        near = [
+            np.take(picture, np.clip(np.arange(length) - whole - step, 0, length - 1), axis=axis)
+            for step in (-1, 0, 1, 2)
+        ]
+        moved = sum(
+            _cubic(abs(step - (along - whole))) * points for step, points in zip((-1, 0, 1, 2), near, strict=True)
+        )
+        picture = np.clip(moved, np.minimum(near[1], near[2]), np.maximum(near[1], near[2]))
     return picture
 
 

@@ -16,6 +16,7 @@ from ..effects import AppliedEffect, in_order
 from ..line.line_state import FixedPattern, FloatArray, LagLaw, LineFlicker, LineState, TelegraphPixels, TilePattern
 from ..line.series_request import SeriesRequest
 from ..line.twin import Twin
+from ._spread import from_beyond
 from .light import BEFORE_EXPOSURE, Acting, Charge, Light, context_of, light_of, of_quanta
 from .memory import Trapped, filled_before, pause_of, paused, trapped_before
 from .model_cache import ModelCache
@@ -115,6 +116,16 @@ class LineModel:
             InputError: a beam without known level, a scene for a twin without spectral part, an unknown effect or parameter.
         """
         return self._light(request, self._acting(request))
+
+    def from_beyond(self, request: SeriesRequest) -> FloatArray:
+        """What pixels would get more (4, row, column), DN, if a picture did not mirror at a border (above, below, left, right).
+
+        It would go on there as it ends. A model knows no more than the field; what effects blur into it from outside is a guess.
+
+        Raises:
+            InputError: as `light`.
+        """
+        return from_beyond(self.light(request).at_load().state, self.twin.noise.spread.value)
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:
         """What the frames of a series are expected to hold, DN.

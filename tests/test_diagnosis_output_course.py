@@ -1,9 +1,12 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from raytwin.acquisition.setting import setting_from_text
+from raytwin.diagnosis.probes.scalar_context import Areas
+from raytwin.diagnosis.problem.nuisance_columns import brighter
 from raytwin.diagnosis.problem.output_course import OutputCourse, rms_about_mean
 from raytwin.generator.line.series_request import SeriesRequest
 
@@ -71,3 +74,36 @@ def test_noise_of_the_frames_is_no_output():
     levels, courses = split(noisy, frames)
     assert rms_about_mean(levels, courses, [1e-4] * 40) == pytest.approx(0.004, rel=0.15)
     assert rms_about_mean(levels, courses, [1e-3] * 40) == 0.0
+
+
+def test_more_light_has_the_noise_of_more_quanta():
+    """Against frames drawn at both levels: a bright and a dim half, electronics of one variance."""
+    shape, gain, white, more = (40, 50), 2.0, 300.0, 0.3
+    signal = np.where(np.arange(50) < 25, 1000.0, 60.0) * np.ones((40, 1))
+    rng = np.random.default_rng(3)
+
+    def variances(light):
+        frames = gain * rng.poisson(light / gain, (2000, *shape)) + math.sqrt(white) * rng.standard_normal(
+            (2000, *shape)
+        )
+        return [float(frames[:, :, half].var(axis=0).mean()) for half in (np.s_[:25], np.s_[25:])]
+
+    dim, lit = variances(signal), variances((1.0 + more) * signal)
+    labels = (np.arange(50) >= 25).astype(np.int64) * np.ones((40, 1), np.int64)
+    names = ("log_variance bright", "log_variance dim", "frame_factor")
+    series = SimpleNamespace(
+        expected=SimpleNamespace(quantum_variance_DN2=gain * signal, white_variance_DN2=np.full((1, 1), white)),
+        context=SimpleNamespace(areas=Areas.of(np.ones(shape, dtype=bool), labels, 2), label_names=("bright", "dim")),
+    )
+    probes = SimpleNamespace(
+        series=series,
+        of_maps=lambda images: np.pad(images.mean(axis=(1, 2))[:, None], ((0, 0), (0, 3))),
+        of_scalars=lambda change: np.array([0.0, *(change(SimpleNamespace(name=name)) for name in names)]),
+    )
+    level, bright, faint, steps = 100.0 * more * brighter(probes, signal)
+    assert level == pytest.approx(more * signal.mean())
+    assert steps == 0.0
+    # the variance itself grows in proportion
+    for found, before, after in zip((bright, faint), dim, lit, strict=True):
+        assert math.log1p(found) == pytest.approx(math.log(after / before), abs=0.01)
+    assert bright > 2.0 * faint

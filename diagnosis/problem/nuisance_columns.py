@@ -148,14 +148,10 @@ def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.floa
 
     The variance of a mean of n pixels in line is 1 + 2 sum_d (1 - d / n) rho_d times that of independent ones.
     """
-    expected, context = probes.series.expected, probes.series.context
+    context = probes.series.context
     down, across = lag[0], abs(lag[1])
     rows, columns = context.good.shape
-    (of_quanta, of_labels), (white, whites) = map(
-        context.areas.means, (expected.quantum_variance_DN2, expected.white_variance_DN2)
-    )
-    shares = dict(zip(context.label_names, whites / np.maximum(of_labels + whites, LEAST_NOISE_DN2), strict=True))
-    share = white / max(of_quanta + white, LEAST_NOISE_DN2)
+    share, shares = _white_shares(probes)
     within = {
         "row_ratio": (down == 0) * (1.0 - across / columns),
         "column_ratio": (across == 0) * (1.0 - down / rows),
@@ -172,6 +168,30 @@ def _read_texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.floa
     return scales.READ_TEXTURE_SD * probes.of_scalars(lambda probe: of(probe.name))
 
 
+def _white_shares(probes: SeriesProbes) -> tuple[float, dict[str, float]]:
+    """White noise's share of the variance of frames: in all pixels, and by label of the noise probes."""
+    expected, context = probes.series.expected, probes.series.context
+    (of_quanta, of_labels), (white, whites) = map(
+        context.areas.means, (expected.quantum_variance_DN2, expected.white_variance_DN2)
+    )
+    shares = whites / np.maximum(of_labels + whites, LEAST_NOISE_DN2)
+    return white / max(of_quanta + white, LEAST_NOISE_DN2), dict(zip(context.label_names, shares, strict=True))
+
+
+def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What 1 % more light does to a series (probe,), not shrunk: to its mean frame, and to the noise of its quanta.
+
+    signal: expected (row, column), DN.
+    """
+    _, shares = _white_shares(probes)
+
+    def noisier(name: str) -> float:
+        label = name.removeprefix("log_variance ")
+        return 0.01 * (1.0 - shares[label]) if label != name and label in shares else 0.0
+
+    return probes.of_maps(0.01 * signal[None])[0] + probes.of_scalars(lambda probe: noisier(probe.name))
+
+
 def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:
     """Level of beam and series, and gradient of the field."""
     rows, columns = signal.shape
@@ -179,7 +199,7 @@ def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: fl
     x = np.linspace(-1, 1, columns)[None, :] * np.ones((rows, 1))
     images: _Images = {
         f"level of {_beam(item)}": beams_differ * scales.LEVEL_OF_BEAM_SD * signal,
-        level_of(item): scales.LEVEL_OF_SERIES_SD * signal,
+        f"level of {item.name}": scales.LEVEL_OF_SERIES_SD * signal,
     }
     if item.request.exposure_ms > 0:
         images["length of exposures"] = scales.EXPOSURE_SD_MS / item.request.exposure_ms * signal
@@ -226,11 +246,6 @@ def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
     few = 0.5 * max(scales.FEW_BAD_PIXELS, scales.FEW_BAD_SHARE * probes.series.context.areas.order.size)
     more = math.sqrt(few + 0.375) - math.sqrt(0.375)
     return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
-
-
-def level_of(item: SessionSeries) -> str:
-    """Name of the nuisance that is the level of one series, LEVEL_OF_SERIES_SD of it."""
-    return f"level of {item.name}"
 
 
 def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool) -> _Images:

@@ -17,9 +17,9 @@ from ..probes.scalar_context import time_templates
 from ..session.session import SessionSeries
 from .nuisance_columns import (
     Columns,
+    brighter,
     changed_gain_pattern,
     changed_tiles,
-    level_of,
     noise_of_lines,
     offset_of_later,
     uneven,
@@ -33,7 +33,8 @@ class SeriesBlock:
     """The part of a problem that one series makes; its probes are standardised.
 
     Fields: session; names (one a probe); residual, sd, noise (probe,), as in `Problem`; nuisances (probe,) by name; responses
-    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; pattern (probe, wave),
+    (change, probe), 0 where a change cannot be asked; offset (probe,): of one DN more in every pixel; brighter (probe,): of 1 % more
+    light; pattern (probe, wave),
     pattern_jitter (probe,) by length over which pixels are alike, px: what 1 % of a changed gain map does by chance; lines (2,
     probe): variance of what 1 DN of noise common to rows (to columns) does; lit_lines, alike, of 1 % of the light; uneven (2,
     probe) by number of change: more of it on one side of the panel; tiles (probe, tile), alike: what 1 % of changed gains of its
@@ -48,6 +49,7 @@ class SeriesBlock:
     nuisances: Columns
     responses: NDArray[np.float64]
     offset: NDArray[np.float64]
+    brighter: NDArray[np.float64]
     pattern: NDArray[np.float64]
     pattern_jitter: dict[float, NDArray[np.float64]]
     lines: NDArray[np.float64]
@@ -102,6 +104,7 @@ def series_block(
         nuisances=nuisances,
         responses=responses,
         offset=offset_of_later(probes) * shrink,
+        brighter=brighter(probes, signal) * shrink,
         pattern=pattern * shrink[:, None],
         pattern_jitter={length: variance * shrink**2 for length, variance in jitter.items()},
         lines=lines,
@@ -200,8 +203,7 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     single = []  # (probe, what it does by itself)
     levels = np.zeros((size, means.shape[1]))
     for (block, place), shares in zip(lit, means, strict=True):
-        amount = 0.01 / scales.LEVEL_OF_SERIES_SD * block.nuisances[level_of(block.session)]
-        np.multiply.outer(amount, shares, out=levels[place])
+        np.multiply.outer(block.brighter, shares, out=levels[place])
         request = block.session.request
         profiles = dict(time_templates(request.frames))
         for index, name in enumerate(block.names):

@@ -189,7 +189,8 @@ def brighter(probes: SeriesProbes, signal: NDArray[np.float64]) -> NDArray[np.fl
         label = name.removeprefix("log_variance ")
         return 0.01 * (1.0 - shares[label]) if label != name and label in shares else 0.0
 
-    return probes.of_maps(0.01 * signal[None])[0] + probes.of_scalars(lambda probe: noisier(probe.name))
+    level = probes.of_maps(0.01 * signal[None])[0]
+    return np.asarray(level + probes.of_scalars(lambda probe: noisier(probe.name)))
 
 
 def _of_field(item: SessionSeries, signal: NDArray[np.float64], beams_differ: float) -> _Images:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Grid, Parameter, Reading, Shows
+from .effect import Effect, Grid, Parameter, Shows
 
 _NEAR_GAUSSIAN = 0.02  # peakedness up to which first order is enough: the transfer is off by less than 3e-4
 _RING = -0.5
@@ -101,8 +101,5 @@ OFF_FOCAL = Effect(
     isolated_by="an opaque disc at two magnifications",
     shows=Shows(series=("object",), axis="sharpness", flats=False),
     absorbed="nothing",
-    # share and width stand for each other: two shares in the lab were off by 32 %, three of rings in the second simulator by 60 %;
-    # the default of 12 % counts as four (validation/lab_effects.py --strengths)
-    reading=Reading(law_sd=0.38),
     grid=Grid(shares=(0.8,), variants=tuple({"width_mm": width, "peakedness": 0.5} for width in (2.7, 8.3))),
 )

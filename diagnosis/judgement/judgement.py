@@ -122,8 +122,8 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         )
 
     first = weigh([(observed, fits)], rests=False)
-    likeliest = next((item for item in first if item.effects and item.effects != (UNKNOWN,)), None)
-    if likeliest is not None and likeliest.log_evidence > 0.0:
+    likeliest = _likeliest(first)
+    if likeliest is not None:
         tell("nuisances beside the likeliest explanation")
         problem = problem.with_nuisances_beside(_applied_everywhere(problem, likeliest))
         whitening, observed, whitened = _whitened(problem)
@@ -142,6 +142,13 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
     alone = [curve for curve in whitened if not curve.beside]
     fits = fit_effects(observed, alone)
+    nearer = _likeliest(weigh([(observed, fits)], rests=False)) if closer else None
+    if nearer is not None:
+        tell("nuisances beside it, as refinement found it")
+        problem = problem.with_nuisances_beside(_applied_everywhere(problem, nearer))
+        whitening, observed, whitened = _whitened(problem)
+        alone = [curve for curve in whitened if not curve.beside]
+        fits = fit_effects(observed, alone)
     tell("all hypotheses")
     seen = [(observed, fits)]
     if observed.given:
@@ -163,6 +170,12 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         observed=observed,
         fits=fits,
     )
+
+
+def _likeliest(hypotheses: Sequence[Hypothesis]) -> Hypothesis | None:
+    """The likeliest with effects of the catalogue, where it explains anything."""
+    known = next((item for item in hypotheses if item.effects and item.effects != (UNKNOWN,)), None)
+    return known if known is not None and known.log_evidence > 0.0 else None
 
 
 def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]:

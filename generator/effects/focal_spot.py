@@ -1,4 +1,4 @@
-"""Focal spot: it blurs what stands in the beam and leaves the noise alone.
+"""Focal spot: it blurs what stands in the beam and correlates no noise.
 
 Variance of a Gaussian of full width a (M - 1) at the detector, M = source-detector over source-object; profile from Gaussian to
 even brightness.

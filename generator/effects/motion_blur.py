@@ -1,4 +1,4 @@
-"""Motion during the exposure: it blurs what stands in the beam and leaves the noise alone.
+"""Motion during the exposure: it blurs what stands in the beam and correlates no noise.
 
 Box of length l = v t M along the belt; of an object that grows faster or slower by a share a of its mean speed, the places
 l [u + a (u^2 - u)], u even from 0 to 1, about their mean. That mean lies l m from where the object is stated to be: exposures

@@ -27,10 +27,8 @@ SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displa
 _DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
 _LARGEST_STEP_PX = 0.25
 _SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
-_WORTH_A_CELL = 0.98  # share of what is left that a cell further on must take off
-_SHARP_BLUR_PX = (
-    1.5  # standard deviation: the parabola through what a displaced edge leaves then errs by 0.004 px at most
-)
+_WORTH_A_CELL = 0.98  # share of what is left from which a step further on helps
+_SHARP_BLUR_PX = 1.5  # standard deviation; the parabola through what an edge of it leaves errs by 0.004 px at most
 CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
 
 

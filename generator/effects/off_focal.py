@@ -2,11 +2,19 @@
 
 Seen from the object it is a second, wide source; its picture of an edge is as much larger as the detector lies behind the object:
 
-H(f) = 1 - w + w [1 + 2 p (pi s_d f)^2]^(-1 / p),    s_d = s (M - 1)
+H(f) = 1 - w + w P(h),    h = 2 (pi s_d f)^2,    s_d = s (M - 1)
 
-Its profile is a Gaussian at p = 0, falls exponentially from the middle at p = 2/3, and has a peak and a long tail beyond: Gaussians
-whose variances are spread by a gamma law of relative variance p. The open field has the same light with it and without. What lies
-beyond the borders of the field is taken to go on as at them.
+s is the standard deviation of its profile along a line, p its peakedness: a third of the excess kurtosis along a line.
+
+p > 0: P(h) = (1 + p h)^(-1 / p). Gaussians whose variances are spread by a gamma law of relative variance p: the profile falls
+exponentially from the middle at p = 2/3, and has a peak and a long tail beyond. p = 0: a Gaussian, P(h) = exp(-h).
+
+p < 0: P(h) = 0F1(n, -n h), n = -1 - 1 / p. The profile (1 - R^2 / R_0^2)^(n - 2) ends at a rim R_0 = s sqrt(2 n): a ring at p = -1/2
+(n = 1), an even disc at p = -1/3 (n = 2).
+
+The open field has the same light with it and without. Beyond the borders of the field the picture mirrors.
+
+Source: E. M. Stein, G. Weiss (1971), Introduction to Fourier Analysis on Euclidean Spaces, theorem 4.15 of chapter IV (p < 0).
 """
 
 import math
@@ -20,7 +28,7 @@ from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, Parameter, Shows
 
 _NEAR_GAUSSIAN = 0.02  # peakedness up to which first order is enough: the transfer is off by less than 3e-4
-_RING = -0.5
+_RING = -0.5  # peakedness of a source that is its rim alone; no even profile is flatter
 
 
 def _transfer_of_source(half: FloatArray, peakedness: float) -> FloatArray:
@@ -59,7 +67,10 @@ def _add_source(state: LineState, parameters: Mapping[str, float], context: Line
 OFF_FOCAL = Effect(
     id="off_focal",
     title="radiation from around the focal spot",
-    law=r"H(f) = 1 - w + w\,\left[1 + 2\,p\,(\pi s_d f)^2\right]^{-1/p}\ (p > 0),\quad s_d = s\,(M - 1)",
+    law=(
+        r"H = 1 - w + w\,P(h),\quad h = 2\,(\pi s_d f)^2,\quad s_d = s\,(M - 1),\quad "
+        r"P = (1 + p h)^{-1/p}\ (p > 0),\quad P = {}_0F_1(n; -n h),\ n = -1 - 1/p\ (p < 0)"
+    ),
     parameters=(
         Parameter(
             name="strength",

@@ -121,6 +121,7 @@ class LineModel:
         """What pixels would get more (4, row, column), DN, if a picture did not mirror at a border (above, below, left, right).
 
         It would go on there as it ends. A model knows no more than the field; what effects blur into it from outside is a guess.
+        (4, 1, 1), zeros, where all pixels are alike.
 
         Raises:
             InputError: as `light`.

@@ -16,7 +16,7 @@ PIXEL_MM, SOURCE_OBJECT_MM, SOURCE_DETECTOR_MM = 0.15, 300.0, 450.0
 STAGE = {
     "beam": "in the beam, before the object is projected",
     "arrivals": "on the field that reaches the scintillator",
-    "object_blur": "on the picture of the object; the noise follows the light and is no more correlated",
+    "object_blur": "on the picture of the object; noise follows the light, pixel by pixel",
     "quanta": "on the statistics of the photons",
     "optics": "on the spread of light in the detector: picture and noise",
     "exposure": "on the exposure as a whole",

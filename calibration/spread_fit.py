@@ -65,6 +65,9 @@ _REACH_STEP = math.log(1.5)
 # follows a beta law of mean 0.1, in one case of ten any share.
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
+# Behind a screen quanta land anywhere in a pixel; but of frames that are said to have one, so many come from a simulation that counts
+# quanta in pixels. Assumed: some hundred frames of either kind differ by a chi-square of hundreds, against which it is nothing.
+_SIMULATED = 0.01
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
 _MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be
 # A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
@@ -80,6 +83,7 @@ _FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
     "Gaussian, light collected in pixels": ("aperture", _LORENTZIAN, ("sigma_px2",)),
     "Gaussian, quanta counted in pixels": ("sampled", _LORENTZIAN, ("sigma_px2",)),
     "Gaussian with two widths": ("aperture", _LORENTZIAN, _WIDTHS),
+    "two widths, quanta counted in pixels": ("sampled", _LORENTZIAN, _WIDTHS),
     "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px2", *_TAIL)),
     "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px2", *_TAIL)),
     "Gaussian with the tail of a clear layer": ("aperture", CLEAR_LAYER, ("sigma_px2", *_TAIL)),
@@ -733,9 +737,11 @@ def _share_density(share: float) -> float:
 def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
     """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts."""
     cores = _cores(problem)
-    collecting = [item for item in cores.values() if item.spread.model == "aperture"]
-    core = min(collecting, key=lambda item: _criterion(problem, item))
-    found = [(2.0 * problem.no_tail, item) for item in cores.values() if item.spread.model != "aperture"]
+    core, counting = (
+        min((item for item in cores.values() if item.spread.model == model), key=lambda item: _criterion(problem, item))
+        for model in ("aperture", "sampled")
+    )
+    found = [(max(2.0 * problem.no_tail, _SIMULATED), counting)]
     found += _with_tails(problem, core)
     lit = [(mass, item) for mass, item in found if mass > 0 and np.all(item.coefficients[: problem.groups] > 0)]
     return [

@@ -391,15 +391,18 @@ def _tail_changes(twin: Twin) -> list[TwinChange]:
 
 
 def always_a_little(*, side: int = 1) -> list[Variant]:
-    """What most lines have of some effects, at one prior standard deviation: tails of the spread, short and long ones."""
+    """What most lines have of some effects, at one prior standard deviation: tails of the spread."""
     result = []
     for effect in EFFECTS.values():
         little = effect.always_a_little
         if little is None:
             continue
-        for variant in variants_of(effect, side=side):
-            name = f"{little.name}, {variant.name}"
-            result.append(replace(variant, name=name, since="always", strengths=(little.strength,)))
+        some = variants_of(effect, side=side)[0]
+        for inner, strength in little.amounts:
+            own = {name: value / effect.pixels_per_square(name, side) for name, value in inner.items()}
+            label = ", ".join([little.name, *(f"{name} {value:.3g}" for name, value in own.items())])
+            parameters = {**some.parameters, **own}
+            result.append(replace(some, name=label, parameters=parameters, since="always", strengths=(strength,)))
     return result
 
 

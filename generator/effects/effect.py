@@ -166,10 +166,13 @@ class InImages:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlwaysALittle:
-    """What most lines have of an effect, and calibration takes for its own: a nuisance, no effect. Strength: one prior sd."""
+    """What most lines have of an effect, and calibration takes for its own: a nuisance, no effect.
+
+    amounts: inner parameters, and the strength of one prior standard deviation with these.
+    """
 
     name: str
-    strength: float
+    amounts: tuple[tuple[Mapping[str, float], float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

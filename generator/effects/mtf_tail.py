@@ -61,6 +61,10 @@ MTF_TAIL = Effect(
     shows=Shows(series=LIT_SERIES, axis="sharpness"),
     absorbed="noise",
     grid=Grid(shares=(0.8,), variants=({"reach_px": 0.84}, {"reach_px": 2.4})),
-    # screens have up to 20 % of their light there
-    always_a_little=AlwaysALittle(name="tail of the spread", strength=10.0),
+    # screens have up to 20 % of their light there; of a clear layer's, (r^2 + L^2)^(-3/2) with L of 1 to 2 px, a fifth goes beyond
+    # 5 px, where noise shows too little of it
+    always_a_little=AlwaysALittle(
+        name="tail of the spread",
+        amounts=(({"reach_px": 0.84}, 10.0), ({"reach_px": 2.4}, 10.0), ({"reach_px": 5.0}, 3.0)),
+    ),
 )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from raytwin.diagnosis.model.point_maps import blurred_between_points, sampled_at_points
 from raytwin.diagnosis.problem.nuisance_columns import _between_points
-from raytwin.diagnosis.problem.point_maps import blurred_between_points, sampled_at_points
 
 FINE = 15  # places along each side of a pixel
 

@@ -7,6 +7,7 @@ Files:
     responses         change of corrected mean frames and scalars
     calibrated_maps   dark and gain map of the calibrating series, and their noise
     placing           where scenes lie against their thickness maps
+    point_maps        maps that were sampled at points
     defects           pixels that stand out
     _node_loops       responses joined at strengths, compiled
 """

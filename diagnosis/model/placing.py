@@ -11,9 +11,11 @@ from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
 from ..probes.registration import LARGEST_PX, Placement, left_over, register, register_drawn
+from ..probes.straight_edge import straight_scene
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
 from . import changes as scales
+from .point_maps import sampled_at_points
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
 _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
@@ -24,6 +26,7 @@ _CLOSER = 0.5  # of the displacement: what a round may add to it
 _BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
 _GAUSSIANS_PX = (2.0, 3.0, 4.0, 6.0)
 _SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many blurs must leave for others to be tried
+_BETWEEN_POINTS_PX = 1.0 / math.sqrt(12.0)  # standard deviation of a place that may be anywhere in a pixel
 _SEEN_PX = 0.3  # standard deviation below which a displacement is a probe
 
 
@@ -64,8 +67,8 @@ def place_scenes(
     drawn = dict(expected)
     placements: dict[str, Placement] = {}
     telling: dict[str, SeriesRequest] = {}
-    for members in _places(kept).values():
-        placement = _placement(members, expected, pictures, clean=clean, sharp=sharp, expect=expect)
+    for stated in _places(kept).values():
+        members, placement = _as_drawn(stated, expected, pictures, clean=clean, sharp=sharp, expect=expect)
         if placement is None:
             continue
         for item in members:
@@ -95,6 +98,40 @@ def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[Sessi
         if item.series.kind == "object":
             places.setdefault((item.series.scene, item.request.source_object_mm or 0.0), []).append(item)
     return places
+
+
+def _as_drawn(
+    members: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    pictures: Mapping[str, NDArray[np.float64]],
+    *,
+    clean: NDArray[np.bool_],
+    sharp: bool,
+    expect: Callable[[SeriesRequest], ExpectedSeries],
+) -> tuple[Sequence[SessionSeries], Placement | None]:
+    """Series of one place with the maps that show their scene more truly, and where it lies.
+
+    A straight border that jumps from pixel to pixel in its map, as rays to the middle of each have it, is drawn so or as it runs:
+    real pixels see their whole square, most simulations the middle of it.
+    """
+    placement = _placement(members, expected, pictures, clean=clean, sharp=sharp, expect=expect)
+    asked = members[0].request
+    maps = asked.thickness_mm or {}
+    straight = straight_scene(maps) if asked.scene_kind == "edge" and sampled_at_points(maps) else None
+    if placement is None or straight is None:
+        return members, placement
+    others = [replace(item, request=replace(item.request, thickness_mm=straight)) for item in members]
+
+    def left(drawn: Sequence[SessionSeries]) -> float:
+        at = (placement.row_px, placement.column_px)
+        models = [signal_map(expect(replace(item.request, displacement_px=at)), clean.shape) for item in drawn]
+        here = replace(placement, row_px=0.0, column_px=0.0)
+        return left_over([pictures[item.name] for item in drawn], models, clean, here)
+
+    if left(others) >= left(members):
+        return members, placement
+    redrawn = {item.name: expect(item.request) for item in others}
+    return others, _placement(others, redrawn, pictures, clean=clean, sharp=sharp, expect=expect)
 
 
 def _placement(
@@ -200,15 +237,19 @@ def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:
     return covered
 
 
-def displacement_probes(placement: Placement) -> list[Scalar]:
-    """The displacement as probes, px, along the axes where it is seen."""
+def displacement_probes(placement: Placement, *, between_points: bool) -> list[Scalar]:
+    """The displacement as probes, px, along the axes where it is seen.
+
+    between_points: the scene's borders lie anywhere between the points of its maps, along lines of pixels.
+    """
+    stated_px = math.hypot(scales.POSITION_SD_PX, _BETWEEN_POINTS_PX if between_points else 0.0)
     return [
         Scalar(
             axis="sharpness",
             name=name,
             unit="px",
             value=value,
-            sd=math.hypot(sd, scales.POSITION_SD_PX),
+            sd=math.hypot(sd, stated_px),
             sampling_sd=sd,
         )
         for name, value, sd in (

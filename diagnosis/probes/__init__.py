@@ -10,6 +10,7 @@ Files:
     fixed_pattern       patterns that stand in mean frames, and pixels that stand out
     lasting             pixels whose level lasts from frame to frame
     registration        displacement of a scene against its thickness maps
+    straight_edge       how truly a straight edge is drawn, by its oversampled profile
     moving_picture      noise that a fading picture seems to add
     noise_correlation   correlation of neighbouring pixels' noise, summed
     lost_bits           kurtosis of rounded noise

@@ -53,22 +53,27 @@ def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[
     return np.asarray(along_rows, dtype=np.float64), np.asarray(along_columns, dtype=np.float64)
 
 
-def render_variance(signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1) -> NDArray[np.float64]:
+def render_variance(
+    signal_DN: NDArray[np.floating], *, far: bool = True, side: int = 1, cut: float = RENDER_SHARE
+) -> NDArray[np.float64]:
     """Variance (row, column), DN^2, with which pixels at edges are rendered from thickness maps and blur.
 
     far: in the shadow beside an edge the noise is so low that the far end of a blur, which no law has right, would outweigh all
     else: a share of the range within some of the panel's pixels stays open; side: of the squares that the picture has for
-    pixels.
+    pixels; cut: share of the local range to which a pixel that an edge cuts is rendered.
     """
+    result = cut * local_range(signal_DN)
+    for reach, share in _FAR_SHARES if far else ():
+        result = np.maximum(result, share * local_range(signal_DN, math.ceil(reach / side)))
+    return np.asarray(result**2, dtype=np.float64)
+
+
+def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.float64]:
+    """Largest less least signal (row, column) within `reach` pixels of each, DN."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    result = np.zeros(signal_DN.shape)
-    reaches = ((reach, share) for reach, share in _FAR_SHARES if far)
-    for reach, share in ((side, RENDER_SHARE), *reaches):
-        size = 2 * math.ceil(reach / side) + 1
-        local = maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size)
-        result = np.maximum(result, share * local)
-    return np.asarray(result**2, dtype=np.float64)
+    size = 2 * reach + 1
+    return np.asarray(maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size), dtype=np.float64)
 
 
 def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:

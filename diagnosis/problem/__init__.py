@@ -7,7 +7,7 @@ Files:
     series_probes      one series projected: templates, scalars, residual
     series_block       one series in numbers: residual, nuisances, responses, random parts
     nuisance_columns   nuisances of one series
-    point_maps         nuisances of maps sampled at points
+    other_scenes       scenes as they may be instead
     line_noise         noise of rows and columns that is no effect
     output_course      levels and trends of a drifting output
     known_effects      effects that the twin has already

@@ -12,23 +12,22 @@ from ..model.forward_model import Change, strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
 from .nuisance_columns import Columns, light_from_beyond, nuisances_of_series
+from .other_scenes import OtherScenes
 from .series_probes import SeriesProbes
 
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
-Thicker = Mapping[str, Mapping[str, NDArray[np.floating]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbedSeries:
     """One series as the base twin expects it, and what its numbers are.
 
-    Fields: probes; signal_DN (row, column): expected, corrected; thicker: thickness maps of its scene with one material thicker by
-    THICKNESS_SD, by that material.
+    Fields: probes; signal_DN (row, column): expected, corrected; scenes: what may stand in its scene's place.
     """
 
     probes: SeriesProbes
     signal_DN: NDArray[np.floating]
-    thicker: Thicker
+    scenes: OtherScenes
 
     def __len__(self) -> int:
         return len(self.probes)
@@ -117,12 +116,10 @@ class AskedAgain:
         }
         here = replace(one.probes, series=self.session.under(one.probes.series, found))
         signal = np.asarray(one.signal_DN, np.float64) + full_size(at[0], one.signal_DN.shape)
-        thicker = {
-            material: self.session.with_scene(here.series, scene, found) for material, scene in one.thicker.items()
-        }
+        redrawn = one.scenes.drawn(self.session, here.series, found)
         if here.series.session.series.kind == "object":
             columns |= light_from_beyond(here, self.session.from_beyond(one.probes.series, found))
-        return columns | nuisances_of_series(self.session, here, signal, thicker)
+        return columns | nuisances_of_series(self.session, here, signal, redrawn)
 
 
 def notable(columns: Columns) -> Columns:

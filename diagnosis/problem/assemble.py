@@ -18,7 +18,6 @@ from ..checks.preparation import PreparedSession
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
-from ..model import changes as scales
 from ..model.calibrated_maps import LEAST_GAIN, calibrated_maps, exposure_of
 from ..model.changes import (
     Variant,
@@ -43,6 +42,7 @@ from .asked_again import AskedAgain, ProbedSeries, notable
 from .known_effects import lasting, with_found
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns, nuisances_of_series
+from .other_scenes import NO_SCENES, OtherScenes, other_scenes
 from .problem import Problem, SeriesView, read_exactly
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, mean_frame, series_probes
@@ -113,7 +113,7 @@ def build_problem(
         had=had,
         variants=tuple(variants),
         steps=steps,
-        thicker=_thicker_scenes(expected.series),
+        scenes=other_scenes(expected.series),
         back=back,
         side=side,
     )
@@ -267,25 +267,6 @@ def _as_light(item: SessionSeries, model: ForwardModel) -> SessionSeries:
     return replace(item, series=light_of_shares(item.series, float(np.mean(opened.signal_DN))))
 
 
-def _thicker_scenes(series: Sequence[SeriesModel]) -> dict[tuple[str, str], dict[str, NDArray[np.floating]]]:
-    """Thickness maps (row, column), mm, of each scene with one material thicker, by scene and that material.
-
-    One mapping for all series of a scene, so that it is drawn once.
-    """
-    result: dict[tuple[str, str], dict[str, NDArray[np.floating]]] = {}
-    factor = np.float32(1.0 + scales.THICKNESS_SD)
-    for one in series:
-        if one.session.series.kind != "object":
-            continue
-        scene = one.session.request.thickness_mm or {}
-        for material in scene:
-            if (one.session.series.scene, material) not in result:
-                result[one.session.series.scene, material] = {
-                    name: image * factor if name == material else image for name, image in scene.items()
-                }
-    return result
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Part:
     """What one series brings into the problem."""
@@ -300,7 +281,7 @@ class _Compared:
     """A session and the changes that every series of it is asked with.
 
     Fields: measured; asked: changes, those of variants' strengths first, then steps, the twin less each of its effects last; had:
-    these effects; variants; steps: of nuisances that lie in the twin; thicker: see `_thicker_scenes`; back: prior standard
+    these effects; variants; steps: of nuisances that lie in the twin; scenes: see `other_scenes`; back: prior standard
     deviations from the base twin's spectral parameters to the calibrated ones, by name; side: of the squares of the panel's
     pixels that stand for pixels.
     """
@@ -310,7 +291,7 @@ class _Compared:
     had: Mapping[str, AppliedEffect]
     variants: tuple[Variant, ...]
     steps: tuple[Change, ...]
-    thicker: Mapping[tuple[str, str], dict[str, NDArray[np.floating]]]
+    scenes: Mapping[str, OtherScenes]
     back: Mapping[str, float]
     side: int
 
@@ -333,17 +314,12 @@ class _Compared:
             copies=measured.copies.get(one.name, 0),
             lasting=measured.lasting,
         )
-        scenes = {
-            material: self.thicker[one.session.series.scene, material]
-            for material in one.session.request.thickness_mm or {}
-            if one.session.series.kind == "object"
-        }
-        thicker = {material: session.with_scene(one, scene, session.unchanged) for material, scene in scenes.items()}
-        nuisances = nuisances_of_series(session, probes, frame.signal_DN, thicker)
+        scenes = self.scenes.get(one.session.series.scene, NO_SCENES)
+        nuisances = nuisances_of_series(session, probes, frame.signal_DN, scenes.drawn(session, one, session.unchanged))
         return _Part(
             view=_view(one, frame, measured.summaries[one.name]),
             block=series_block(probes, frame, self.asked, moved, nuisances),
-            probed=ProbedSeries(probes=probes, signal_DN=frame.signal_DN, thicker=scenes),
+            probed=ProbedSeries(probes=probes, signal_DN=frame.signal_DN, scenes=scenes),
         )
 
 

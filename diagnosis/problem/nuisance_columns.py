@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from ...generator.line.line_state import TilePattern
 from ..model import changes as scales
 from ..model.forward_model import ForwardModel
+from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
 from ..probes.noise_correlation import autocovariance, correlation_sum
 from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
-from ..probes.registration import CELL_SD_PX, gradient
+from ..probes.registration import CELL_SD_PX, RENDER_SHARE, gradient
 from ..session.even_maps import Map
 from ..session.session import SessionSeries
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
-from .point_maps import blurred_between_points, sampled_at_points
+from .other_scenes import Redrawn
 from .series_probes import SeriesProbes
 
 Columns = dict[str, NDArray[np.float64]]
@@ -30,7 +31,7 @@ _GAIN_MAP_MODES = 3  # cosines along each side
 
 
 def nuisances_of_series(
-    session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved]
+    session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64], redrawn: Redrawn
 ) -> Columns:
     """Nuisances of one series by name, shrunk.
 
@@ -38,15 +39,13 @@ def nuisances_of_series(
         session: all series.
         probes: of the series.
         signal: expected (row, column), DN.
-        thicker: what a scene with one material thicker by THICKNESS_SD would show, by material.
+        redrawn: what other scenes would show.
     """
-    columns = _of_its_own(session.model, probes, signal, thicker) | _gain_map_noise(session, probes, signal)
+    columns = _of_its_own(session.model, probes, signal, redrawn) | _gain_map_noise(session, probes, signal)
     return {name: column * probes.shrink for name, column in columns.items()}
 
 
-def _of_its_own(
-    model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.float64], thicker: Mapping[str, Moved]
-) -> Columns:
+def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.float64], redrawn: Redrawn) -> Columns:
     item, beams_differ = probes.series.session, model.beams_differ
     columns: Columns = {
         "shape of the noise": probes.of_scalars(lambda probe: scales.KURTOSIS_SD if probe.name == "kurtosis" else 0.0)
@@ -62,10 +61,12 @@ def _of_its_own(
         columns["few new bad pixels"] = _few_bad_pixels(probes)
     if item.series.kind == "object":
         dy, dx = gradient(signal)
-        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, thicker, beams_differ)
-        images |= _of_scene(item, dy, dx, sharp=model.sharp)
+        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, redrawn.thicker, beams_differ)
+        images |= _of_scene(item, dy, dx, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
         if model.sharp:
             images |= _between_points(item, signal)
+        if redrawn.straight is not None:
+            images[f"straight border of {_place(item)}"] = redrawn.straight
     return columns | _projected(probes, images)
 
 
@@ -249,8 +250,14 @@ def _few_bad_pixels(probes: SeriesProbes) -> NDArray[np.float64]:
     return probes.of_scalars(lambda probe: more if probe.name in (OUTLIERS, OUTLIERS_ANYWHERE) else 0.0)
 
 
-def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool) -> _Images:
-    """Where a scene lies and how its outline is drawn; dy, dx: slopes of the signal (row, column), DN a pixel."""
+def _of_scene(
+    item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float64], *, sharp: bool, rough: float
+) -> _Images:
+    """Where a scene lies and how its outline is drawn.
+
+    dy, dx: slopes of the signal (row, column), DN a pixel; sharp: pixels see no farther than themselves; rough: how far outlines
+    depart from their maps along them, over what is assumed.
+    """
     place = _place(item)
     rows, columns = dy.shape
     registered_px = CELL_SD_PX if sharp else scales.REGISTERED_SD_PX
@@ -265,7 +272,7 @@ def _of_scene(item: SessionSeries, dy: NDArray[np.float64], dx: NDArray[np.float
         f"rotation of {place}": scales.MAGNIFICATION_SD * (across * dy - row * dx),
     }
     for number, field in enumerate(_rough_fields(dy.shape, place)):
-        images[f"rough edge {number} of {place}"] = slope * field
+        images[f"rough edge {number} of {place}"] = rough * slope * field
     return images
 
 

@@ -12,12 +12,14 @@ from ..model.calibrated_maps import CalibratedMaps
 from ..model.changes import Variant
 from ..model.forward_model import strength_rows
 from ..model.placing import SHARP_SCENES, displacement_probes, inside
+from ..model.point_maps import sampled_at_points
 from ..model.responses import Moved, SeriesModel, SessionModel
 from ..probes.fixed_pattern import count_outliers, pattern_statistics
 from ..probes.frame_scalars import measured_scalars
 from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
 from ..probes.probes import ProbeName, Scalar
-from ..probes.registration import render_variance
+from ..probes.registration import RENDER_SHARE, local_range, render_variance
+from ..probes.straight_edge import distance_px, scatter_share, straight_scene
 from ..session.even_maps import Map, full_size, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
@@ -29,7 +31,8 @@ class MeanFrame:
     """A series' corrected mean frame against the model; maps (row, column).
 
     Fields: signal_DN: expected; residual_DN: measured less expected; mask: pixels that are compared; quantum_DN2, white_DN2: variance
-    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white.
+    of the mean frame, dark's and gain map's share included, correlated as quanta are, and white; rendered: share of the local range
+    to which pixels that an edge cuts are drawn.
     """
 
     signal_DN: NDArray[np.float64]
@@ -37,6 +40,7 @@ class MeanFrame:
     mask: NDArray[np.bool_]
     quantum_DN2: NDArray[np.float64]
     white_DN2: NDArray[np.float64]
+    rendered: float = RENDER_SHARE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,13 +48,14 @@ class SeriesProbes:
     """The probes of one series: projections of its mean frame, then scalars.
 
     Fields: series; projection; scalars: measured; shrink (probe,): what each number is multiplied with to have unit noise again once
-    the floor of what edges show is added.
+    the floor of what edges show is added; rendered: see `MeanFrame`.
     """
 
     series: SeriesModel
     projection: MapProjection
     scalars: tuple[Scalar, ...]
     shrink: NDArray[np.float64]
+    rendered: float
 
     def __len__(self) -> int:
         return len(self.shrink)
@@ -133,13 +138,35 @@ def mean_frame(
     white = np.maximum(white, LEAST_NOISE_DN2)
     quantum = quantum / frames + signal**2 * maps.gain_quantum
     white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
+    rendered = RENDER_SHARE
     if one.session.series.kind == "object":
-        white = white + render_variance(signal, side=side)
+        rendered = _rendered(one, corrected_DN - signal, signal, mask)
+        white = white + render_variance(signal, side=side, cut=rendered)
         if one.session.request.scene_kind not in SHARP_SCENES:
             # steps of wedges and outlines of products are rendered no better than their maps' pixels
             mask = mask & ~near_steps(signal)
     return MeanFrame(
-        signal_DN=signal, residual_DN=corrected_DN - signal, mask=mask, quantum_DN2=quantum, white_DN2=white
+        signal_DN=signal,
+        residual_DN=corrected_DN - signal,
+        mask=mask,
+        quantum_DN2=quantum,
+        white_DN2=white,
+        rendered=rendered,
+    )
+
+
+def _rendered(
+    one: SeriesModel, residual_DN: NDArray[np.float64], signal_DN: NDArray[np.float64], mask: NDArray[np.bool_]
+) -> float:
+    """Share of the local range to which pixels at edges are drawn: of a straight edge as it is seen, of others as assumed."""
+    request = one.session.request
+    if request.scene_kind != "edge" or request.thickness_mm is None:
+        return RENDER_SHARE
+    away = distance_px(request.thickness_mm)
+    return (
+        RENDER_SHARE
+        if away is None
+        else min(RENDER_SHARE, scatter_share(residual_DN, local_range(signal_DN), mask, away))
     )
 
 
@@ -220,7 +247,10 @@ def series_probes(
     )
     scalars = [probe for probe in scalars if probe.name in one.scalars]
     if one.placement is not None and one.tells_displacement:
-        scalars += displacement_probes(one.placement)
+        maps = one.session.request.thickness_mm or {}
+        # a slanted border meets the pixels everywhere, so that where it lies between them averages out
+        between = sampled_at_points(maps) and straight_scene(maps) is None
+        scalars += displacement_probes(one.placement, between_points=between)
     # noise of lines that is no effect stands in the mean frame as well
     beyond = np.asarray(session.usual_lines(one.session)) @ projection.line_noise()
     at_edges = [
@@ -232,6 +262,7 @@ def series_probes(
         projection=projection,
         scalars=tuple(scalars),
         shrink=np.concatenate([1.0 / np.sqrt(1.0 + floors**2 + beyond), np.ones(len(scalars))]),
+        rendered=frame.rendered,
     )
 
 

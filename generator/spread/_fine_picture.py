@@ -91,7 +91,7 @@ def _of_three(picture: FloatArray, which: np.ufunc) -> FloatArray:
     return np.asarray(which(which(lines[:, :-2], lines[:, 1:-1]), lines[:, 2:]))
 
 
-def _area_beyond(distance: FloatArray, long: FloatArray, short: FloatArray) -> FloatArray:
+def area_beyond(distance: FloatArray, long: FloatArray, short: FloatArray) -> FloatArray:
     """Share of a unit square on the far side of a line at `distance` from its centre, normal (long, short), long >= short.
 
     The projection of the square on the normal is the sum of two uniform numbers of widths `long` and `short`.
@@ -123,12 +123,12 @@ def cell_coverage(normal_row: FloatArray, normal_column: FloatArray, covered: Fl
     lowest, highest = np.full(covered.shape, -1.0), np.full(covered.shape, 1.0)
     for _ in range(40):
         middle = 0.5 * (lowest + highest)
-        too_much = _area_beyond(middle, long, short) > covered
+        too_much = area_beyond(middle, long, short) > covered
         lowest, highest = np.where(too_much, middle, lowest), np.where(too_much, highest, middle)
     distance = 0.5 * (lowest + highest)
     place = (np.arange(FINE) - 0.5 * (FINE - 1)) / FINE
     offset = down[:, None, None] * place[:, None] + right[:, None, None] * place[None, :]
-    cells = _area_beyond(FINE * (distance[:, None, None] - offset), long[:, None, None], short[:, None, None])
+    cells = area_beyond(FINE * (distance[:, None, None] - offset), long[:, None, None], short[:, None, None])
     # what is not straight within the pixel would change its mean
     return np.asarray(cells + (covered - cells.mean(axis=(1, 2)))[:, None, None])
 

@@ -1,0 +1,65 @@
+"""Scenes as they may be instead: a material thicker, a straight border where it runs between the points of a map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..model import changes as scales
+from ..model.point_maps import sampled_at_points
+from ..model.responses import Asked, Moved, SeriesModel, SessionModel
+from ..probes.straight_edge import straight_scene
+from ..session.even_maps import Map
+
+_Maps = Mapping[str, NDArray[np.floating]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OtherScenes:
+    """Thickness maps (row, column), mm, of what may stand in a scene's place.
+
+    Fields: thicker: with one material thicker by THICKNESS_SD, by that material; straight: with a straight border drawn by the share
+    of each pixel that it covers; None: the maps show none, or have it so.
+    """
+
+    thicker: Mapping[str, _Maps]
+    straight: _Maps | None
+
+    def drawn(self, session: SessionModel, one: SeriesModel, asked: Asked) -> "Redrawn":
+        """What each shows in a series under a change, less what its own scene shows there."""
+        return Redrawn(
+            thicker={material: session.with_scene(one, maps, asked) for material, maps in self.thicker.items()},
+            straight=None if self.straight is None else session.with_scene(one, self.straight, asked)[0],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Redrawn:
+    """What other scenes show in a series, by the fields of `OtherScenes`; maps (row, column), DN."""
+
+    thicker: Mapping[str, Moved]
+    straight: Map | None
+
+
+NO_SCENES = OtherScenes(thicker={}, straight=None)
+
+
+def other_scenes(series: Sequence[SeriesModel]) -> dict[str, OtherScenes]:
+    """Other scenes by the scene in whose place they stand; one object for all its series, so that each is drawn once."""
+    result: dict[str, OtherScenes] = {}
+    factor = np.float32(1.0 + scales.THICKNESS_SD)
+    for one in series:
+        item = one.session
+        if item.series.kind != "object" or item.series.scene in result:
+            continue
+        maps = item.request.thickness_mm or {}
+        edge = item.request.scene_kind == "edge" and sampled_at_points(maps)
+        result[item.series.scene] = OtherScenes(
+            thicker={
+                material: {name: image * factor if name == material else image for name, image in maps.items()}
+                for material in maps
+            },
+            straight=straight_scene(maps) if edge else None,
+        )
+    return result

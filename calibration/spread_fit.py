@@ -65,8 +65,8 @@ _REACH_STEP = math.log(1.5)
 # follows a beta law of mean 0.1, in one case of ten any share.
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
-# Behind a screen quanta land anywhere in a pixel; but of frames that are said to have one, so many come from a simulation that counts
-# quanta in pixels. Assumed: some hundred frames of either kind differ by a chi-square of hundreds, against which it is nothing.
+# Behind a screen quanta land anywhere in a pixel; but of frames that are said to have one, so many come from a simulation that
+# counts quanta in pixels. Assumed: chi-squares differ by 10 to 1900 where that is so, by thousands in the lab, where it is not.
 _SIMULATED = 0.01
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
 _MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be

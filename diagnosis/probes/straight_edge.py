@@ -26,8 +26,10 @@ _MOST_CUT = 3.0  # pixels of a line: a step, even a worn one, and no slope
 
 @dataclass(frozen=True, slots=True)
 class _Border:
-    """A straight border: distance of each pixel from it (row, column), px, to either side; slope: rows a column or less; behind: sign
-    of the distances where the object is.
+    """A straight border that crosses lines of pixels.
+
+    Fields: away_px: distance of each pixel from it (row, column), px, to either side; slope: pixels that it goes on from line to
+    line; behind: sign of the distances where the object is; lines: how many it crosses.
     """
 
     away_px: NDArray[np.float64]

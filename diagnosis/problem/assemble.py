@@ -314,7 +314,7 @@ class _Compared:
             copies=measured.copies.get(one.name, 0),
             lasting=measured.lasting,
         )
-        scenes = self.scenes.get(one.session.series.scene, NO_SCENES)
+        scenes = self.scenes.get(one.name, NO_SCENES)
         nuisances = nuisances_of_series(session, probes, frame.signal_DN, scenes.drawn(session, one, session.unchanged))
         return _Part(
             view=_view(one, frame, measured.summaries[one.name]),

@@ -46,20 +46,23 @@ NO_SCENES = OtherScenes(thicker={}, straight=None)
 
 
 def other_scenes(series: Sequence[SeriesModel]) -> dict[str, OtherScenes]:
-    """Other scenes by the scene in whose place they stand; one object for all its series, so that each is drawn once."""
+    """Other scenes by the name of each series of objects; one object for all series of the same maps, so that each is drawn once."""
     result: dict[str, OtherScenes] = {}
+    known: dict[int, OtherScenes] = {}
     factor = np.float32(1.0 + scales.THICKNESS_SD)
     for one in series:
-        item = one.session
-        if item.series.kind != "object" or item.series.scene in result:
+        if one.session.series.kind != "object":
             continue
-        maps = item.request.thickness_mm or {}
-        edge = item.request.scene_kind == "edge" and sampled_at_points(maps)
-        result[item.series.scene] = OtherScenes(
-            thicker={
-                material: {name: image * factor if name == material else image for name, image in maps.items()}
-                for material in maps
-            },
-            straight=straight_scene(maps) if edge else None,
-        )
+        asked = one.session.request
+        maps = asked.thickness_mm or {}
+        if id(asked.thickness_mm) not in known:
+            edge = asked.scene_kind == "edge" and sampled_at_points(maps)
+            known[id(asked.thickness_mm)] = OtherScenes(
+                thicker={
+                    material: {name: image * factor if name == material else image for name, image in maps.items()}
+                    for material in maps
+                },
+                straight=straight_scene(maps) if edge else None,
+            )
+        result[one.name] = known[id(asked.thickness_mm)]
     return result

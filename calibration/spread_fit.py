@@ -737,11 +737,12 @@ def _share_density(share: float) -> float:
 def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
     """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts."""
     cores = _cores(problem)
-    core, counting = (
-        min((item for item in cores.values() if item.spread.model == model), key=lambda item: _criterion(problem, item))
-        for model in ("aperture", "sampled")
+    core = min(
+        (item for item in cores.values() if item.spread.model == "aperture"),
+        key=lambda item: _criterion(problem, item),
     )
-    found = [(max(2.0 * problem.no_tail, _SIMULATED), counting)]
+    counting = [item for item in cores.values() if item.spread.model == "sampled"]
+    found = [(max(2.0 * problem.no_tail, _SIMULATED) / len(counting), item) for item in counting]
     found += _with_tails(problem, core)
     lit = [(mass, item) for mass, item in found if mass > 0 and np.all(item.coefficients[: problem.groups] > 0)]
     return [

@@ -19,6 +19,7 @@ from raytwin.diagnosis.model.forward_model import Change, ForwardModel, strength
 from raytwin.diagnosis.model.placing import inside
 from raytwin.diagnosis.probes.registration import Placement
 from raytwin.diagnosis.problem.nuisance_columns import nuisances_of_series
+from raytwin.diagnosis.problem.other_scenes import Redrawn
 from raytwin.diagnosis.problem.series_probes import variance_of_what_came
 from raytwin.diagnosis.session.even_maps import compact, full_size
 from raytwin.errors import InputError
@@ -351,6 +352,7 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         of_maps=lambda images: np.asarray(images, dtype=float).reshape(len(images), -1),
         of_scalars=lambda change: np.zeros(4),
         shrink=np.ones(4),
+        rendered=0.1,
     )
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_edges", lambda *_: {})
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._read_texture", lambda *_: np.zeros(4))
@@ -360,7 +362,7 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
     def columns(beams_differ):
         model = SimpleNamespace(sharp=False, beams_differ=beams_differ)
         session = SimpleNamespace(model=model, maps=SimpleNamespace(shares={}))
-        return nuisances_of_series(session, probes, signal, {"Al": (thinner, {})})
+        return nuisances_of_series(session, probes, signal, Redrawn(thicker={"Al": (thinner, {})}, straight=None))
 
     usual, wider = columns(1.0), columns(3.0)
     # all exposures 20 us longer or shorter than stated

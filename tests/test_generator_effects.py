@@ -25,7 +25,7 @@ from raytwin.generator.frames.line_model import LineMemory, LineModel
 from raytwin.generator.frames.model_cache import ModelCache
 from raytwin.generator.frames.response import light_of, responded
 from raytwin.generator.line.line_state import STAGES, LineState
-from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding
+from raytwin.generator.line.rounding import rounded_variance, variance_before_rounding, variance_kept_by_means
 from raytwin.generator.line.series_request import SeriesRequest
 from raytwin.generator.line.spectral_signal import OpenBeam
 from raytwin.generator.predictions.predict import spectral_model_of
@@ -1033,6 +1033,18 @@ def test_rounding_to_coarse_steps_has_the_moments_of_a_rounded_gaussian(series_l
         assert found.mean_DN[0, 0] == pytest.approx(mean, abs=2e-3)
         assert found.white_variance_DN2[0, 0] == pytest.approx(float(weight @ (grid - mean) ** 2), rel=1e-3)
         assert found.quantisation_step_DN == step
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.15, 0.3, 1.0])
+def test_rounding_stays_in_means_where_noise_is_below_half_a_step(sd):
+    """Means of 4000 rounded values, about what was rounded: their own scatter aside, the variance that is said to stay."""
+    rng, step = np.random.default_rng(2), 3.0
+    true = rng.uniform(100.0, 200.0, 800)
+    values = step * np.round((true + sd * step * rng.standard_normal((4000, 800))) / step)
+    stays = float(np.mean((values.mean(axis=0) - true) ** 2) - np.mean(values.var(axis=0)) / 4000)
+    said = float(variance_kept_by_means(rounded_variance((sd * step) ** 2, step), step))
+    assert stays == pytest.approx(said, rel=0.08, abs=2e-4 * step**2)
+    assert said == pytest.approx(step**2 / 12.0, rel=1e-6) if sd == 0.0 else said < 0.05 * step**2
 
 
 @pytest.mark.parametrize("sd_steps", [0.05, 0.15, 0.3, 0.6, 2.0])

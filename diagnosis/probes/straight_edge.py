@@ -19,7 +19,7 @@ from ...generator.spread._fine_picture import area_beyond
 _BINS_A_PX = 4
 _NEAR_PX = 3.0  # from the border
 _STRAIGHT_PX = 0.4  # rms of the border about a line; a border that runs between sampled points departs by 0.29
-_LEAST_LINES = 16
+_LEAST_LINES = 16  # that cross the border: its place is then known to 0.29 / 4 px
 _LEAST_CUT = 0.02  # of a pixel, from which a border cuts it
 _MOST_CUT = 3.0  # pixels of a line: a step, even a worn one, and no slope
 
@@ -56,7 +56,7 @@ def straight_scene(thickness_mm: Mapping[str, NDArray[np.floating]]) -> dict[str
     short, long = (np.full(border.away_px.shape, side / length) for side in sides)
     covered = area_beyond(-border.behind * border.away_px, long, short)
     ((name, image),) = thickness_mm.items()
-    return {name: (covered * float(np.max(image))).astype(image.dtype)}
+    return {name: (covered * float(np.max(image))).astype(np.float32)}
 
 
 def _border(thickness_mm: Mapping[str, NDArray[np.floating]]) -> _Border | None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
+from ...generator.line.rounding import variance_kept_by_means
 from ..model import changes as scales
 from ..model.calibrated_maps import CalibratedMaps
 from ..model.changes import Variant
@@ -23,6 +24,7 @@ from ..probes.straight_edge import distance_px, scatter_share, straight_scene
 from ..session.even_maps import Map, full_size, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
+_STEP_DN = 1.0  # of the ADC
 _NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
 
 
@@ -136,8 +138,9 @@ def mean_frame(
         came = variance_of_what_came(quantum + white, signal, corrected_DN)
         quantum = np.maximum(quantum, came - white)
     white = np.maximum(white, LEAST_NOISE_DN2)
+    kept = variance_kept_by_means(quantum + white, _STEP_DN)
     quantum = quantum / frames + signal**2 * maps.gain_quantum
-    white = white / frames + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
+    white = white / frames + kept + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
     rendered = RENDER_SHARE
     if one.session.series.kind == "object":
         rendered = _rendered(one, corrected_DN - signal, signal, mask)

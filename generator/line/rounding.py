@@ -29,6 +29,15 @@ def variance_before_rounding(variance: ArrayLike, step: float) -> NDArray[np.flo
     return np.asarray(np.where(after < found[-1], np.interp(after, found, sd) ** 2, after - 1.0 / 12.0) * step**2)
 
 
+def variance_kept_by_means(variance: ArrayLike, step: float) -> NDArray[np.float64]:
+    """What rounding to multiples of `step` (> 0) leaves in the mean of any number of values, by their variance after it; any shape.
+
+    Noise below half a step does not move a value over the next threshold each time: step^2 / 12 without any, nothing from a step on.
+    """
+    after = np.asarray(variance, dtype=np.float64)
+    return np.maximum(variance_before_rounding(after, step) + step**2 / 12.0 - np.maximum(after, 0.0), 0.0)
+
+
 @lru_cache(maxsize=1)
 def _table() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Standard deviations before, and variances after rounding, in steps."""

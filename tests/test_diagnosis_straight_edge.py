@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from raytwin.diagnosis.model.placing import _as_drawn
+from raytwin.diagnosis.model.placing import MeasuredScenes, _as_drawn
 from raytwin.diagnosis.probes.registration import local_range
 from raytwin.diagnosis.probes.straight_edge import distance_px, scatter_share, straight_scene
 from raytwin.generator.line.series_request import SeriesRequest
@@ -127,9 +127,8 @@ def test_a_border_between_points_is_drawn_as_it_shows(rays):
     truth = drawn(replace(asked, thickness_mm={"Pb": edge(0.06, rays=rays)})).signal_DN
     seen = truth + np.random.default_rng(4).normal(0.0, np.sqrt(truth / 10.0))
     items = [Item("edge", asked, SimpleNamespace(n_frames=10))]
-    members, placement = _as_drawn(
-        items, {"edge": drawn(asked)}, {"edge": seen}, clean=np.ones(SHAPE, bool), sharp=False, expect=drawn
-    )
+    measured = MeasuredScenes(pictures={"edge": seen}, clean=np.ones(SHAPE, bool), sharp=False, expect=drawn)
+    members, placement = _as_drawn(items, {"edge": drawn(asked)}, measured)
     left = np.abs(members[0].request.thickness_mm["Pb"] - edge(0.06, rays=rays)).max()
     assert left < 0.12
     assert (members is items) == (rays == 1)

@@ -44,37 +44,53 @@ class PlacedSeries:
     telling: Mapping[str, SeriesRequest]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredScenes:
+    """What scenes are placed by.
+
+    Fields: pictures: corrected mean frames (row, column), DN, by name of series; clean: pixels in use that do not stand out (row,
+    column); sharp: pixels see no farther than themselves; expect: asks the base twin.
+    """
+
+    pictures: Mapping[str, NDArray[np.float64]]
+    clean: NDArray[np.bool_]
+    sharp: bool
+    expect: Callable[[SeriesRequest], ExpectedSeries]
+
+    def of(self, members: Sequence[SessionSeries]) -> list[NDArray[np.float64]]:
+        """Measured pictures of some series."""
+        return [self.pictures[item.name] for item in members]
+
+    def drawn(self, members: Sequence[SessionSeries], at: tuple[float, float]) -> list[NDArray[np.float64]]:
+        """Their pictures by the base twin with the scene displaced along rows and columns, px."""
+        asked = [replace(item.request, displacement_px=at) for item in members]
+        return [signal_map(self.expect(request), self.clean.shape) for request in asked]
+
+
 def place_scenes(
     kept: Sequence[SessionSeries],
     expected: Mapping[str, ExpectedSeries],
-    pictures: Mapping[str, NDArray[np.float64]],
-    *,
-    clean: NDArray[np.bool_],
-    sharp: bool,
-    expect: Callable[[SeriesRequest], ExpectedSeries],
+    measured: MeasuredScenes,
 ) -> PlacedSeries:
     """Registers every scene, all series of a place together.
 
     Args:
         kept: series that can be compared.
         expected: by the base twin, scenes where their maps have them, by name.
-        pictures: corrected mean frames (row, column), DN, by name.
-        clean: pixels in use that do not stand out (row, column).
-        sharp: pixels see no farther than themselves.
-        expect: asks the base twin.
+        measured: what they are placed by.
     """
     requests: dict[str, SeriesRequest] = {}
     drawn = dict(expected)
     placements: dict[str, Placement] = {}
     telling: dict[str, SeriesRequest] = {}
     for stated in _places(kept).values():
-        members, placement = _as_drawn(stated, expected, pictures, clean=clean, sharp=sharp, expect=expect)
+        members, placement = _as_drawn(stated, expected, measured)
         if placement is None:
             continue
         for item in members:
             placements[item.name] = placement
             requests[item.name] = replace(item.request, displacement_px=(placement.row_px, placement.column_px))
-            drawn[item.name] = expect(requests[item.name])
+            drawn[item.name] = measured.expect(requests[item.name])
         # the series with the most light says most of where the scene lies
         tells = max(members, key=lambda item: _light_DN(item, expected[item.name]))
         telling |= {item.name: requests[tells.name] for item in members}
@@ -101,20 +117,14 @@ def _places(kept: Sequence[SessionSeries]) -> dict[tuple[str, float], list[Sessi
 
 
 def _as_drawn(
-    members: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    pictures: Mapping[str, NDArray[np.float64]],
-    *,
-    clean: NDArray[np.bool_],
-    sharp: bool,
-    expect: Callable[[SeriesRequest], ExpectedSeries],
+    members: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], measured: MeasuredScenes
 ) -> tuple[Sequence[SessionSeries], Placement | None]:
     """Series of one place with the maps that show their scene more truly, and where it lies.
 
     A straight border that jumps from pixel to pixel in its map, as rays to the middle of each have it, is drawn so or as it runs:
     real pixels see their whole square, most simulations the middle of it.
     """
-    placement = _placement(members, expected, pictures, clean=clean, sharp=sharp, expect=expect)
+    placement = _placement(members, expected, measured)
     asked = members[0].request
     maps = asked.thickness_mm or {}
     straight = straight_scene(maps) if asked.scene_kind == "edge" and sampled_at_points(maps) else None
@@ -124,28 +134,21 @@ def _as_drawn(
 
     def left(drawn: Sequence[SessionSeries]) -> float:
         at = (placement.row_px, placement.column_px)
-        models = [signal_map(expect(replace(item.request, displacement_px=at)), clean.shape) for item in drawn]
         here = replace(placement, row_px=0.0, column_px=0.0)
-        return left_over([pictures[item.name] for item in drawn], models, clean, here)
+        return left_over(measured.of(drawn), measured.drawn(drawn, at), measured.clean, here)
 
     if left(others) >= left(members):
         return members, placement
-    redrawn = {item.name: expect(item.request) for item in others}
-    return others, _placement(others, redrawn, pictures, clean=clean, sharp=sharp, expect=expect)
+    redrawn = {item.name: measured.expect(item.request) for item in others}
+    return others, _placement(others, redrawn, measured)
 
 
 def _placement(
-    members: Sequence[SessionSeries],
-    expected: Mapping[str, ExpectedSeries],
-    pictures: Mapping[str, NDArray[np.float64]],
-    *,
-    clean: NDArray[np.bool_],
-    sharp: bool,
-    expect: Callable[[SeriesRequest], ExpectedSeries],
+    members: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], measured: MeasuredScenes
 ) -> Placement | None:
     """Where the scene of series of one place lies; None: nothing shows it, or it is nowhere near its maps."""
-    shape = clean.shape
-    seen = [pictures[item.name] for item in members]
+    clean, sharp = measured.clean, measured.sharp
+    shape, seen = clean.shape, measured.of(members)
     noises = [
         full_size(expected[item.name].quantum_variance_DN2 + expected[item.name].white_variance_DN2, shape)
         / item.series.n_frames
@@ -157,7 +160,7 @@ def _placement(
         return None
 
     def drawn(at: tuple[float, float]) -> list[NDArray[np.float64]]:
-        return [signal_map(expect(replace(item.request, displacement_px=at)), shape) for item in members]
+        return measured.drawn(members, at)
 
     # drawn where it lies, an edge shows what is left of its displacement more truly than any resampled picture
     if sharp or members[0].request.scene_kind in SHARP_SCENES:

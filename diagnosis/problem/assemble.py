@@ -31,7 +31,7 @@ from ..model.changes import (
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
 from ..model.forward_model import Change, ForwardModel, draft_cache, own_maps, strength_rows
-from ..model.placing import place_scenes
+from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
 from ..session.even_maps import Map
@@ -206,7 +206,8 @@ def _measured(
     }
     tell("registration")
     pictures = {item.name: maps.corrected(item, seen.looks[item.name].mean_DN) for item in seen.kept}
-    placed = place_scenes(seen.kept, seen.expected, pictures, clean=clean, sharp=model.sharp, expect=model.expect)
+    scenes = MeasuredScenes(pictures=pictures, clean=clean, sharp=model.sharp, expect=model.expect)
+    placed = place_scenes(seen.kept, seen.expected, scenes)
     return _Measured(
         expected=session_model(model, maps, placed, seen, summaries, clean, lines_DN2=lines_DN2),
         pictures=pictures,

@@ -10,6 +10,7 @@ Files:
     flat_levels           each series as photon transfer sees it, the level of each beam, the gain map
     flat_evidence         drift, lag, linearity, repeats, shape of the noise
     noise_power           noise power of one series
+    spread_families       forms that the optical spread may have, and how likely each is
     spread_fit            optical spread, gain and read noise from the noise power of all series
     noise_of_flats        the series that this fit takes
     repeated_frames       noise where flats are single frames

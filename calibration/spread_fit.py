@@ -4,24 +4,35 @@ P_s(f) = I_s [A_g S(f) + W_g] + r^2 + E_s f_0 / f + F_s (f_0 / f)^2
 
 S: power of unit quanta after the spread (1 at f = 0), so that the gain of a beam g is A_g + W_g; W: white noise that
 follows the signal; r^2: electronic noise; E, F: what is left of slow changes between frames, where the data show any or
-come from two series. The spread is a Gaussian core, of one width or two, and a tail. Frames that are small or few hardly show
-a tail that takes a tenth of the light and a fifth of the gain with it: tails are averaged over by their evidence, with what
-is known of panels as prior, and what they leave open is part of the standard deviations. A second route to the gain, which
-knows no kernel, tests the first.
+come from two series. The spread is a Gaussian core, of one width or two, and a tail (`spread_families.py`). Frames that are
+small or few hardly show a tail that takes a tenth of the light and a fifth of the gain with it: tails are averaged over by
+their evidence, with what is known of panels as prior, and what they leave open is part of the standard deviations. A second
+route to the gain, which knows no kernel, tests the first.
 """
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
 from ..generator.line.twin import OtherSpread
-from ..generator.spread.psf import CLEAR_LAYER, Spread
+from ..generator.spread.psf import Spread
 from .noise_power import LARGEST_SQUARE_PX, NoisePower, mode_share, spread_of_bins, usable
+from .spread_families import (
+    CORES,
+    FAMILIES,
+    GENERAL,
+    LOG_REACH,
+    SIMPLEST,
+    TAIL,
+    prior_of_models,
+    reach_mass,
+    share_density,
+)
 
 FloatArray = NDArray[np.float64]
 # White noise proportional to signal beside the quanta (secondary quanta): 1/K of the quantum variance for K electrons a
@@ -45,9 +56,6 @@ _BOUNDS = {
     "tail_share": (0.0, 1.0),
     "log_tail_px": (-1.6, 1.6),
 }
-# Light that goes farther is glare, not spread. The longest reach L is that whose transfer function is still 0.8 at 2 / M, the
-# lowest frequency that the largest squares, of M px, have in full use: 2 pi L (2 / M) = 1/2.
-_LONGEST_TAIL_PX = LARGEST_SQUARE_PX / (8.0 * math.pi)
 # Of a core wider than this share of the square less than a fifth of the power is left there: it cannot be told from drift.
 _WIDEST_CORE = 0.1
 # narrow and wide, and of the tail little, much and nearly all
@@ -56,18 +64,7 @@ _STARTS = (
     {"sigma_px2": 4.0, "log_aspect": 0.0, "tail_share": 0.2, "log_tail_px": 0.0},
     {"sigma_px2": 0.25, "log_aspect": 0.0, "tail_share": 0.8, "log_tail_px": 0.0},
 )
-# Logarithm of a tail's reach, px, any reach between these equally likely: averaged over at steps of a factor of 1.5, which change
-# the gain by less than a share is known to; where it is known better than that, at steps of its standard deviation.
-_LOG_REACH = (math.log(0.25), math.log(_LONGEST_TAIL_PX))
-_REACH_STEP = math.log(1.5)
-# Light that diffuses through a screen has a tail, however small (Swank, Appl. Opt. 12 (1973) 1865); without a screen a tail (the
-# low-frequency drop of IEC 62220-1) is as likely as none. Assumed, since no survey of panels says it: its share of the light
-# follows a beta law of mean 0.1, in one case of ten any share.
-_NO_TAIL = 0.5
-_TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
-# Behind a screen quanta land anywhere in a pixel; but of frames that are said to have one, so many come from a simulation that
-# counts quanta in pixels. Assumed: chi-squares differ by 10 to 1900 where that is so, by thousands in the lab, where it is not.
-_SIMULATED = 0.01
+_REACH_STEP = math.log(1.5)  # changes the gain by less than a share is known to
 _STEPS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0)  # standard deviations, at which share and reach are averaged over
 _MOST_SD = 0.15  # of the share between such steps, which then reach over most of what it can be
 # A spread is as good as another where its likelihood is a tenth of the best at least; and a gain within half a standard
@@ -75,25 +72,6 @@ _MOST_SD = 0.15  # of the share between such steps, which then reach over most o
 _AS_LIKELY = 2.0 * math.log(10.0)
 _NEAR_THE_MEAN = 0.5
 _LEAST_LIKELY = 0.01  # of a family to be kept: its difference from the chosen one counts by the root of this, a tenth
-_WIDTHS = ("sigma_px2", "log_aspect")  # the square: by the width itself nothing changes at a width of 0
-_TAIL = ("tail_share", "log_tail_px")
-_LORENTZIAN, _EXPONENTIAL = 1.0, 1.5
-# description of the pixels, order of the tail, parameters
-_FAMILIES: dict[str, tuple[str, float, tuple[str, ...]]] = {
-    "Gaussian, light collected in pixels": ("aperture", _LORENTZIAN, ("sigma_px2",)),
-    "Gaussian, quanta counted in pixels": ("sampled", _LORENTZIAN, ("sigma_px2",)),
-    "Gaussian with two widths": ("aperture", _LORENTZIAN, _WIDTHS),
-    "two widths, quanta counted in pixels": ("sampled", _LORENTZIAN, _WIDTHS),
-    "Gaussian with a Lorentzian tail": ("aperture", _LORENTZIAN, ("sigma_px2", *_TAIL)),
-    "Gaussian with an exponential tail": ("aperture", _EXPONENTIAL, ("sigma_px2", *_TAIL)),
-    "Gaussian with the tail of a clear layer": ("aperture", CLEAR_LAYER, ("sigma_px2", *_TAIL)),
-    "two widths with a Lorentzian tail": ("aperture", _LORENTZIAN, (*_WIDTHS, *_TAIL)),
-    "two widths with an exponential tail": ("aperture", _EXPONENTIAL, (*_WIDTHS, *_TAIL)),
-    "two widths with the tail of a clear layer": ("aperture", CLEAR_LAYER, (*_WIDTHS, *_TAIL)),
-}
-_SIMPLEST = "Gaussian, light collected in pixels"
-_MOST_GENERAL = "two widths with an exponential tail"
-_CORES = tuple(family for family, (*_, names) in _FAMILIES.items() if not set(names) & set(_TAIL))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +142,12 @@ class _Candidate:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return _FAMILIES[self.family][2]
+        return FAMILIES[self.family].names
+
+    @property
+    def lit(self) -> bool:
+        """Whether all beams have quanta."""
+        return bool(np.all(self.coefficients[: self.groups] > 0))
 
     @property
     def gains(self) -> FloatArray:
@@ -250,7 +233,7 @@ class _Problem:
     def __init__(
         self, series: Sequence[NoisePower], group: Sequence[int], most_read_DN2: float | None, *, screen: bool
     ) -> None:
-        self.no_tail = 0.0 if screen else _NO_TAIL
+        self.prior = prior_of_models(screen=screen)
         self.series = list(series)
         self.group = list(group)
         self.groups = max(group, default=-1) + 1
@@ -508,38 +491,25 @@ def _slow(side: int) -> FloatArray:
     return np.stack([np.sqrt(8.0 / square), 8.0 / square])
 
 
-def _spread_of(family: str, theta: FloatArray) -> Spread:
-    model, order, names = _FAMILIES[family]
-    values = dict(zip(names, (float(value) for value in theta), strict=True))
-    return Spread(
-        model=model,
-        sigma_px=math.sqrt(max(values["sigma_px2"], 0.0)),
-        aspect=math.exp(values.get("log_aspect", 0.0)),
-        tail_share=min(max(values.get("tail_share", 0.0), 0.0), 1.0),
-        tail_px=math.exp(values.get("log_tail_px", 0.0)),
-        tail_order=order,
-    )
-
-
 def _starts(family: str) -> list[FloatArray]:
     """Where a family's descent begins."""
-    return [np.array([one[name] for name in _FAMILIES[family][2]]) for one in _STARTS]
+    return [np.array([one[name] for name in FAMILIES[family].names]) for one in _STARTS]
 
 
 def _fitted(problem: _Problem, family: str, starts: Sequence[FloatArray], *, fixed: Sequence[str] = ()) -> _Candidate:
     """A family at its best, with the parameters `fixed` as they start."""
-    names = _FAMILIES[family][2]
+    names = FAMILIES[family].names
     free = [place for place, name in enumerate(names) if name not in fixed]
     bounds = np.array([_BOUNDS[name] for name in names]).T
     if "log_tail_px" in names:
-        bounds[:, names.index("log_tail_px")] = _LOG_REACH
+        bounds[:, names.index("log_tail_px")] = LOG_REACH
     bounds[1, names.index("sigma_px2")] = (_WIDEST_CORE * max(problem.sides)) ** 2
     tried = [
         _descended(problem, family, np.clip(one, bounds[0], bounds[1]), bounds, free)
         for one in {tuple(one): one for one in starts}.values()
     ]
     theta, chi_square = min(tried, key=lambda one: one[1])
-    spread = _spread_of(family, theta)
+    spread = FAMILIES[family].spread(theta)
     coefficients, _ = problem.solve(spread)
     normal = problem.normal(
         problem.in_cells(spread),
@@ -567,12 +537,12 @@ def _variance_share(problem: _Problem, spread: Spread) -> float:
 
 def _moved(family: str, theta: FloatArray, place: int) -> list[tuple[float, Spread]]:
     """A parameter of the spread a little more and a little less, with the spreads that it makes."""
-    name = _FAMILIES[family][2][place]
+    name = FAMILIES[family].names[place]
     ends = []
     for step in (0.005, -0.005):
         moved = theta.copy()
         moved[place] = np.clip(theta[place] + step, *_BOUNDS[name])
-        ends.append((float(moved[place]), _spread_of(family, moved)))
+        ends.append((float(moved[place]), FAMILIES[family].spread(moved)))
     return ends
 
 
@@ -583,7 +553,7 @@ def _with_share(problem: _Problem, best: _Candidate, share_at: int, share: float
     follows = best.covariance[place] / best.covariance[place, place]
     theta = best.theta + follows[linear:] * (share - best.theta[share_at])
     theta = np.array([np.clip(value, *_BOUNDS[name]) for name, value in zip(best.names, theta, strict=True)])
-    spread = _spread_of(best.family, theta)
+    spread = FAMILIES[best.family].spread(theta)
     coefficients, chi_square = problem.solve(spread)
     return replace(
         best,
@@ -611,10 +581,10 @@ def _descended(
 ) -> tuple[FloatArray, float]:
     """Parameters of the spread at the least chi-square near a start, and that chi-square (Gauss and Newton's steps, halved
     until they help)."""
-    coefficients, chi_square = problem.solve(_spread_of(family, theta))
+    coefficients, chi_square = problem.solve(FAMILIES[family].spread(theta))
     for _ in range(_MOST_STEPS):
         normal = problem.normal(
-            problem.in_cells(_spread_of(family, theta)),
+            problem.in_cells(FAMILIES[family].spread(theta)),
             problem.gains(coefficients),
             coefficients[: problem.groups],
             _slopes(problem, family, theta, free),
@@ -623,7 +593,7 @@ def _descended(
         step[list(free)] = normal.solved(problem.not_negative)[0][-len(free) :]
         for share in (1.0, 0.5, 0.25, 0.1, 0.03):
             moved = np.clip(theta + share * step, bounds[0], bounds[1])
-            there, value = problem.solve(_spread_of(family, moved))
+            there, value = problem.solve(FAMILIES[family].spread(moved))
             if value < chi_square:
                 break
         else:
@@ -639,12 +609,12 @@ def _cores(problem: _Problem) -> dict[str, _Candidate]:
     """Families without a tail at their best; the weights are those of the best spread."""
     found: dict[str, _Candidate] = {}
     for _ in range(_REWEIGHTED):
-        for family in (_SIMPLEST, _MOST_GENERAL):
+        for family in (SIMPLEST, GENERAL["aperture"]):
             found[family] = _fitted(problem, family, [found[family].theta] if family in found else _starts(family))
         best = min(found.values(), key=lambda item: _criterion(problem, item))
         problem.reweight(best.spread, best.coefficients)
-        _learn_changes(problem, found[_MOST_GENERAL])
-    return {family: _fitted(problem, family, _starts(family)) for family in _CORES}
+        _learn_changes(problem, found[GENERAL["aperture"]])
+    return {family: _fitted(problem, family, _starts(family)) for family in CORES}
 
 
 def _learn_changes(problem: _Problem, item: _Candidate) -> None:
@@ -665,35 +635,32 @@ def _criterion(problem: _Problem, candidate: _Candidate) -> float:
 
     A tail is weighed by its prior instead: its share and reach are averaged over.
     """
-    core = len(set(candidate.names) - set(_TAIL))
+    core = len(set(candidate.names) - set(TAIL))
     return candidate.chi_square + core * math.log(max(problem.independent, 2.0))
 
 
 def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _Candidate]]:
-    """Spreads with this core, without a tail and with tails of all reaches, orders and shares, each with its prior probability."""
-    if problem.no_tail > 0:
-        yield problem.no_tail, core
-    families = [family for family, (model, *_, names) in _FAMILIES.items() if set(names) == {*core.names, *_TAIL}]
-    for family in families:
-        names = _FAMILIES[family][2]
-        share_at = names.index("tail_share")
-        for reach_mass, best in _of_reaches(problem, family):
+    """Spreads with this core and tails of all laws, reaches and shares, each with its prior probability among tails."""
+    for family, form in FAMILIES.items():
+        if form.model != core.spread.model or set(form.names) != {*core.names, *TAIL}:
+            continue
+        share_at = form.names.index("tail_share")
+        for of_reach, best in _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             if variance <= 0.0:
-                yield (1.0 - problem.no_tail) * reach_mass / len(families), best
+                yield form.of_tails * of_reach, best
                 continue
             sd = min(math.sqrt(variance), _MOST_SD)
             for share, width in _steps(float(best.theta[share_at]), sd, (0.0, 1.0)):
-                density = (1.0 - problem.no_tail) * _share_density(share)
-                mass = width * density * reach_mass / len(families)
-                yield mass, _with_share(problem, best, share_at, share)
+                density = form.of_tails * of_reach * share_density(share)
+                yield width * density, _with_share(problem, best, share_at, share)
 
 
 def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]]:
     """The best spread of a family at each of some reaches of the tail, with its share of all reaches."""
-    place = _FAMILIES[family][2].index("log_tail_px")
-    count = 1 + math.ceil((_LOG_REACH[1] - _LOG_REACH[0]) / _REACH_STEP)
-    grid = np.linspace(*_LOG_REACH, count)
+    place = FAMILIES[family].names.index("log_tail_px")
+    count = 1 + math.ceil((LOG_REACH[1] - LOG_REACH[0]) / _REACH_STEP)
+    grid = np.linspace(*LOG_REACH, count)
     step = float(grid[1] - grid[0])
     found: list[tuple[float, _Candidate]] = []
     starts = _starts(family)
@@ -701,7 +668,7 @@ def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]
         for start in starts:
             start[place] = reach
         item = _fitted(problem, family, starts, fixed=("log_tail_px",))
-        found.append((_reach_mass(float(reach), step if grid[0] < reach < grid[-1] else 0.5 * step), item))
+        found.append((reach_mass(float(reach), step if grid[0] < reach < grid[-1] else 0.5 * step), item))
         starts = [item.theta.copy()]
     best = min((item for _, item in found), key=lambda item: item.chi_square)
     free = _fitted(problem, family, [best.theta])
@@ -709,16 +676,11 @@ def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]
     if not 0.0 < sd < 0.5 * step:
         return found
     sharp = []
-    for reach, width in _steps(float(free.theta[place]), sd, _LOG_REACH):
+    for reach, width in _steps(float(free.theta[place]), sd, LOG_REACH):
         theta = free.theta.copy()
         theta[place] = reach
-        sharp.append((_reach_mass(reach, width), _fitted(problem, family, [theta], fixed=("log_tail_px",))))
+        sharp.append((reach_mass(reach, width), _fitted(problem, family, [theta], fixed=("log_tail_px",))))
     return sharp
-
-
-def _reach_mass(log_reach: float, width: float) -> float:
-    """Share of all reaches that lie within a width of the logarithm about this one."""
-    return math.exp(log_reach) * width / (math.exp(_LOG_REACH[1]) - math.exp(_LOG_REACH[0]))
 
 
 def _steps(middle: float, sd: float, bounds: tuple[float, float]) -> list[tuple[float, float]]:
@@ -728,26 +690,27 @@ def _steps(middle: float, sd: float, bounds: tuple[float, float]) -> list[tuple[
     return [(float(value), float(width)) for value, width in zip(values, halves[:-1] + halves[1:], strict=True)]
 
 
-def _share_density(share: float) -> float:
-    """Prior density of the share of the light that is in the tail."""
-    beta = _TAIL_SHARE_POWER * (1.0 - share) ** (_TAIL_SHARE_POWER - 1.0)
-    return float(_ANY_TAIL + (1.0 - _ANY_TAIL) * beta)
-
-
 def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
-    """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts."""
-    cores = _cores(problem)
-    core = min(
-        (item for item in cores.values() if item.spread.model == "aperture"),
-        key=lambda item: _criterion(problem, item),
-    )
-    counting = [item for item in cores.values() if item.spread.model == "sampled"]
-    found = [(max(2.0 * problem.no_tail, _SIMULATED) / len(counting), item) for item in counting]
-    found += _with_tails(problem, core)
-    lit = [(mass, item) for mass, item in found if mass > 0 and np.all(item.coefficients[: problem.groups] > 0)]
+    """Spreads that the data leave open, with the logarithm of the weight of each before its chi-square counts.
+
+    Tails are averaged over for the way that quanta meet pixels that is likelier with the best spread of any form.
+    """
+    cores = list(_cores(problem).values())
+    best, least = {}, {}
+    for model in problem.prior:
+        own = [item for item in cores if item.spread.model == model]
+        best[model] = min([item for item in own if item.lit] or own, key=partial(_criterion, problem))
+        general = [item for _, item in _of_reaches(problem, GENERAL[model])]
+        least[model] = min(item.chi_square for item in (*own, *general))
+    likeliest = max(problem.prior, key=lambda model: math.log(problem.prior[model][0]) - 0.5 * least[model])
+    found = []
+    for model, (prior, no_tail) in problem.prior.items():
+        found.append((prior * no_tail, best[model]))
+        if model == likeliest:
+            found += [(prior * (1.0 - no_tail) * mass, item) for mass, item in _with_tails(problem, best[model])]
     return [
         (math.log(mass) - 0.5 * (_criterion(problem, item) - item.chi_square), item)
-        for mass, item in lit or [(1.0, core)]
+        for mass, item in [one for one in found if one[0] > 0 and one[1].lit] or [(1.0, best[likeliest])]
     ]
 
 

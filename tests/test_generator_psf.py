@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.special import j0
 from scipy.stats import norm
 
 from raytwin.errors import InputError
 from raytwin.generator.spread.psf import (
     PSF_MODELS,
+    Spread,
     blur_variance_share,
     convolve_separable,
     noise_autocovariance,
@@ -97,6 +99,24 @@ def test_both_descriptions_meet_when_the_spread_is_wide():
         assert blur_variance_share("aperture", sigma) == pytest.approx(
             1.0 / (4.0 * math.pi * (sigma**2 + 1.0 / 12.0)), rel=0.002
         )
+
+
+@pytest.mark.parametrize("absorption", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("frequency", [0.02, 0.1, 0.4])
+def test_a_layers_tail_is_diffusion_with_absorption_at_a_distance(absorption, frequency):
+    """Of a point at a distance L: - d/dL of exp(-k s) / (2 pi s), s = sqrt(r^2 + L^2), with all its light in a sum of 1."""
+    reach = 1.5
+
+    def light(r):
+        s = math.hypot(r, reach)
+        return reach * (1.0 + absorption * s) * math.exp(absorption * (reach - s)) / (2.0 * math.pi * s**3)
+
+    expected, _ = quad(
+        lambda r: 2.0 * math.pi * r * light(r) * j0(2.0 * math.pi * frequency * r), 0.0, 400.0, limit=2000
+    )
+    spread = Spread(tail_share=1.0, tail_px=reach, tail_order=0.0, absorption_per_px=absorption)
+    # a clear layer has a share L / R of its light beyond R
+    assert float(spread.transfer(np.array(frequency), np.array(0.0))) == pytest.approx(expected, abs=5e-3)
 
 
 @pytest.mark.parametrize("model", PSF_MODELS)

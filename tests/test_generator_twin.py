@@ -151,13 +151,21 @@ def test_a_twin_comes_back_from_its_file_as_it_was(tmp_path, twin, with_spectrum
     other = Spread(sigma_px=0.4, aspect=1.1, tail_share=0.2, tail_px=1.5, tail_order=1.5)
     tailed = replace(
         gaussian_spread("aperture", estimate_from_sd(0.4, 0.01)),
-        value=Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0),
+        value=Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0, absorption_per_px=0.2),
         others=(OtherSpread(family="two widths with an exponential tail", probability=0.2, value=other),),
     )
     written = replace(written, noise=replace(written.noise, spread=tailed))
     write_twin(tmp_path / "twin.h5", written)
     same(written, read_twin(tmp_path / "twin.h5"))
     assert [path.name for path in tmp_path.iterdir()] == ["twin.h5"]
+
+
+def test_a_file_from_before_layers_that_absorb_has_a_clear_one(tmp_path, twin):
+    layer = Spread(sigma_px=0.4, tail_share=0.3, tail_px=2.0, tail_order=0.0)
+    spread = replace(gaussian_spread("aperture", estimate_from_sd(0.4, 0.01)), value=layer)
+    write_twin(tmp_path / "twin.h5", replace(twin, noise=replace(twin.noise, spread=spread)))
+    damage(tmp_path / "twin.h5", lambda file: file["noise"].attrs.__delitem__("absorption_per_px"))
+    assert read_twin(tmp_path / "twin.h5").noise.spread.value == layer
 
 
 def damage(path, edit):

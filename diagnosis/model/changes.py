@@ -374,6 +374,8 @@ def _tail_changes(twin: Twin) -> list[TwinChange]:
         known = spread.intervals.get(name)
         found = 0.0 if known is None else (known.high - known.low) / (2 * 1.959964)
         steps[name] = max(found, SPREAD_SD * getattr(value, name))
+    if value.tail_share + steps["tail_share"] > 1.0:
+        steps["tail_share"] = -min(steps["tail_share"], value.tail_share)
     return [
         TwinChange(
             name=f"{name} of the optical spread",

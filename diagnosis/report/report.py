@@ -112,7 +112,7 @@ def headline(diagnosis: Diagnosis) -> str:
     named = _sentence(
         " and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in _leading(diagnosis))
     )
-    return f"{named}: a part of the gap" if diagnosis.verdict == "explained_in_part" else named
+    return f"{named}: its law leaves a rest" if diagnosis.verdict == "explained_in_part" else named
 
 
 def _sentence(text: str) -> str:

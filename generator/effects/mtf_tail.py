@@ -11,6 +11,7 @@ from ._light_spread import order_parameter, spread_transfer
 from .effect import LIT_SERIES, AlwaysALittle, Effect, Grid, Parameter, Shows
 
 _USUAL_ORDER = 1.0  # of the tail: a Lorentzian
+_MOST_LIKE_A_GAUSSIAN = 6.0  # order of the tail, the largest
 
 
 def _add_tail(state: LineState, parameters: Mapping[str, float], context: LineContext) -> LineState:
@@ -62,9 +63,15 @@ MTF_TAIL = Effect(
     absorbed="noise",
     grid=Grid(shares=(0.8,), variants=({"reach_px": 0.84}, {"reach_px": 2.4})),
     # screens have up to 20 % of their light there; of a clear layer's, (r^2 + L^2)^(-3/2) with L of 1 to 2 px, a fifth goes beyond
-    # 5 px, where noise shows too little of it
+    # 5 px, where noise shows too little of it. A tail goes on as a Lorentzian does, or ends as a Gaussian: edges tell the two apart
     always_a_little=AlwaysALittle(
         name="tail of the spread",
-        amounts=(({"reach_px": 0.84}, 10.0), ({"reach_px": 2.4}, 10.0), ({"reach_px": 5.0}, 3.0)),
+        amounts=(
+            ({"reach_px": 0.84}, 10.0),
+            ({"reach_px": 2.4}, 10.0),
+            ({"reach_px": 2.4, "order": _MOST_LIKE_A_GAUSSIAN}, 10.0),
+            ({"reach_px": 5.0}, 3.0),
+            ({"reach_px": 5.0, "order": _MOST_LIKE_A_GAUSSIAN}, 3.0),
+        ),
     ),
 )

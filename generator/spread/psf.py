@@ -5,9 +5,11 @@ Transfer function along rows and columns (f in cycles per pixel):
     H(f) = (1 - w) exp(-2 pi^2 sigma^2 q) + w / (1 + (2 pi L)^2 q)^p,    q = a f_row^2 + f_column^2 / a
 
 sigma: width of the Gaussian core; w: share of the light in a tail of reach L; p: its order, 1 for the Lorentzian transfer of
-screens, 3/2 for light that falls off as exp(-r / L). Order 0 stands for exp(-2 pi L sqrt(q)), light that falls off as
-(r^2 + L^2)^(-3/2): that of a point a distance L behind a clear layer. a: width along rows over width along columns. With w = 0
-and a = 1 it is the Gaussian of most simulators, which factors into two axes.
+screens, 3/2 for light that falls off as exp(-r / L). Order 0 stands for a layer in which light diffuses and is absorbed, a
+distance L from the pixels: exp(-L (sqrt((2 pi)^2 q + k^2) - k)), k the inverse of the length over which it is absorbed. Without
+absorption that is light which falls off as (r^2 + L^2)^(-3/2), of a point behind a clear layer; with it as exp(-k r) far away.
+a: width along rows over width along columns. With w = 0 and a = 1 it is the Gaussian of most simulators, which factors into two
+axes.
 
 Two descriptions of how quanta meet pixels exist in the field, and below one pixel they differ:
 
@@ -18,7 +20,8 @@ Two descriptions of how quanta meet pixels exist in the field, and below one pix
 
 All arrays here are per unit variance before the spread: a kernel sums to 1, and so does an autocovariance.
 
-Source: tails of screens: Burgess (1978), doi:10.1118/1.594387.
+Source: tails of screens: Burgess (1978), doi:10.1118/1.594387; diffusion with absorption: Swank, Appl. Opt. 12 (1973) 1865,
+of which this is one distance to the pixels and nothing sent back.
 """
 
 import math
@@ -31,7 +34,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 
 PSF_MODELS = ("aperture", "sampled")
-CLEAR_LAYER = 0.0  # order of the tail that a clear layer makes
+LAYER = 0.0  # order of the tail that a layer makes
 FloatArray = NDArray[np.float64]
 _GRID = 64  # cells of the noise power spectrum per axis
 _REACH = 14  # of a kernel over both axes, px
@@ -40,7 +43,8 @@ _ALIASES = 3  # spectra on either side that a tail and a pixel's aperture still 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """The optical spread: `model` (`aperture` or `sampled`), sigma_px, aspect, tail_share, tail_px, tail_order (see the module).
+    """The optical spread: `model` (`aperture` or `sampled`), sigma_px, aspect, tail_share, tail_px, tail_order and
+    absorption_per_px, which only a layer's tail has (see the module).
 
     Example:
         >>> Spread(sigma_px=0.5).variance_share < Spread(sigma_px=0.3).variance_share
@@ -53,14 +57,19 @@ class Spread:
     tail_share: float = 0.0
     tail_px: float = 1.0
     tail_order: float = 1.0
+    absorption_per_px: float = 0.0
 
     def __post_init__(self) -> None:
         _check(self.model, self.sigma_px)
-        if not (0.1 <= self.aspect <= 10.0 and 0.0 <= self.tail_share <= 1.0 and 0.0 <= self.tail_px <= 1000.0):
+        tail = (
+            0.0 <= self.tail_share <= 1.0 and 0.0 <= self.tail_px <= 1000.0 and 0.0 <= self.absorption_per_px < math.inf
+        )
+        if not (0.1 <= self.aspect <= 10.0 and tail):
             raise InputError(
                 "optical spread",
-                received=f"aspect {self.aspect:g}, tail share {self.tail_share:g}, tail reach {self.tail_px:g} px",
-                expected="an aspect of 0.1 to 10, a share of 0 to 1, a reach of 0 to 1000 px",
+                received=f"aspect {self.aspect:g}, tail share {self.tail_share:g}, tail reach {self.tail_px:g} px,"
+                f" absorption {self.absorption_per_px:g} per px",
+                expected="an aspect of 0.1 to 10, a share of 0 to 1, a reach of 0 to 1000 px, an absorption of 0 or more",
             )
 
     @property
@@ -146,8 +155,9 @@ class Spread:
 def _tail_transfer(spread: Spread, square: FloatArray) -> FloatArray:
     """Of a tail, at squared frequencies q (see the module)."""
     reach = 2.0 * np.pi * spread.tail_px
-    if spread.tail_order == CLEAR_LAYER:
-        return np.asarray(np.exp(-reach * np.sqrt(square)))
+    if spread.tail_order == LAYER:
+        absorbed = spread.absorption_per_px * spread.tail_px
+        return np.asarray(np.exp(absorbed - np.sqrt(reach**2 * square + absorbed**2)))
     return np.asarray((1.0 + reach**2 * square) ** -spread.tail_order)
 
 

@@ -42,6 +42,7 @@ _READING_S = 20.0  # of processor time, for what takes a second or two: at some 
 _LARGEST_EXPONENT = math.log(sys.float_info.max)
 TUBE = "tube"
 _SDS_OF_EFFECTS = ("strength_sd", "law_sd")
+_SHAPE_OF_SPREAD = ("aspect", "tail_share", "tail_px", "tail_order", "absorption_per_px")
 _MAPS = ("dark_DN", "dark_DN_per_ms", "gain_relative", "read_variance_DN2", BAD_PIXEL_MAP)
 
 
@@ -127,7 +128,7 @@ def write_twin(path: str | os.PathLike[str], twin: Twin | TubeTwin) -> None:
         noise.attrs["psf_model"] = spread.value.model
         noise.attrs["spread_family"] = spread.family
         noise.attrs["spread_others"] = json.dumps([asdict(item) for item in spread.others])
-        for name in ("aspect", "tail_share", "tail_px", "tail_order"):
+        for name in _SHAPE_OF_SPREAD:
             noise.attrs[name] = getattr(spread.value, name)
             if name in spread.intervals:
                 _put_estimate(noise, f"{name}_interval", spread.intervals[name])
@@ -326,7 +327,8 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
     model = _text(noise.attrs["psf_model"])
     if "tail_share" not in noise.attrs:
         return gaussian_spread(model, sigma)
-    shape = {name: float(noise.attrs[name]) for name in ("aspect", "tail_share", "tail_px", "tail_order")}
+    none = {"absorption_per_px": 0.0}  # files from before layers that absorb
+    shape = {name: float({**none, **noise.attrs}[name]) for name in _SHAPE_OF_SPREAD}
     found = {name: _get_estimate(noise, f"{name}_interval") for name in shape}
     return SpreadEstimate(
         value=Spread(model=model, sigma_px=sigma.value, **shape),
@@ -336,7 +338,7 @@ def _spread(noise: Any, path: object) -> SpreadEstimate:
             OtherSpread(
                 family=str(item["family"]),
                 probability=float(item["probability"]),
-                value=Spread(**{name: item["value"][name] for name in ("model", "sigma_px", *shape)}),
+                value=Spread(**{name: (none | item["value"])[name] for name in ("model", "sigma_px", *shape)}),
             )
             for item in json.loads(_text(noise.attrs.get("spread_others", "[]")))
         ),

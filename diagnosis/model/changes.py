@@ -35,14 +35,10 @@ GAIN_OF_BEAM_SD = 0.01  # of the gain of a kV and filter
 GAIN_EXPONENT_SD = 0.5  # of the power of a pixel's gain with which its quantum noise grows: 1 to 2
 POSITION_SD_PX = 0.15  # of a scene against its thickness maps
 REGISTERED_SD_PX = 1.0  # of the same before registration looks (`register`): what that finds is in no series' pictures
-SHARPNESS_FLOOR = 1.0  # of a scene's map probes at edges, in their own sds: rendering beyond all the nuisances
 OUTLINE_SD_PX = 0.1  # of where an object's outline lies: rendering of the pixels that it cuts, true size
 MAGNIFICATION_SD = 0.001
-EDGE_SD_PX2 = 0.08  # of the variance of an edge's blur: how a pixel's thickness stands for what its square sees
-EDGE_SD_PX3 = 0.03  # of the third and fourth order of an edge's profile
-EDGE_SD_PX4 = 0.02
-EDGE_OF_SERIES = 0.2  # share of these that differs between series of one scene
-EDGE_OF_ALL = 0.4  # share of these that all scenes have in common, and again those at one distance
+# of the variance of edges' blur in all scenes: a third of a pixel's own, 1/12, as a thickness may be a pixel's mean or its middle's
+EDGE_SD_PX2 = 1.0 / 36.0
 ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place

@@ -61,7 +61,7 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
         columns["few new bad pixels"] = _few_bad_pixels(probes)
     if item.series.kind == "object":
         dy, dx = gradient(signal)
-        columns |= _of_edges(probes, dy, dx) | _of_thickness(probes, signal, redrawn.thicker, beams_differ)
+        columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
         images |= _of_scene(item, dy, dx, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
         if model.sharp:
             images |= _between_points(item, signal)
@@ -264,7 +264,11 @@ def _of_scene(
     row = np.linspace(-0.5, 0.5, rows)[:, None] * rows
     across = np.linspace(-0.5, 0.5, columns)[None, :] * columns
     slope = np.hypot(dy, dx)
+    (yy, _), (_, xx) = gradient(dy), gradient(dx)
+    half = 0.5 * scales.EDGE_SD_PX2
     images: _Images = {
+        "edges, columns": half * xx,
+        "edges, rows": half * yy,
         f"column of {place}": registered_px * dx,
         f"row of {place}": registered_px * dy,
         f"outline of {place}": scales.OUTLINE_SD_PX * np.asarray(slope),
@@ -285,37 +289,6 @@ def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images
     return {
         f"outline of {place} between points, {number}": image
         for number, image in enumerate(blurred_between_points(maps, signal))
-    }
-
-
-def _of_edges(probes: SeriesProbes, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> Columns:
-    """Profiles of edges, as pixels that an edge cuts are rendered."""
-    item = probes.series.session
-    columns: Columns = {}
-    for label, column in _projected(probes, _edge_profiles(dy, dx)).items():
-        columns[f"edges, {label}, of {_place(item)}"] = column
-        # the pixels that an edge cuts are not rendered quite alike for different beams
-        columns[f"edges, {label}, of {item.name}"] = scales.EDGE_OF_SERIES * column
-        # nor quite truly anywhere, and not the same where a pixel is another size in the object
-        columns[f"edges, {label}"] = scales.EDGE_OF_ALL * column
-        columns[f"edges, {label}, at {item.series.source_object_mm or 0:g}"] = scales.EDGE_OF_ALL * column
-    return columns
-
-
-def _edge_profiles(dy: NDArray[np.float64], dx: NDArray[np.float64]) -> _Images:
-    """Derivatives across edges of second to fourth order, times what rendering leaves open of each."""
-    slope = np.hypot(dy, dx)
-    (yy, _), (_, xx) = gradient(dy), gradient(dx)
-    normal_y, normal_x = dy / np.maximum(slope, 1e-9), dx / np.maximum(slope, 1e-9)
-    steeper_y, steeper_x = gradient(xx + yy)
-    third = normal_y * steeper_y + normal_x * steeper_x
-    fourth = gradient(steeper_y)[0] + gradient(steeper_x)[1]
-    half = 0.5 * scales.EDGE_SD_PX2
-    return {
-        "columns": half * xx,
-        "rows": half * yy,
-        "third order": scales.EDGE_SD_PX3 * third,
-        "fourth order": scales.EDGE_SD_PX4 * fourth,
     }
 
 

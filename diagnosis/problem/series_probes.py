@@ -256,15 +256,11 @@ def series_probes(
         scalars += displacement_probes(one.placement, between_points=between)
     # noise of lines that is no effect stands in the mean frame as well
     beyond = np.asarray(session.usual_lines(one.session)) @ projection.line_noise()
-    at_edges = [
-        kind == "object" and name.axis == "sharpness" and name.statistic == "mean frame" for name in projection.names()
-    ]
-    floors = scales.SHARPNESS_FLOOR * np.array(at_edges, dtype=np.float64)
     return SeriesProbes(
         series=one,
         projection=projection,
         scalars=tuple(scalars),
-        shrink=np.concatenate([1.0 / np.sqrt(1.0 + floors**2 + beyond), np.ones(len(scalars))]),
+        shrink=np.concatenate([1.0 / np.sqrt(1.0 + beyond), np.ones(len(scalars))]),
         rendered=frame.rendered,
     )
 

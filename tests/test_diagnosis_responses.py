@@ -354,7 +354,6 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
         shrink=np.ones(4),
         rendered=0.1,
     )
-    monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_edges", lambda *_: {})
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._read_texture", lambda *_: np.zeros(4))
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_scene", lambda *_, **__: {})
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns.gradient", lambda image: (image, image))

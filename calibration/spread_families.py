@@ -26,7 +26,7 @@ _ABSORBED_PX = tuple(LARGEST_SQUARE_PX / (4.0 * math.pi) * factor for factor in 
 _NO_TAIL = 0.5
 _TAIL_SHARE_POWER, _ANY_TAIL = 9.0, 0.1
 # Behind a screen quanta land anywhere in a pixel; but of frames that are said to have one, so many come from a simulation that
-# counts quanta in pixels. Assumed: chi-squares differ by 10 to 1900 where that is so, by thousands in the lab, where it is not.
+# counts quanta in pixels. Assumed; noise decides where the spread is narrower than a pixel, and hardly where it is wider.
 _SIMULATED = 0.01
 
 

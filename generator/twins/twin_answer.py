@@ -22,7 +22,7 @@ def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
         "model": value.model,
         **{
             name: (spread.intervals[name].as_dict() if name in spread.intervals else getattr(value, name))
-            for name in ("sigma_px", "aspect", "tail_share", "tail_px")
+            for name in ("sigma_px", "aspect", "tail_share", "tail_px", "tail_order", "absorption_per_px")
         },
         "variance_share": value.variance_share,
         "others": [asdict(item) for item in spread.others],

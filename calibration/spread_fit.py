@@ -162,6 +162,9 @@ class _Candidate:
         return np.asarray(quantum * self.variance_share + white)
 
 
+_OfReaches = list[tuple[float, _Candidate]]  # a family at reaches of the tail, each with its share of all reaches
+
+
 @lru_cache(maxsize=16)
 def _cells(side: int) -> tuple[FloatArray, FloatArray]:
     """Means over cells of frequencies (cell, bin in use), and each cell's share of the modes (cell,).
@@ -639,13 +642,18 @@ def _criterion(problem: _Problem, candidate: _Candidate) -> float:
     return candidate.chi_square + core * math.log(max(problem.independent, 2.0))
 
 
-def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _Candidate]]:
-    """Spreads with this core and tails of all laws, reaches and shares, each with its prior probability among tails."""
+def _with_tails(
+    problem: _Problem, core: _Candidate, known: Mapping[str, _OfReaches]
+) -> Iterator[tuple[float, _Candidate]]:
+    """Spreads with this core and tails of all laws, reaches and shares, each with its prior probability among tails.
+
+    known: families whose reaches have been tried.
+    """
     for family, form in FAMILIES.items():
         if form.model != core.spread.model or set(form.names) != {*core.names, *TAIL}:
             continue
         share_at = form.names.index("tail_share")
-        for of_reach, best in _of_reaches(problem, family):
+        for of_reach, best in known.get(family) or _of_reaches(problem, family):
             variance = float(best.covariance[len(best.coefficients) + share_at, len(best.coefficients) + share_at])
             if variance <= 0.0:
                 yield form.of_tails * of_reach, best
@@ -656,13 +664,13 @@ def _with_tails(problem: _Problem, core: _Candidate) -> Iterator[tuple[float, _C
                 yield width * density, _with_share(problem, best, share_at, share)
 
 
-def _of_reaches(problem: _Problem, family: str) -> list[tuple[float, _Candidate]]:
+def _of_reaches(problem: _Problem, family: str) -> _OfReaches:
     """The best spread of a family at each of some reaches of the tail, with its share of all reaches."""
     place = FAMILIES[family].names.index("log_tail_px")
     count = 1 + math.ceil((LOG_REACH[1] - LOG_REACH[0]) / _REACH_STEP)
     grid = np.linspace(*LOG_REACH, count)
     step = float(grid[1] - grid[0])
-    found: list[tuple[float, _Candidate]] = []
+    found: _OfReaches = []
     starts = _starts(family)
     for reach in grid:
         for start in starts:
@@ -696,18 +704,20 @@ def _members(problem: _Problem) -> list[tuple[float, _Candidate]]:
     Tails are averaged over for the way that quanta meet pixels that is likelier with the best spread of any form.
     """
     cores = list(_cores(problem).values())
+    general = {family: _of_reaches(problem, family) for family in GENERAL.values()}
     best, least = {}, {}
     for model in problem.prior:
         own = [item for item in cores if item.spread.model == model]
         best[model] = min([item for item in own if item.lit] or own, key=partial(_criterion, problem))
-        general = [item for _, item in _of_reaches(problem, GENERAL[model])]
-        least[model] = min(item.chi_square for item in (*own, *general))
+        least[model] = min(item.chi_square for item in (*own, *(item for _, item in general[GENERAL[model]])))
     likeliest = max(problem.prior, key=lambda model: math.log(problem.prior[model][0]) - 0.5 * least[model])
     found = []
     for model, (prior, no_tail) in problem.prior.items():
         found.append((prior * no_tail, best[model]))
         if model == likeliest:
-            found += [(prior * (1.0 - no_tail) * mass, item) for mass, item in _with_tails(problem, best[model])]
+            found += [
+                (prior * (1.0 - no_tail) * mass, item) for mass, item in _with_tails(problem, best[model], general)
+            ]
     return [
         (math.log(mass) - 0.5 * (_criterion(problem, item) - item.chi_square), item)
         for mass, item in [one for one in found if one[0] > 0 and one[1].lit] or [(1.0, best[likeliest])]

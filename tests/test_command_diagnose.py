@@ -55,6 +55,8 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     assert leading["probability"] > 0.9
     assert leading["strength"]["value"] == pytest.approx(60.0, rel=0.15)
     assert found["gap"]["after"] < 1.0 < 1.2 < found["gap"]["before"]  # 1: noise alone
+    (noise,) = [row for row in found["held_out"] if row["axis"] == "noise"]
+    assert noise["after"] < 0.7 * noise["before"]
     assert {place["axis"] for place in found["where"]} >= {"noise"}
     assert sum(item["probability"] for item in found["hypotheses"]) == pytest.approx(1.0, abs=1e-6)
     from raytwin.generator.twins.twin_io import read_twin

@@ -81,6 +81,14 @@ def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_i
     assert set(named) - {item.name for item in twin_changes(plain)} == {step.name}
 
 
+def test_steps_of_a_tail_that_takes_nearly_all_light_stay_spreads():
+    plain = as_twin("virtual_lab")
+    spread = replace(plain.noise.spread, value=Spread(sigma_px=0.3, tail_share=0.99, tail_px=0.5))
+    named = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=spread)))}
+    step = named["tail_share of the optical spread"].twin.noise.spread.value
+    assert step.tail_share == pytest.approx(0.95 * 0.99, abs=1e-3)
+
+
 def test_flats_without_light_make_no_gain_map():
     flat = series("flat", "flat", exposure_ms=50.0)
     with pytest.raises(InputError, match="gain map of the calibrating flats: got 0 pixels that see light"):

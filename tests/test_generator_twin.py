@@ -218,6 +218,14 @@ DAMAGES = {
         ),
         "exponential with a probability of 0; expected a probability above 0",
     ),
+    "a spread of no order": (
+        lambda file: file["noise"].attrs.update(tail_order=np.nan),
+        "tail_order of the optical spread: got nan; expected 0 to 100",
+    ),
+    "a layer that gives light": (
+        lambda file: file["noise"].attrs.update(absorption_per_px=-0.5),
+        "absorption_per_px of the optical spread: got -0.5; expected 0 to 1000",
+    ),
     "another spread of no shape": (
         lambda file: file["noise"].attrs.update(
             spread_others='[{"family": "exponential", "probability": 0.2, "value": 3}]'

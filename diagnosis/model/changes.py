@@ -37,7 +37,8 @@ POSITION_SD_PX = 0.15  # of a scene against its thickness maps
 REGISTERED_SD_PX = 1.0  # of the same before registration looks (`register`): what that finds is in no series' pictures
 OUTLINE_SD_PX = 0.1  # of where an object's outline lies: rendering of the pixels that it cuts, true size
 MAGNIFICATION_SD = 0.001
-# of the variance of edges' blur in all scenes: a third of a pixel's own, 1/12, as a thickness may be a pixel's mean or its middle's
+# of the variance of edges' blur in all scenes: a third of a pixel's own, 1/12, as a thickness may be a pixel's mean or its middle's.
+# Assumed; with three times as much or a third four sessions had the same names (docs/notebook/diagnosis_designs.md)
 EDGE_SD_PX2 = 1.0 / 36.0
 ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
@@ -370,7 +371,7 @@ def _tail_changes(twin: Twin) -> list[TwinChange]:
         known = spread.intervals.get(name)
         found = 0.0 if known is None else (known.high - known.low) / (2 * 1.959964)
         steps[name] = max(found, SPREAD_SD * getattr(value, name))
-    if value.tail_share + steps["tail_share"] > 1.0:
+    if value.tail_share + steps["tail_share"] > 1.0:  # a step down is as large where nearly all light is in the tail
         steps["tail_share"] = -min(steps["tail_share"], value.tail_share)
     return [
         TwinChange(

@@ -172,13 +172,14 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         text += f" and falls to {gap.after:.2f} once that is added, by {_percent((value, low, high))} of what is above noise."
     else:
         text += f" and {gap.after:.2f} after; it is too close to noise for a share to mean anything."
-    return text + _rest_text(diagnosis, leading)
+    return text + rest_text(diagnosis)
 
 
-def _rest_text(diagnosis: Diagnosis, leading: Sequence[Cause]) -> str:
+def rest_text(diagnosis: Diagnosis) -> str:
     """By how much laws of what is named are off here, and where they leave most; empty where they fit."""
     if diagnosis.verdict != "explained_in_part":
         return ""
+    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
     off = [f"{title_of(cause.effect)} by some {100.0 * cause.level:.0f} %" for cause in leading if cause.level > 0.0]
     told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
     left = leading[0].left if leading else ()

@@ -15,6 +15,7 @@ from .explanation import (
     axis_text,
     compared_text,
     location_text,
+    rest_text,
     strained_text,
     strength_text,
     task_text,
@@ -120,7 +121,7 @@ def _sentence(text: str) -> str:
 
 
 def lead_text(diagnosis: Diagnosis) -> str:
-    """Where the gap is observed and what becomes of it, in two or three sentences."""
+    """Where the gap is observed and what becomes of it, in two to four sentences."""
     gap = diagnosis.gap
     if diagnosis.mislabelled:
         first = diagnosis.mislabelled[0].text
@@ -131,7 +132,7 @@ def lead_text(diagnosis: Diagnosis) -> str:
     place = diagnosis.where[0]
     seen = f"The gap is clearest in the {axis_text(place.axis)} of {place.series}"
     ends = f"the gap on series that the fit did not use falls from {gap.before:.2f} to {gap.after:.2f} (1: noise alone)"
-    return f"{seen}. With what was found added to the twin, {ends}."
+    return f"{seen}. With what was found added to the twin, {ends}.{rest_text(diagnosis)}"
 
 
 def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:

@@ -61,16 +61,20 @@ class Spread:
 
     def __post_init__(self) -> None:
         _check(self.model, self.sigma_px)
-        tail = (
-            0.0 <= self.tail_share <= 1.0 and 0.0 <= self.tail_px <= 1000.0 and 0.0 <= self.absorption_per_px < math.inf
-        )
-        if not (0.1 <= self.aspect <= 10.0 and tail):
-            raise InputError(
-                "optical spread",
-                received=f"aspect {self.aspect:g}, tail share {self.tail_share:g}, tail reach {self.tail_px:g} px,"
-                f" absorption {self.absorption_per_px:g} per px",
-                expected="an aspect of 0.1 to 10, a share of 0 to 1, a reach of 0 to 1000 px, an absorption of 0 or more",
-            )
+        bounds = {
+            "aspect": (0.1, 10.0),
+            "tail_share": (0.0, 1.0),
+            "tail_px": (0.0, 1000.0),
+            "tail_order": (0.0, 100.0),
+            "absorption_per_px": (0.0, 1000.0),
+        }
+        for name, (low, high) in bounds.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(
+                    f"{name} of the optical spread",
+                    received=f"{getattr(self, name):g}",
+                    expected=f"{low:g} to {high:g}",
+                )
 
     @property
     def separable(self) -> bool:

@@ -55,17 +55,25 @@ def _number(value: float | None, digits: int = 3) -> str:
     return _DASH if value is None else f"{value:.{digits}f}"
 
 
+def _bounds(low: float | None, high: float | None) -> str:
+    """A 95 % interval, or the bound that there is."""
+    if low is None or high is None:
+        known = [f"{word} {value:.3f}" for word, value in (("from", low), ("up to", high)) if value is not None]
+        return known[0] if known else "no bounds"
+    return f"{low:.3f} to {high:.3f}"
+
+
 def _interval(entry: Mapping[str, Any] | None) -> str:
     if not entry or entry["a90"] is None:
         return _DASH
-    return f"{_number(entry['a90'])} ({_number(entry['low'])} to {_number(entry['high'])})"
+    return f"{_number(entry['a90'])} ({_bounds(entry['low'], entry['high'])})"
 
 
 def _difference(compare: Mapping[str, Any] | None) -> str:
     difference = (compare or {}).get("difference_a90") or {}
     if difference.get("value") is None:
         return _DASH
-    return f"{difference['value']:+.3f} ({_number(difference.get('low'))} to {_number(difference.get('high'))})"
+    return f"{difference['value']:+.3f} ({_bounds(difference.get('low'), difference.get('high'))})"
 
 
 def _table_row(row: Mapping[str, Any]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from raytwin.campaign.demo_gap import (
     withheld_text,
 )
 from raytwin.campaign.figures import exposures_chart, gap_parts, pod_chart, withheld_pictures
-from raytwin.campaign.report import missing_a90
+from raytwin.campaign.report import _bounds, missing_a90
 from raytwin.cli import main
 from raytwin.diagnosis.report.figures import gap_chart
 from raytwin.generator.effects import AppliedEffect
@@ -176,6 +176,14 @@ def test_a_missing_a90_says_which_objects_it_needs(hit_from, needed):
     (line,) = missing_a90(table, {"real_20ms": rows})
     assert line.startswith("20 ms, measured: ")
     assert needed in line
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "told"),
+    [(0.1, 0.2, "0.100 to 0.200"), (0.1, None, "from 0.100"), (None, 0.2, "up to 0.200"), (None, None, "no bounds")],
+)
+def test_an_interval_says_which_bounds_it_has(low, high, told):
+    assert _bounds(low, high) == told
 
 
 def test_options_of_the_shared_start_belong_to_the_papers_size(tmp_path, capsys):

@@ -2,10 +2,8 @@
 
 Same network, batch and stored images; the two take turns, so that both see the same load of the machine. Ratios above 1 mean
 that raytwin's step is faster. The second line is the starter's network against the plain loop with DeepLabV3Plus. Seconds are
-the processor's; on a GPU those of the clock, read when the device has finished.
-
-On a GPU the step alone stands beside, without making its images: recorded once as a CUDA graph and replayed, in single
-precision and in bfloat16.
+the processor's; on a GPU those of the clock, read when the device has finished, and of the second pass: during the first one
+raytwin's step is recorded.
 
     python benchmarks/training_step.py [--steps 6] [--turns 3] [--device cuda]
 """
@@ -21,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from raytwin.segmentation import LOSSES, RECIPES, Recipe, build_network, examples_from_arrays, starter_recipe
+from raytwin.segmentation import RECIPES, Recipe, build_network, examples_from_arrays, starter_recipe
 from raytwin.segmentation.training import _train_epoch
+from raytwin.segmentation.training_step import TrainingStep
 
 SHAPE = (96, 128)
 BATCH = 8
@@ -75,60 +74,16 @@ def plain_seconds(images: np.ndarray, masks: np.ndarray, device: str) -> float:
 
 def raytwin_seconds(images: np.ndarray, masks: np.ndarray, recipe: Recipe, device: str) -> float:
     """Seconds a step of raytwin's loop, scaling and augmentation included."""
-    import torch
-
     examples = examples_from_arrays(images, masks, recipe=recipe)
-    network = build_network(recipe, seed=1).to(device)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+    step = TrainingStep(build_network(recipe, seed=1).to(device), recipe=recipe, device=device)
     steps = len(images) // BATCH
+    rng = np.random.default_rng(1)
+    if device != "cpu":
+        _train_epoch(step, examples, recipe=recipe, generator=rng, first_step=0, steps=steps)
     clock = clock_of(device)
     started = clock()
-    _train_epoch(
-        network,
-        optimizer,
-        examples,
-        recipe=recipe,
-        generator=np.random.default_rng(1),
-        device=device,
-        first_step=0,
-        steps=steps,
-    )
+    _train_epoch(step, examples, recipe=recipe, generator=rng, first_step=0, steps=steps)
     return (clock() - started) / steps
-
-
-def recorded_seconds(images: np.ndarray, masks: np.ndarray, recipe: Recipe, *, mixed: bool) -> float:
-    """Seconds of a step on one batch that lies on the GPU, recorded as a CUDA graph; `mixed`: products in bfloat16."""
-    import torch
-
-    network = build_network(recipe, seed=1).to("cuda").train()
-    x = torch.from_numpy(images[:BATCH]).to("cuda", memory_format=torch.channels_last)
-    y = torch.from_numpy(masks[:BATCH, None]).to("cuda")
-    rate = torch.tensor(recipe.learning_rate, device="cuda")
-    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, capturable=True)
-
-    def step() -> None:
-        optimizer.zero_grad(set_to_none=True)
-        with torch.autocast("cuda", dtype=torch.bfloat16, enabled=mixed, cache_enabled=False):
-            logits = network(x)
-        LOSSES[recipe.loss](logits.float(), y).backward()
-        optimizer.step()
-
-    # what is made at first use must be there before anything is recorded
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):
-            step()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    optimizer.zero_grad(set_to_none=True)
-    with torch.cuda.graph(graph):
-        step()
-    clock = clock_of("cuda")
-    started = clock()
-    for _ in range(len(images) // BATCH):
-        graph.replay()
-    return (clock() - started) / (len(images) // BATCH)
 
 
 def main() -> None:
@@ -148,9 +103,6 @@ def main() -> None:
     work: dict[str, Callable[[], float]] = {"plain": partial(plain_seconds, images, masks, device)}
     for name, recipe in networks.items():
         work[name] = partial(raytwin_seconds, images, masks, recipe, device)
-        if device != "cpu":
-            work[f"{name}_recorded"] = partial(recorded_seconds, images, masks, recipe, mixed=False)
-            work[f"{name}_recorded_bf16"] = partial(recorded_seconds, images, masks, recipe, mixed=True)
     found: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(given.turns + 1):
         for name, one in work.items():

@@ -1,5 +1,6 @@
 """Networks on a dataset file: train a folder of them, and try every one of them on every image."""
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 _HELD_BACK_SHARE = 0.2
 _DETECTION_BATCH = 8
+_SHARE_OF_KEEPING = 0.05  # of a training's time that goes into keeping states to go on from
 
 # network number, epochs done, epochs wanted, the last epoch (None: nothing new, only where it stands)
 Progress = Callable[[int, int, int, EpochResult | None], None]
@@ -163,7 +165,7 @@ def train_networks(
             resume = _state_or_none(runs, number, say)
             if resume is not None and progress is not None:
                 progress(number, resume.epochs_done, resume.epochs_wanted, None)
-            state = resume
+            state, due = resume, 0.0
             for state in iterate_training(
                 train_examples,
                 validation_examples,
@@ -175,7 +177,10 @@ def train_networks(
                 resume=resume,
                 network=network,
             ):
-                write_state(runs, number, state)
+                if time.monotonic() >= due:
+                    began = time.monotonic()
+                    write_state(runs, number, state)
+                    due = time.monotonic() + (time.monotonic() - began) / _SHARE_OF_KEEPING
                 if progress is not None:
                     progress(number, state.epochs_done, state.epochs_wanted, state.history[-1])
             if state is None or not state.best_weights:

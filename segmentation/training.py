@@ -22,6 +22,7 @@ from .network import tensor_from_array
 from .own_module import network_of
 from .recipe import Recipe
 from .scaling import crop_to_shape, pad_to_multiple
+from .training_step import TrainingStep
 
 # Validation costs about a third of a training step an image: small sets are not validated after every short epoch.
 _STEPS_BETWEEN_VALIDATIONS = 25
@@ -135,27 +136,25 @@ def iterate_training(
     module = network_of(recipe, network, seed=_seed(seed, network_number, 0), pretrained=fresh)
     load_weights(module, resume.weights if resume is not None else start_from)
     module = module.to(device)
-    make = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[recipe.optimizer]
-    optimizer = make(module.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    step = TrainingStep(module, recipe=recipe, device=device, record=network is None)
     history: list[EpochResult] = []
     best_weights: Mapping[str, Any] = {}
     best_epoch, best_loss = 0, math.inf
     if resume is not None:
-        optimizer.load_state_dict(resume.optimizer)
+        step.go_on_from(resume.optimizer)
         history = list(resume.history)
         best_weights, best_epoch, best_loss = resume.best_weights, resume.best_epoch, resume.best_loss
 
     for epoch in range(len(history) + 1, epochs + 1):
         gpus = [device] if device.startswith("cuda") else []
+        module.train()
         with torch.random.fork_rng(devices=gpus):
             torch.manual_seed(_seed(seed, network_number, epoch))
             loss = _train_epoch(
-                module,
-                optimizer,
+                step,
                 train.at_epoch(epoch),
                 recipe=recipe,
                 generator=np.random.default_rng([seed, network_number, epoch]),
-                device=device,
                 first_step=(epoch - 1) * steps_per_epoch,
                 steps=epochs * steps_per_epoch,
             )
@@ -177,7 +176,7 @@ def iterate_training(
             epochs_wanted=epochs,
             history=tuple(history),
             weights=module.state_dict(),
-            optimizer=optimizer.state_dict(),
+            optimizer=step.optimizer.state_dict(),
             best_weights=best_weights,
             best_epoch=best_epoch,
             best_loss=best_loss,
@@ -185,36 +184,23 @@ def iterate_training(
 
 
 def _train_epoch(
-    network: Any,
-    optimizer: Any,
+    step: TrainingStep,
     train: Examples,
     *,
     recipe: Recipe,
     generator: np.random.Generator,
-    device: str,
     first_step: int,
     steps: int,
 ) -> float:
     """One pass; returns the mean loss."""
-    torch = load_torch()
-    loss_function = LOSSES[recipe.loss]
-    network.train()
     losses = []
     batches = _batches(len(train), recipe.batch, generator)
-    for step, numbers in enumerate(batches, start=first_step):
-        rate = learning_rate_at(step, recipe=recipe, steps=steps)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-        pairs = [_augmented(train[number], recipe, generator) for number in numbers]
-        images = tensor_from_array(np.stack([image for image, _ in pairs]), device=device)
-        masks = tensor_from_array(np.stack([mask for _, mask in pairs]), device=device)
-        loss = loss_function(network(images), masks)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.detach())
+    for number, chosen in enumerate(batches, start=first_step):
+        pairs = [_augmented(train[one], recipe, generator) for one in chosen]
+        images, masks = (np.stack(arrays) for arrays in zip(*pairs, strict=True))
+        losses.append(step(images, masks, rate=learning_rate_at(number, recipe=recipe, steps=steps)))
     # read once an epoch: so a GPU works on while the next batch is made
-    return float(sum(torch.stack(losses).tolist()) / len(batches))
+    return float(sum(load_torch().stack(losses).tolist()) / len(batches))
 
 
 def _augmented(

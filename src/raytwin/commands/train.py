@@ -1,8 +1,8 @@
 """Train segmentation networks on a dataset.
 
-Networks are numbered from 0 and differ in their random numbers. A run that was stopped goes on with the same command:
-at most one epoch is lost. A folder holds networks of one dataset, recipe, seed and start; asking for more networks than
-it has adds to them. The validation images decide which epoch's weights are kept (lowest loss).
+Networks are numbered from 0 and differ in their random numbers. A run that was stopped goes on with the same command: what is lost is
+the epoch under way, or some seconds of shorter ones. A folder holds networks of one dataset, recipe, seed and start; asking for more
+networks than it has adds to them. The validation images decide which epoch's weights are kept (lowest loss).
 
 With --fresh-noise DATASET holds reference images, and every epoch sees them with noise of its own at a setting: a network never
 sees the same noise twice.

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from raytwin.diagnosis.model.changes import READ_TEXTURE_SD
-from raytwin.diagnosis.probes.line_scalars import LineNoise, bent_share, of_mean
+from raytwin.diagnosis.probes.fixed_pattern import pattern_statistics
+from raytwin.diagnosis.probes.line_scalars import LineNoise, bent_share, line_pattern, of_mean
 from raytwin.diagnosis.probes.scalar_context import Areas
 from raytwin.diagnosis.problem.nuisance_columns import _read_texture
 from raytwin.generator.line.line_state import EACH_LINE, LineFlicker
@@ -67,6 +68,29 @@ def test_variances_of_pixels_lines_blocks_and_frames_are_those_of_drawn_frames(c
         assert np.mean(frames.mean(axis=1) ** 2) == pytest.approx(
             found.columns() + 9.0 * of_mean(SHAPE[0], in_bands), rel=0.08
         )
+
+
+@pytest.mark.parametrize(("column_share", "together_lines"), [(0.0, 0.5), (1.0, 0.5), (0.4, 4.0)])
+def test_a_fixed_pattern_shows_the_lines_of_its_few_frames(column_share, together_lines):
+    rng = np.random.default_rng(6)
+    shape = (64, 512)  # of few columns the smooth surface follows a part
+    rms, offset_DN, level_DN = 0.01, 4.0, 1000.0
+    lines = [drawn_lines(rng, length, together_lines)[:60] for length in shape]
+    frames = level_DN * rms * math.sqrt(1.0 - column_share) * lines[0][:, :, None]
+    frames = frames + level_DN * rms * math.sqrt(column_share) * lines[1][:, None, :]
+    frames += offset_DN * rng.standard_normal((60, 1, shape[1]))
+    everywhere = np.ones(shape, dtype=bool)
+    seen = [pattern_statistics(one, np.full(shape, level_DN), clean=everywhere, good=everywhere) for one in frames]
+    expected = SimpleNamespace(
+        row_variance_DN2=0.0,
+        column_variance_DN2=offset_DN**2,
+        offsets_together_lines=EACH_LINE,
+        flicker=LineFlicker(rms=rms, column_share=column_share, together_lines=together_lines),
+    )
+    wanted = line_pattern(expected, level_DN**2)
+    for name in ("pixel_DN2", "blocks_DN2", "rows_DN2", "columns_DN2"):
+        mean = np.mean([getattr(one, name) for one in seen])
+        assert mean == pytest.approx(getattr(wanted, name), rel=0.1, abs=1e-6 * level_DN), name
 
 
 def test_without_light_or_flicker_only_offsets_are_left():

@@ -43,7 +43,6 @@ EDGE_SD_PX2 = 1.0 / 36.0
 ROUGH_FIELDS = 24
 BEYOND_SD = 1.0  # beyond a border: 0 a picture that mirrors there, 1 one that goes on as it ends, 2 an edge that runs straight on
 ROUGH_SHARE = 0.9  # of the local slope: rendering along an edge, from place to place
-TWO_WIDTHS_SD = 0.06  # relative, of the spread's width along rows against that along columns
 SPREAD_SD = 0.05  # of the calibrated optical spread: calibration may have taken in an effect
 TEXTURE_SD = 0.003  # of the correlation of neighbours at each lag, the same in all series
 READ_TEXTURE_SD = (

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
-from ..probes.fixed_pattern import OUTLIER_SD, pattern_noise, pattern_of
-from ..probes.line_scalars import bent_share
-from ..probes.model_scalars import expected_scalars
-from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED, FIXED_BLOCKS, FIXED_COLUMNS, FIXED_ROWS
+from ..probes.fixed_pattern import OUTLIER_SD, Pattern, pattern_noise, pattern_of, sum_of_patterns
+from ..probes.line_scalars import line_pattern
+from ..probes.model_scalars import expected_scalars, with_pattern
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED
 from ..probes.registration import Placement
 from ..probes.scalar_context import ScalarContext
 from ..session.even_maps import NOWHERE, Map, compact, mean_over
@@ -26,9 +26,7 @@ from .defects import counting_series
 from .forward_model import Change, ForwardModel
 from .placing import PlacedSeries
 
-Lines = dict[
-    str, tuple[float, float]
-]  # variance of rows and columns from frame to frame, DN^2, of each calibrating series
+Lines = dict[str, Pattern]  # what lines of one frame have in common, DN^2, of each calibrating series
 Moved = tuple[
     Map, Mapping[str, float]
 ]  # change of a corrected mean frame, DN, and the scalar probes under the change, by name
@@ -380,14 +378,9 @@ def _context(
     )
 
 
-def _lines_of_noise(model: ExpectedSeries) -> tuple[float, float]:
-    """Variance of rows and of columns from frame to frame, DN^2, as second differences of lines show it."""
-    flicker, of_bends = model.flicker, bent_share(model.offsets_together_lines)
-    rows, columns = of_bends * model.row_variance_DN2, of_bends * model.column_variance_DN2
-    if flicker is None:
-        return rows, columns
-    of_light = flicker.rms**2 * float(np.mean(model.signal_DN)) ** 2 * bent_share(flicker.together_lines)
-    return rows + (1.0 - flicker.column_share) * of_light, columns + flicker.column_share * of_light
+def _lines_of_noise(model: ExpectedSeries) -> Pattern:
+    """What lines of one frame have in common, DN^2."""
+    return line_pattern(model, float(np.mean(model.signal_DN)) ** 2)
 
 
 def _with_patterns(
@@ -413,23 +406,10 @@ def _with_patterns(
     """
     if FIXED not in values:
         return dict(values)
-    noise, shown = context.pattern_noise, pattern_of(moved)
-    result = dict(values)
-    for name, one, own in (
-        (FIXED, shown.pixel_DN2, noise.pixel_DN2),
-        (FIXED_BLOCKS, shown.blocks_DN2, noise.blocks_DN2),
-    ):
-        if name in values and one and own:
-            result[name] = math.hypot(values[name], math.sqrt(one / own))
-    if noise.rows_DN2 is None or noise.columns_DN2 is None:
-        return result
-    added = np.array([shown.rows_DN2, shown.columns_DN2])
     weights = {} if "offset" in item.series.corrected else maps.darks.weights[exposure_of(item)]
-    for name, weight in weights.items():
-        added += weight**2 * np.array(lines[name]) / maps.darks.frames[name]
+    standing = [pattern_of(moved)]
+    standing += [lines[name].times(weight**2 / maps.darks.frames[name]) for name, weight in weights.items()]
     for name, share in maps.shares.items():
         there = share * signals_DN[item.name] / max(signals_DN[name], 1e-9)
-        added += there**2 * np.array(lines[name]) / maps.frames[name]
-    for name, one, own in zip((FIXED_ROWS, FIXED_COLUMNS), added, (noise.rows_DN2, noise.columns_DN2), strict=True):
-        result[name] = 0.5 * math.log(math.exp(2.0 * values[name]) + float(one) / own)
-    return result
+        standing.append(lines[name].times(there**2 / maps.frames[name]))
+    return with_pattern(values, sum_of_patterns(standing), context.pattern_noise)

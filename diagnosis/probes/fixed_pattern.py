@@ -5,7 +5,7 @@ readout lines) show in the means of rows or columns far above what single pixels
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -48,6 +48,17 @@ class Pattern:
             None if one is None else factor * one for one in (self.blocks_DN2, self.rows_DN2, self.columns_DN2)
         )
         return Pattern(pixel_DN2=factor * self.pixel_DN2, blocks_DN2=blocks, rows_DN2=rows, columns_DN2=columns)
+
+
+def sum_of_patterns(patterns: Iterable[Pattern]) -> Pattern:
+    """What stands in a mean frame where all of these do; what cannot be seen of one counts as nothing."""
+    given = tuple(patterns)
+    return Pattern(
+        pixel_DN2=sum(one.pixel_DN2 for one in given),
+        blocks_DN2=sum(one.blocks_DN2 or 0.0 for one in given),
+        rows_DN2=sum(one.rows_DN2 or 0.0 for one in given),
+        columns_DN2=sum(one.columns_DN2 or 0.0 for one in given),
+    )
 
 
 NO_PATTERN = Pattern(pixel_DN2=0.0, blocks_DN2=0.0, rows_DN2=0.0, columns_DN2=0.0)

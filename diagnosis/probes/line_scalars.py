@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import EACH_LINE, LineFlicker, between_lines
+from ..session.summaries import BLOCK_PX
+from .fixed_pattern import Pattern, sum_of_patterns
 from .scalar_context import ScalarContext
 
 
@@ -105,6 +107,30 @@ def of_mean(count: int, together_lines: float) -> float:
     lag = np.arange(1, count)
     fades = np.exp(-lag / together_lines)
     return float(1.0 + 2.0 * np.sum((1.0 - lag / count) * fades)) / count
+
+
+def line_pattern(expected: ExpectedSeries, signal2_DN2: float) -> Pattern:
+    """What rows and columns of one frame have in common, as a fixed pattern's statistics show it; signal2_DN2: mean square signal."""
+    found = [_of_lines(expected.row_variance_DN2, expected.column_variance_DN2, expected.offsets_together_lines)]
+    flicker = expected.flicker
+    if flicker is not None:
+        of_light = flicker.rms**2 * signal2_DN2
+        share = flicker.column_share
+        found.append(_of_lines((1.0 - share) * of_light, share * of_light, flicker.together_lines))
+    return sum_of_patterns(found)
+
+
+def _of_lines(rows_DN2: float, columns_DN2: float, together_lines: float) -> Pattern:
+    """Of variances of rows and of columns; neighbours along rows, pixels or blocks, lie in other columns of the same rows."""
+    bent = bent_share(together_lines)
+    # half the mean square of differences of means over neighbouring blocks
+    of_blocks = 2.0 * (of_mean(BLOCK_PX, together_lines) - of_mean(2 * BLOCK_PX, together_lines))
+    return Pattern(
+        pixel_DN2=(1.0 - between_lines(1, together_lines)) * columns_DN2,
+        blocks_DN2=of_blocks * columns_DN2,
+        rows_DN2=bent * rows_DN2,
+        columns_DN2=bent * columns_DN2,
+    )
 
 
 def bent_share(together_lines: float) -> float:

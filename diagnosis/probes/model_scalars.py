@@ -1,6 +1,7 @@
 """Scalar probes by the forward model."""
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
-from .fixed_pattern import NO_PATTERN, shares_of_pixels, shares_of_tiles
+from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles, sum_of_patterns
 from .lasting import BY_CHANCE, chance_in_flat, chances
-from .line_scalars import LineNoise, bent_share
+from .line_scalars import LineNoise, line_pattern
 from .lost_bits import rounded_kurtosis
 from .moving_picture import MovingPicture, lag_loss
 from .noise_correlation import autocovariance, correlation_sum
@@ -27,6 +28,8 @@ from .probes import (
     REPEATED_FRAMES,
 )
 from .scalar_context import ScalarContext, afterglow_bins, frame_profile, time_templates
+
+_LEAST_PATTERN = 1e-3  # of the variance of noise: less noise than expected leaves at least this
 
 
 def expected_scalars(
@@ -123,45 +126,28 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
 def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[str, float]:
     """What stands in the mean frame of a flat or dark that does not calibrate: pattern, its blocks and lines, outliers."""
     values: dict[str, float] = {}
-    rows, columns = context.good.shape
-    of_bends = bent_share(expected.offsets_together_lines)
-    row, column = of_bends * expected.row_variance_DN2, of_bends * expected.column_variance_DN2
+    shape = context.good.shape
     signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
-    if expected.flicker is not None:
-        bent = expected.flicker.rms**2 * signal2 * bent_share(expected.flicker.together_lines)
-        row += (1.0 - expected.flicker.column_share) * bent
-        column += expected.flicker.column_share * bent
-    changed = [NO_PATTERN]
+    # lines that change leave their mean
+    standing = [line_pattern(expected, signal2).times(1.0 / context.frames)]
     if expected.gain_pattern is not None:
-        pixels = shares_of_pixels((rows, columns), expected.gain_pattern.correlation_px)
-        changed.append(pixels.times(PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2))
+        pixels = shares_of_pixels(shape, expected.gain_pattern.correlation_px)
+        standing.append(pixels.times(PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2))
     if expected.tile_pattern is not None:
-        tiles = shares_of_tiles((rows, columns), expected.tile_pattern)
-        changed.append(tiles.times(expected.tile_pattern.rms**2 * signal2))
+        tiles = shares_of_tiles(shape, expected.tile_pattern)
+        standing.append(tiles.times(expected.tile_pattern.rms**2 * signal2))
     # more quanta's noise in the frames is more of it in their mean
     mean_q, _ = context.areas.means(expected.quantum_variance_DN2)
     added = (mean_q - context.quantum_DN2) / context.frames
-    neighbours = 1.0 - autocovariance(expected, 0, 1)
-    lasting = added * correlation_sum(expected, BLOCK_PX, BLOCK_PX)
-    noise = context.pattern_noise
-    values[FIXED] = math.sqrt(
-        max(1.0 + (sum(one.pixel_DN2 for one in changed) + added * neighbours) / noise.pixel_DN2, 1e-3)
-    )
-    if noise.blocks_DN2 is not None:
-        of_blocks = (sum(one.blocks_DN2 or 0.0 for one in changed) + lasting / BLOCK_PX**2) / noise.blocks_DN2
-        values[FIXED_BLOCKS] = math.sqrt(max(1.0 + of_blocks, 1e-3))
-    if noise.rows_DN2 is not None and noise.columns_DN2 is not None:
-        # lines that change leave their mean
-        of_rows, of_columns = (
-            sum(one.rows_DN2 or 0.0 for one in changed),
-            sum(one.columns_DN2 or 0.0 for one in changed),
+    standing.append(
+        Pattern(
+            pixel_DN2=added * (1.0 - autocovariance(expected, 0, 1)),
+            blocks_DN2=added * correlation_sum(expected, BLOCK_PX, BLOCK_PX) / BLOCK_PX**2,
+            rows_DN2=added / shape[1],
+            columns_DN2=added / shape[0],
         )
-        for name, noise_DN2, line, fixed, length in (
-            (FIXED_ROWS, noise.rows_DN2, row, of_rows, columns),
-            (FIXED_COLUMNS, noise.columns_DN2, column, of_columns, rows),
-        ):
-            of_lines = (fixed + added / length + line / context.frames) / noise_DN2
-            values[name] = 0.5 * math.log(max(1.0 + of_lines, 1e-3))
+    )
+    values |= with_pattern({}, sum_of_patterns(standing), context.pattern_noise)
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
     seen = _jumping(expected, context)[1] + (hot if context.kind == "dark" else bad - 0.5 * hot)
@@ -169,6 +155,29 @@ def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[s
     # what bad pixels add is new in every frame
     values["memory of outliers"] = 0.0
     return values
+
+
+def with_pattern(values: Mapping[str, float], standing: Pattern, noise: Pattern) -> dict[str, float]:
+    """Probes of the fixed pattern (those in `values`, or of noise alone) with more that stands in the mean frame.
+
+    The roots of variances of pixels and blocks over those of noise, and half their logarithm for rows and columns.
+    """
+    result = dict(values)
+    for name, more, own in (
+        (FIXED, standing.pixel_DN2, noise.pixel_DN2),
+        (FIXED_BLOCKS, standing.blocks_DN2, noise.blocks_DN2),
+    ):
+        if own is not None:
+            result[name] = math.sqrt(max(values.get(name, 1.0) ** 2 + (more or 0.0) / own, _LEAST_PATTERN))
+    if noise.rows_DN2 is None or noise.columns_DN2 is None:
+        return result
+    for name, more, own in (
+        (FIXED_ROWS, standing.rows_DN2, noise.rows_DN2),
+        (FIXED_COLUMNS, standing.columns_DN2, noise.columns_DN2),
+    ):
+        before = math.exp(2.0 * values.get(name, 0.0))
+        result[name] = 0.5 * math.log(max(before + (more or 0.0) / own, _LEAST_PATTERN))
+    return result
 
 
 def _jumping(expected: ExpectedSeries, context: ScalarContext) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from ..model import changes as scales
 from ..model.forward_model import ForwardModel
 from ..model.point_maps import blurred_between_points, sampled_at_points
 from ..model.responses import Moved, SessionModel
-from ..probes.noise_correlation import autocovariance, correlation_sum
+from ..probes.noise_correlation import correlation_sum
 from ..probes.probes import OUTLIERS, OUTLIERS_ANYWHERE
 from ..probes.registration import CELL_SD_PX, RENDER_SHARE, gradient
 from ..session.even_maps import Map
@@ -110,31 +110,12 @@ def _of_beam(probes: SeriesProbes, beams_differ: float) -> Columns:
             )
         ),
     }
-    columns["widths of the spread"] = _two_widths(probes)
     for lag in LAGS:
         # the calibrated spread is one number; what it leaves open is the same in all series, or in those of a kV
         texture = _texture(probes, lag)
         columns[f"texture {lag}"] = texture
         columns[f"texture {lag} at {_voltage(item)}"] = scales.TEXTURE_OF_BEAM_SHARE * texture
     return columns
-
-
-def _two_widths(probes: SeriesProbes) -> NDArray[np.float64]:
-    """Correlations under a spread that is wider along one axis by TWO_WIDTHS_SD, and as much narrower along the other.
-
-    Of a Gaussian rho = exp(-d^2 / 4 s^2), so d rho / d ln s = -2 rho ln rho at each lag.
-    """
-    expected = probes.series.expected
-    change: dict[str, float] = {}
-    for down, across in LAGS:
-        by_row, by_column = (max(autocovariance(expected, *lag), 1e-6) for lag in ((down, 0), (0, across)))
-        wider = -2.0 * by_row * by_column * (math.log(by_row) - math.log(by_column))
-        change[f"({down},{across})"] = 0.5 * scales.TWO_WIDTHS_SD * wider
-
-    def of(name: str) -> float:
-        return change[name.rsplit(" ", 1)[-1]] if name.startswith("correlation") else 0.0
-
-    return probes.of_scalars(lambda probe: of(probe.name))
 
 
 def _texture(probes: SeriesProbes, lag: tuple[int, int]) -> NDArray[np.float64]:

@@ -236,7 +236,7 @@ def _causes(diagnosis: Diagnosis) -> SortedTable:
         for cause in diagnosis.causes
     ]
     header = ("effect", "id", "probability", "strength (95 %)", "inner parameters", "when", "gap removed", "law off by")
-    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 4, 5}))
+    return SortedTable(header=header, rows=tuple(rows), words=frozenset({0, 1, 3, 4, 5}))
 
 
 def _where(answer: Mapping[str, Any]) -> SortedTable:

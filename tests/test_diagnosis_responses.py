@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from raytwin.acquisition.setting import setting_from_text
 from raytwin.api._given import as_twin
 from raytwin.calibration.priors import PRIORS
+from raytwin.diagnosis.checks.preparation import _taken_in
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
 from raytwin.diagnosis.model.changes import catalogue_variants, departures_found, twin_changes
@@ -79,6 +80,15 @@ def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_i
     # the mean square difference from the chosen one is a quarter of the step's: the step is two standard deviations
     assert step.step_sd == 2.0
     assert set(named) - {item.name for item in twin_changes(plain)} == {step.name}
+
+
+def test_a_tail_that_calibration_took_in_is_told_in_pixels_of_the_panel():
+    plain = as_twin("virtual_lab")
+    tail = replace(plain.noise.spread, value=Spread(sigma_px=0.3, tail_share=0.213, tail_px=2.1))
+    (text,) = _taken_in(replace(plain, noise=replace(plain.noise, spread=tail)), factor=2)
+    assert "21.3 %" in text and "4.2 px" in text
+    none = replace(plain.noise.spread, value=Spread(sigma_px=0.3))
+    assert _taken_in(replace(plain, noise=replace(plain.noise, spread=none)), factor=1) == ()
 
 
 def test_steps_of_a_tail_that_takes_nearly_all_light_stay_spreads():

@@ -33,8 +33,9 @@ class PreparedSession:
 
     Fields: acquisition (less the series that cannot be used); exposed (of these, saturated series: what they left in the panel is
     known); twin; calibrated_elsewhere (the twin was given, and none of these series is in it); suspects (series whose labels look
-    wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at); factor (pixels along
-    each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all pixels);
+    wrong); left_out (series that are not used, each with the reason); notes (how the session is looked at, and what calibration took
+    in); factor (pixels along each side of the squares that acquisition and twin have as pixels); all_pixels (the same series with all
+    pixels);
     ends_at_zero (names of lit series whose numbers go down to 0 and not below); spectral_point (parameter,): where the twin's
     spectral nuisances are taken as linear (None: at its best parameters).
     """
@@ -102,6 +103,7 @@ def prepare_session(
         except (InputError, FitError) as error:
             raise _not_calibrated(acquisition, suspects, left_out, error) from error
         suspects = suspects or _without_spectrum(acquisition, twin)
+        notes += _taken_in(twin, factor)
     return PreparedSession(
         acquisition=acquisition,
         exposed=exposed,
@@ -118,6 +120,18 @@ def prepare_session(
         all_pixels=replace(
             all_pixels, series=tuple(item for item in all_pixels.series if item.name not in found.unusable)
         ),
+    )
+
+
+def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
+    """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares."""
+    spread = twin.noise.spread.value
+    if spread.tail_share == 0.0:
+        return ()
+    light, reach_px = 100.0 * spread.tail_share, factor * spread.tail_px
+    return (
+        f"calibration found {light:.3g} % of the light in a tail with a reach of {reach_px:.2g} px; the twin has it, so that it"
+        " is no gap",
     )
 
 

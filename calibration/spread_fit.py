@@ -71,7 +71,7 @@ _MOST_SD = 0.15  # of the share between such steps, which then reach over most o
 # deviation of the mean adds an eighth to that, while a spread without a tail is quicker wherever it is used.
 _AS_LIKELY = 2.0 * math.log(10.0)
 _NEAR_THE_MEAN = 0.5
-_LEAST_LIKELY = 0.01  # of a family to be kept: its difference from the chosen one counts by the root of this, a tenth
+_LEAST_LIKELY = 0.001  # of a family to be kept: the diagnosis weighs what is off against it by the logarithm of this, 7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

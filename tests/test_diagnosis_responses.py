@@ -77,8 +77,11 @@ def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_i
     named = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=known)))}
     step = named["optical spread as exponential"]
     assert step.twin.noise.spread.value == other.value
-    # the mean square difference from the chosen one is a quarter of the step's: the step is two standard deviations
-    assert step.step_sd == 2.0
+    # a whole step costs what the other spread's probability does
+    assert 0.5 * step.step_sd**2 == pytest.approx(math.log(4.0))
+    likely = replace(known, others=(replace(other, probability=0.9),))
+    again = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=likely)))}
+    assert again["optical spread as exponential"].step_sd == 1.0
     assert set(named) - {item.name for item in twin_changes(plain)} == {step.name}
 
 

@@ -326,8 +326,8 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             name=f"optical spread as {other.family}",
             twin=replace(twin, noise=replace(twin.noise, spread=replace(spread, value=other.value))),
             parameters=None,
-            # of a mixture: its mean square difference from the chosen one
-            step_sd=1.0 / math.sqrt(other.probability),
+            # a Gaussian that gives the other spread itself the weight which the mixture does
+            step_sd=math.sqrt(max(-2.0 * math.log(other.probability), 1.0)),
         )
         for other in spread.others
     ]

@@ -94,7 +94,7 @@ def prepare_session(
     exposed = tuple(item for item in acquisition.series if item.name in found.saturated)
     acquisition = replace(acquisition, series=kept)
     elsewhere = twin is not None and not made_of(twin, kept)
-    notes = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
+    notes: tuple[str, ...] = () if elsewhere or twin is None else (_OF_THIS_SESSION,)
     suspects = found.suspects
     if twin is None:
         tell("calibration")

@@ -3,7 +3,7 @@
 Same network, batch and stored images; the two take turns, so that both see the same load of the machine. Ratios above 1 mean
 that raytwin's step is faster. The second line is the starter's network against the plain loop with DeepLabV3Plus. Seconds are
 the processor's; on a GPU those of the clock, read when the device has finished, and of the second pass: during the first one
-raytwin's step is recorded.
+raytwin's step is recorded. There each pass of the plain loop begins with a new network, whose first steps are slower.
 
     python benchmarks/training_step.py [--steps 6] [--turns 3] [--device cuda]
 """

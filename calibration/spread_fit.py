@@ -71,7 +71,8 @@ _MOST_SD = 0.15  # of the share between such steps, which then reach over most o
 # deviation of the mean adds an eighth to that, while a spread without a tail is quicker wherever it is used.
 _AS_LIKELY = 2.0 * math.log(10.0)
 _NEAR_THE_MEAN = 0.5
-_LEAST_LIKELY = 0.001  # of a family to be kept: the diagnosis weighs what is off against it by the logarithm of this, 7
+# of a family to be kept: less likely than any law of an effect is beforehand in the diagnosis (0.40 over 28 effects of some laws)
+_LEAST_LIKELY = 0.001
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

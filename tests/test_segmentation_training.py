@@ -36,6 +36,7 @@ from raytwin.segmentation import (
     starter_recipe,
     train_networks,
 )
+from raytwin.segmentation import runs as runs_module
 from raytwin.segmentation.runs_io import network_folder, read_state, write_state
 
 SHAPE = (20, 36)
@@ -428,7 +429,25 @@ def test_finished_networks_are_not_trained_again_and_more_can_be_asked_for(datas
     assert epochs == [(0, False), (1, True)]
 
 
-def test_a_killed_run_goes_on_from_its_last_epoch_and_ends_as_if_nothing_had_happened(dataset_file, trained, tmp_path):
+def test_a_run_killed_between_two_states_ends_as_if_nothing_had_happened(dataset_file, tmp_path, monkeypatch):
+    recipe = dataclasses.replace(QUICK, epochs=4)
+
+    def kill(network, done, wanted, result):
+        if done == 3 and result is not None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs_module, "_SHARE_OF_KEEPING", 1e-9)  # the first epoch's state is the only one
+    with read_dataset(dataset_file) as dataset:
+        whole = train_networks(dataset, tmp_path / "whole", recipe=recipe, networks=1, seed=5)
+        with pytest.raises(KeyboardInterrupt):
+            train_networks(dataset, tmp_path / "r", recipe=recipe, networks=1, seed=5, progress=kill)
+        assert read_state(open_runs(tmp_path / "r"), 0).epochs_done == 1
+        again = train_networks(dataset, tmp_path / "r", recipe=recipe, networks=1, seed=5)
+    assert again == whole
+    _assert_same(_weights(tmp_path / "r", 0), _weights(tmp_path / "whole", 0))
+
+
+def test_a_killed_run_goes_on_from_its_last_state_and_ends_as_if_nothing_had_happened(dataset_file, trained, tmp_path):
     class Killed(BaseException):
         pass
 

@@ -326,7 +326,7 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]
             name=f"optical spread as {other.family}",
             twin=replace(twin, noise=replace(twin.noise, spread=replace(spread, value=other.value))),
             parameters=None,
-            # a Gaussian that gives the other spread itself the weight which the mixture does
+            # taken whole it costs ln(1 / p), as in a mixture; a standard deviation is no more than the whole
             step_sd=math.sqrt(max(-2.0 * math.log(other.probability), 1.0)),
         )
         for other in spread.others

@@ -27,7 +27,7 @@ from raytwin.errors import InputError
 from raytwin.generator.effects import AppliedEffect
 from raytwin.generator.effects.misregistration import parts_px
 from raytwin.generator.line.series_request import SeriesRequest
-from raytwin.generator.line.twin import OtherSpread
+from raytwin.generator.line.twin import Estimate, OtherSpread
 from raytwin.generator.spread.psf import Spread
 
 SHAPE = (12, 16)
@@ -87,9 +87,14 @@ def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_i
 
 def test_a_tail_that_calibration_took_in_is_told_in_pixels_of_the_panel():
     plain = as_twin("virtual_lab")
-    tail = replace(plain.noise.spread, value=Spread(sigma_px=0.3, tail_share=0.213, tail_px=2.1))
+    share = Estimate(value=0.213, low=0.15, high=0.27)
+    tail = replace(
+        plain.noise.spread,
+        value=Spread(sigma_px=0.3, tail_share=0.213, tail_px=2.1),
+        intervals={**plain.noise.spread.intervals, "tail_share": share},
+    )
     (text,) = _taken_in(replace(plain, noise=replace(plain.noise, spread=tail)), factor=2)
-    assert "21.3 %" in text and "4.2 px" in text
+    assert "21 % (95 %: 15 to 27)" in text and "4.2 px" in text
     none = replace(plain.noise.spread, value=Spread(sigma_px=0.3))
     assert _taken_in(replace(plain, noise=replace(plain.noise, spread=none)), factor=1) == ()
 

@@ -125,13 +125,15 @@ def prepare_session(
 
 def _taken_in(twin: Twin, factor: int) -> tuple[str, ...]:
     """What calibration took in that the catalogue has as an effect; factor: pixels along the side of the twin's squares."""
-    spread = twin.noise.spread.value
-    if spread.tail_share == 0.0:
+    spread = twin.noise.spread
+    if spread.value.tail_share == 0.0:
         return ()
-    light, reach_px = 100.0 * spread.tail_share, factor * spread.tail_px
+    known = spread.intervals.get("tail_share")
+    within = "" if known is None else f" (95 %: {100.0 * known.low:.2g} to {100.0 * known.high:.2g})"
+    light, reach_px = 100.0 * spread.value.tail_share, factor * spread.value.tail_px
     return (
-        f"calibration found {light:.3g} % of the light in a tail with a reach of {reach_px:.2g} px; the twin has it, so that it"
-        " is no gap",
+        f"calibration found {light:.2g} %{within} of the light in a tail with a reach of some {reach_px:.2g} px; the twin has it,"
+        " so that it is no gap",
     )
 
 

@@ -17,7 +17,8 @@ from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
 from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, POSITION_SD_PX, catalogue_variants
-from raytwin.diagnosis.problem.assemble import build_problem
+from raytwin.diagnosis.problem.assemble import build_problem, map_changes
+from raytwin.diagnosis.problem.series_probes import mean_frame
 from raytwin.diagnosis.session.origin import made_of
 from raytwin.diagnosis.session.session import measured_levels, read_session
 from raytwin.generator.effects import EFFECTS, AppliedEffect
@@ -736,9 +737,9 @@ def test_what_calibration_takes_in_divides_later_frames(line):
         )
 
     taken_in = sum(
-        problem.gain_shares[view.session.name] * changes(view)
+        problem.session.maps.shares[view.session.name] * changes(view)
         for view in problem.views
-        if view.session.name in problem.gain_shares
+        if view.session.name in problem.session.maps.shares
     )
     seen = 0
     for number, view in enumerate(problem.views):
@@ -802,3 +803,49 @@ def test_what_registration_finds_of_a_moving_scene_is_in_its_place_and_in_no_pic
     assert np.abs(difference[pictures & (exposures_ms == 100.0)]).max() < 1e-3
     assert np.abs(difference[pictures & (exposures_ms == 25.0)]).max() > 5.0
     assert not difference[~of_objects].any()
+
+
+def test_an_output_that_wanders_since_the_calibration_leaves_the_calibrating_series_as_they_are(line):
+    variants = [item for item in catalogue_variants() if item.effect == "output_drift"]
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=variants)
+    calibrates = np.array([problem.views[number].session.calibrates for number in problem.series_of])
+    assert {curve.since for curve in problem.curves} == {"always", "calibration"}
+    for curve in problem.curves:
+        assert np.any(curve.spread[calibrates]) == (curve.since == "always")
+        assert np.any(curve.spread[~calibrates])
+
+
+def test_pictures_of_scenes_that_registration_has_found_hold_no_displacement(line):
+    """What explains where a scene lies is no change of its picture, which is drawn where it lies."""
+    shifted, turned = (
+        AppliedEffect(id="misregistration", parameters={"strength": 2.0, "rotation_deg": turned}, since="always")
+        for turned in (0.0, 90.0)
+    )
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+    placed = [number for number, one in enumerate(problem.session.series) if one.placement is not None]
+    assert placed
+    changes = {name: map_changes(problem, [effect]) for name, effect in (("shift", shifted), ("turn", turned))}
+    for number in placed:
+        assert not changes["shift"][number].any()
+        assert float(np.abs(changes["turn"][number]).max()) > 1.0
+    assert all(change.shape == problem.views[0].mask.shape for change in changes["turn"])
+
+
+@pytest.mark.parametrize("step_DN", [0.0, 1.0])
+def test_rounding_stays_in_means_of_whole_numbers_alone(line, step_DN):
+    """Squares of a large panel's pixels, and frames of fractions, are not rounded."""
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=())
+    dark = next(one for one in problem.session.series if one.session.series.kind == "dark")
+    quiet = replace(
+        dark, expected=replace(dark.expected, white_variance_DN2=np.full((1, 1), 0.04), quantisation_step_DN=step_DN)
+    )
+    shape = problem.views[0].mask.shape
+    variance, usual = (
+        float(np.mean(mean_frame(one, np.zeros(shape), problem.session.maps, frames=20, side=1).white_DN2))
+        for one in (quiet, replace(quiet, expected=replace(quiet.expected, quantisation_step_DN=0.0)))
+    )
+    # 0.04 DN^2 after rounding are 0.005 before: 1/12 + 0.005 - 0.04 DN^2 stay in a mean of any length
+    assert variance - usual == pytest.approx(0.048 if step_DN else 0.0, abs=0.0005)

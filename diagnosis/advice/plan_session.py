@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ...acquisition.acquisition_io import AcquisitionFile
 from ...generator.effects import EFFECTS
@@ -106,10 +107,12 @@ def plan_session(
     Raises:
         InputError: nothing in the session can be judged.
     """
-    session = prepare_session(acquisition, twin=twin, rng=rng)
-    unseen = unseen_in_squares() if session.factor > 1 else {}
-    problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
-    found = distinguishability(problem)
+    # thousands of small matrices: threads would wait for each other longer than they work
+    with threadpool_limits(limits=1, user_api="blas"):
+        session = prepare_session(acquisition, twin=twin, rng=rng, progress=progress)
+        unseen = unseen_in_squares() if session.factor > 1 else {}
+        problem = problem_of(session, session.twin, without=(*without, *unseen), progress=progress)
+        found = distinguishability(problem)
     shares = [EFFECTS[effect].strength.pixels_per_square(session.factor) for effect in found.effects]
     return SessionPlan(
         distinguishability=replace(found, strengths=found.strengths * shares, seen_from=found.seen_from * shares),

@@ -1,6 +1,5 @@
 """Session and twin -> the problem that inference solves: residual probes, nuisance factors, responses to every effect."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,13 +11,12 @@ from ...acquisition.log_images import light_of_shares
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import beam_conditions, session_conditions, with_conditions
-from ...generator.frames.line_model import LineModel
 from ...generator.line.twin import Twin
 from ..checks.preparation import PreparedSession
 from ..inference.discrepancy import FARTHEST_LEVEL, USUAL_LEVEL
 from ..inference.observed import Point
 from ..inference.unknown import Families
-from ..model.calibrated_maps import LEAST_GAIN, calibrated_maps, exposure_of
+from ..model.calibrated_maps import calibrated_maps
 from ..model.changes import (
     Variant,
     always_a_little,
@@ -39,7 +37,7 @@ from ..session.session import SessionSeries, only_own_noise, read_session
 from ..session.summaries import SeriesSummary
 from ..session.usable import SeenSeries, counted_copies, look_at_all, stated_series, summarise_all
 from .asked_again import AskedAgain, ProbedSeries, notable
-from .known_effects import lasting, with_found
+from .known_effects import lasting
 from .line_noise import usual_line_noise
 from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import NO_SCENES, OtherScenes, other_scenes
@@ -333,18 +331,7 @@ def _view(one: SeriesModel, frame: MeanFrame, summary: SeriesSummary) -> SeriesV
         residual_DN=np.asarray(frame.residual_DN, np.float32),
         noise_DN=np.sqrt(frame.quantum_DN2 + frame.white_DN2).astype(np.float32),
         mask=frame.mask,
-        floor_rms=_half_difference(summary),
     )
-
-
-def _half_difference(summary: SeriesSummary) -> float:
-    """Scatter of the mean frame as repeats show it, over what differences of frames predict (1 = noise only)."""
-    if summary.frames < 4:
-        return 1.0
-    steps = np.diff(summary.frame_mean_DN)
-    white = float(np.mean(steps**2)) / 2.0
-    total = float(np.var(summary.frame_mean_DN, ddof=1))
-    return math.sqrt(total / white) if white > 0 else 1.0
 
 
 def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
@@ -359,7 +346,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
     curves, chosen, missing = _curves(blocks, responses, names, compared, done)
     of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
-    groups, group_names = _numbered(
+    groups, _ = _numbered(
         [
             f"{axis}, {series.kind} {series.scene} {series.kV if series.kind != 'dark' else ''}".strip()
             for axis, series in of_probes
@@ -380,16 +367,12 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         sd=np.concatenate([block.sd for block in blocks]),
         noise=np.concatenate([block.noise for block in blocks]),
         groups=groups,
-        group_names=group_names,
         families=_families(names, [series for _, series in of_probes]),
         blocks=sharing[series_of],
         views=tuple(part.view for part in parts),
-        base=session.model.base,
-        gain_shares=session.maps.shares,
-        dark_weights=session.maps.darks.weights,
+        session=session,
         skipped=compared.measured.skipped,
         missing_effects=missing,
-        conditions=session.model.conditions,
         again=AskedAgain(
             session=session,
             series=tuple(part.probed for part in parts),
@@ -513,28 +496,16 @@ def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]
     """What effects change in each view's corrected mean frame (row, column), DN, calibration having taken in its part.
 
     They take the place of the same ones that the base has.
+
+    Raises:
+        InputError: the twin knows too little for them.
     """
+    session = problem.session
+    asked = session.ask(session.model.with_found(effects))
+    moved = [session.moved(one, [asked])[0] for one in session.series]
+    if asked.failed:
+        raise InputError(
+            "effects that were found", received=asked.failed, expected="effects that this twin can be asked for"
+        )
     shape = problem.base.maps.shape
-    effects = with_found(problem.base.effects, effects)
-    line = LineModel(problem.base, effects=effects, use_measured_level=False, cache=draft_cache())
-    moved: dict[str, NDArray[np.float64]] = {}
-    for view in problem.views:
-        changed = line.expect(view.session.request)
-        moved[view.session.name] = np.asarray(changed.mean_DN) - np.asarray(view.expected.mean_DN)
-
-    def lit(view: SeriesView) -> NDArray[np.float64]:
-        weights = problem.dark_weights.get(exposure_of(view.session), {})
-        return moved[view.session.name] - sum((w * moved[name] for name, w in weights.items()), np.zeros(shape))
-
-    taken = np.zeros(shape)
-    for view in problem.views:
-        share = problem.gain_shares.get(view.session.name)
-        if share:
-            taken = taken + share * lit(view) / np.maximum(view.signal_DN, 1e-6)
-    result = []
-    for view in problem.views:
-        change = lit(view)
-        if view.session.series.kind in ("flat", "object"):
-            change = (change - view.signal_DN * taken) / np.maximum(1.0 + taken, LEAST_GAIN)
-        result.append(np.asarray(change, dtype=np.float32))
-    return result
+    return [np.broadcast_to(found[0], shape) for found in moved if found is not None]

@@ -15,7 +15,8 @@ from ..inference.seen import Blocks
 from ..inference.unknown import Families
 from ..model.changes import Variant
 from ..model.curves import Curve
-from ..model.forward_model import ForwardModel, own_maps
+from ..model.forward_model import draft_cache
+from ..model.responses import SessionModel
 from ..probes.probes import ProbeName
 from ..session.even_maps import Map, full_size
 from ..session.session import SessionSeries
@@ -37,7 +38,6 @@ class SeriesView:
     residual_DN: Map
     noise_DN: Map
     mask: NDArray[np.bool_]
-    floor_rms: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,12 +47,11 @@ class Problem:
     Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
     series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
     noise's share of each probe's standard deviation; blocks (probe,):
-    series that share local nuisances; groups, group_names: within which an effect's law is off by one factor; families: in which an
-    unknown effect may show; views; base: the twin with all pixels alike; gain_shares, dark_weights: how the
-    calibrating series make up gain map and darks; skipped: what could not be used and why; missing_effects: effects that
-    cannot be judged here and why; conditions of the session that effects know; again asks the forward model
-    once more; side of the squares of the panel's pixels that stand for pixels; given: the effects of the base, which are taken off
-    the residual: what they do, at their strengths.
+    series that share local nuisances; groups (probe,): within which an effect's law is off by one factor; families: in which an
+    unknown effect may show; views; session: the forward model of its series; skipped: what could not be used and why;
+    missing_effects: effects that cannot be judged here and why; again asks the forward model once more; side of the squares of the
+    panel's pixels that stand for pixels; given: the effects of the base, which are taken off the residual: what they do, at their
+    strengths.
     """
 
     residual: NDArray[np.float64]
@@ -65,19 +64,25 @@ class Problem:
     sd: NDArray[np.float64]
     noise: NDArray[np.float64]
     groups: NDArray[np.intp]
-    group_names: tuple[str, ...]
     families: Families
     blocks: NDArray[np.intp]
     views: tuple[SeriesView, ...]
-    base: Twin
-    gain_shares: dict[str, float]
-    dark_weights: dict[float, dict[str, float]]
+    session: SessionModel
     skipped: tuple[str, ...]
     missing_effects: dict[str, str]
-    conditions: dict[str, float]
     again: AskedAgain | None
     side: int = 1
     given: tuple[Point, ...] = ()
+
+    @property
+    def base(self) -> Twin:
+        """The twin with all pixels alike, and the effects that it has."""
+        return self.session.model.base
+
+    @property
+    def conditions(self) -> Mapping[str, float]:
+        """Conditions of the session that effects know."""
+        return self.session.model.conditions
 
     def in_series(self, effect: str, variant: str, series: Sequence[int], log_prior: float) -> "Problem":
         """With an effect's variant as it acts in some series (numbers of views) alone, as one more variant."""
@@ -168,8 +173,7 @@ class Problem:
 
     def explained_by(self, effects: Sequence[AppliedEffect]) -> dict[str, Explained]:
         """What effects do to each series that they can show in, by its name."""
-        made_here = own_maps(view.session for view in self.views)
-        model = ForwardModel(base=self.base, conditions=self.conditions, own_maps=made_here)
+        model = self.session.model
         change = model.with_found(effects)
         return {
             view.session.name: _difference(
@@ -180,8 +184,9 @@ class Problem:
         }
 
     def released(self) -> "Problem":
-        """Without the frames' projections, so that nothing can be asked again."""
-        return replace(self, again=None)
+        """Without the frames' projections, so that nothing can be asked again, and without what the forward model keeps."""
+        model = replace(self.session.model, cache=draft_cache())
+        return replace(self, again=None, session=replace(self.session, model=model))
 
     def respond(
         self, variants: Sequence[Variant], /, wanted: NDArray[np.bool_] | None = None

@@ -193,7 +193,9 @@ def _of_output(variant: Variant, blocks: Sequence[SeriesBlock], readout_ms: floa
     """What a wandering output does by chance (probe, factor): levels of lit series together, trend and common factor of each."""
     size = sum(map(len, blocks))
     lit = [
-        (block, place) for block, place in zip(blocks, _places(blocks), strict=True) if block.session.request.beam_on
+        (block, place)
+        for block, place in zip(blocks, _places(blocks), strict=True)
+        if block.session.request.beam_on and (variant.since == "always" or not block.session.calibrates)
     ]
     if not lit:
         return None

@@ -24,7 +24,6 @@ from ..probes.straight_edge import distance_px, scatter_share, straight_scene
 from ..session.even_maps import Map, full_size, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
-_STEP_DN = 1.0  # of the ADC
 _NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
 
 
@@ -138,7 +137,9 @@ def mean_frame(
         came = variance_of_what_came(quantum + white, signal, corrected_DN)
         quantum = np.maximum(quantum, came - white)
     white = np.maximum(white, LEAST_NOISE_DN2)
-    kept = variance_kept_by_means(quantum + white, _STEP_DN)
+    # each exposure is rounded before frames are averaged
+    of_one, step = one.session.request.exposures_per_frame * (quantum + white), expected.quantisation_step_DN
+    kept = variance_kept_by_means(of_one, step) if step > 0.0 else 0.0
     quantum = quantum / frames + signal**2 * maps.gain_quantum
     white = white / frames + kept + signal**2 * maps.gain_white + maps.dark_noise(one.session, signal)
     rendered = RENDER_SHARE

@@ -53,7 +53,9 @@ def diagnosis(verdict, **more):
         "unknown_location": "position of flat",
         "compared": SimpleNamespace(views=views),
     }
-    return SimpleNamespace(**fields | more)
+    fields |= more
+    leading = tuple(cause for cause in fields["causes"] if cause.effect in fields.get("named", ()))
+    return SimpleNamespace(**fields, leading=leading)
 
 
 @pytest.mark.parametrize(

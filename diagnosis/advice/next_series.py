@@ -26,12 +26,11 @@ from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
-from ..inference.nuisances import Nuisances
-from ..inference.whitening import Whitening
 from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.assemble import build_problem
 from ..problem.problem import Problem
+from .plan import length
 
 FRAMES = 20  # of each series that is planned
 Explanation = Mapping[str, tuple[Curve, float]]  # effect -> curve of the problem, strength
@@ -236,53 +235,43 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
 
     every = list(line.settings.values())
     kVs = " and ".join(f"{kV:g}" for kV in voltages) + " kV"
-    found: list[tuple[str, str, list[PlannedSeries]]] = []
+    found: list[Measurement] = []
+
+    def add(name: str, text: str, series: Sequence[PlannedSeries]) -> None:
+        found.append(Measurement(name=name, text=text, series=tuple(series)))
+
     if not any(item.kind == "afterglow" for item in requests):
         off = PlannedSeries(kind="afterglow", setting=None, exposure_ms=high.exposure_ms)
-        found.append(
-            (
-                "afterglow",
-                f"{FRAMES} frames with the beam off straight after flats at {high.kV:g} kV",
-                [*flats([high]), off],
-            )
-        )
+        text = f"{FRAMES} frames with the beam off straight after flats at {high.kV:g} kV"
+        add("afterglow", text, [*flats([high]), off])
     if sum(item.kind == "dark" and item.after_calibration for item in requests) < 2:
         dark = PlannedSeries(kind="dark", setting=None, exposure_ms=longest)
-        found.append(("darks", f"darks of {longest:g} ms between the other series", [dark, dark]))
+        add("darks", f"darks of {longest:g} ms between the other series", [dark, dark])
     if not held("disc"):
         discs = [one for name in ("small disc", "large disc") for one in shots(name, [line.usual_mm], every)]
-        found.append(("discs", f"opaque discs of two sizes at {kVs}", discs))
+        add("discs", f"opaque discs of two sizes at {kVs}", discs)
     if len(held("edge")) < 2:
         edges = [one for name in ("edge x", "edge y") for one in shots(name, far("edge"), every)]
         places = " and ".join(f"{one:.0f} mm" for one in far("edge"))
-        found.append(("edges", f"an opaque edge in two directions, {places} from the source, at {kVs}", edges))
+        add("edges", f"an opaque edge in two directions, {places} from the source, at {kVs}", edges)
     timed = [_exposed(high, share * high.exposure_ms, equal_charge=False) for share in (1.0, 0.5, 0.25)]
     if len({item.exposure_ms for item in requests if item.scene_kind == "edge"}) < 2:
         # equal charge: that of the shortest
         equal = [_exposed(timed[-1], one.exposure_ms, equal_charge=True) for one in timed]
-        found.append(
-            (
-                "timed edges",
-                f"an opaque edge at {', '.join(f'{one.exposure_ms:g}' for one in equal)} ms of equal charge",
-                [*shots("edge x", [line.usual_mm], equal), *shots("edge y", [line.usual_mm], equal)],
-            )
-        )
+        text = f"an opaque edge at {', '.join(f'{one.exposure_ms:g}' for one in equal)} ms of equal charge"
+        edges = [one for name in ("edge x", "edge y") for one in shots(name, [line.usual_mm], equal)]
+        add("timed edges", text, edges)
     if len(held("slab")) < 2:
         places = " and ".join(f"{one:.0f} mm" for one in far("slab"))
-        found.append(
-            (
-                "slabs",
-                f"a slab of {_SLAB_MM:g} mm {line.material}, {places} from the source",
-                shots("slab", far("slab"), every),
-            )
-        )
+        text = f"a slab of {_SLAB_MM:g} mm {line.material}, {places} from the source"
+        add("slabs", text, shots("slab", far("slab"), every))
     if not held("wedge"):
-        found.append(("wedge", f"a wedge of known steps (PMMA, Al) at {kVs}", shots("wedge", [line.usual_mm], every)))
+        add("wedge", f"a wedge of known steps (PMMA, Al) at {kVs}", shots("wedge", [line.usual_mm], every))
     others = [_as_bright(replace(high, kV=kV), high, line.twin) for kV in _other_voltages(voltages)]
     other = next((one for one in others if one is not None), None)
     if len(voltages) == 1 and other is not None:
         more = [*flats([other]), *shots("wedge", [line.usual_mm], [other]), *shots("edge x", [line.usual_mm], [other])]
-        found.append(("voltage", f"flats, a wedge of known steps and an opaque edge at {other.kV:g} kV", more))
+        add("voltage", f"flats, a wedge of known steps and an opaque edge at {other.kV:g} kV", more)
     stacks: dict[float, set[str]] = {}
     for item in requests:
         if item.kind == "flat" and item.setting is not None:
@@ -291,15 +280,15 @@ def measurements_lacking(problem: Problem) -> tuple[Measurement, ...]:
         behind = [_as_bright(replace(one, filters=(*one.filters, _FILTER)), one, line.twin) for one in every]
         filtered = [one for one in behind if one is not None]
         if filtered:
-            found.append(("filter", f"flats behind {_FILTER} more at {kVs}", flats(filtered)))
+            add("filter", f"flats behind {_FILTER} more at {kVs}", flats(filtered))
     if len({item.exposure_ms for item in requests if item.kind == "flat"}) < 3:
         levels = [
             _exposed(one, share * one.exposure_ms, equal_charge=False) for one in every for share in _SHARES_OF_EXPOSURE
         ]
-        found.append(("exposures", "flats at four exposure times and one current", flats(levels)))
+        add("exposures", "flats at four exposure times and one current", flats(levels))
     if not any(item.panel_rotation_deg % 360.0 for item in requests):
-        found.append(("turned", "flats with the panel turned by 180 degrees", flats(every, turned_deg=180.0)))
-    return tuple(Measurement(name=name, text=text, series=tuple(series)) for name, text, series in found)
+        add("turned", "flats with the panel turned by 180 degrees", flats(every, turned_deg=180.0))
+    return tuple(found)
 
 
 def _other_voltages(voltages: Sequence[float]) -> list[float]:
@@ -446,13 +435,9 @@ def _separation(
     if taken is not None:
         factors = _joined(problem, taken, rows)
         blocks = np.concatenate([blocks, taken.blocks[rows] + int(blocks.max()) + 1])
-    found = []
-    for wrong in (ones, others):
-        free = _STRENGTH_FREE * np.stack(wrong, axis=1)
-        whitening = Whitening(np.concatenate([factors, free], axis=1), blocks)
-        moved = whitening.apply(apart[None, :])
-        found.append(float(Nuisances(whitening.factors).inner(moved, moved)[0, 0]))
-    return math.sqrt(max(min(found), 0.0))
+    # the strengths of the explanation that is wrong are free
+    free = (np.concatenate([factors, _STRENGTH_FREE * np.stack(wrong, axis=1)], axis=1) for wrong in (ones, others))
+    return min(length(one, blocks, apart) for one in free)
 
 
 def _joined(problem: Problem, taken: Problem, rows: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -173,31 +173,40 @@ def best_repeat(
         )
 
     apart = response(first) - response(second)
+    now = length(problem.factors, problem.blocks, apart)
+    if not now > 0.0:
+        return None
     whitening = Whitening(problem.factors, problem.blocks)
     moved = whitening.apply(apart[None, :])[0]
-    shared = Nuisances(whitening.factors)
-    weight = shared.solve(moved) * moved
-    now = float(np.sqrt(max(float(weight.sum()), 0.0)))
-    if not now > 0:
-        return None
+    weight = Nuisances(whitening.factors).solve(moved) * moved
     by_series = np.bincount(problem.series_of, weights=weight, minlength=len(problem.views))
     found: list[Repeat] = []
     for number in np.argsort(-by_series)[:_CANDIDATES]:
         # more frames leave less counting noise, and all that is no noise as it was
         shrunk = np.where(problem.series_of == number, 1.0 - (1.0 - 1.0 / _REPEATS) * problem.noise**2, 1.0)
         root = np.sqrt(shrunk)
-        again = Whitening(problem.factors / root[:, None], problem.blocks)
-        there = again.apply((apart / root)[None, :])
-        length = float(Nuisances(again.factors).inner(there, there)[0, 0])
         found.append(
             Repeat(
                 series=problem.views[int(number)].session.name,
                 times=_REPEATS,
                 separation=now,
-                separation_then=float(np.sqrt(max(length, 0.0))),
+                separation_then=length(problem.factors / root[:, None], problem.blocks, apart / root),
             )
         )
     return max(found, key=lambda item: item.separation_then)
+
+
+def length(factors: NDArray[np.float64], blocks: NDArray[np.intp], moved: NDArray[np.float64]) -> float:
+    """Length of a change of the probes (probe,), standard deviations, nuisances refitted.
+
+    Args:
+        factors: of the nuisances (probe, factor).
+        blocks: within which they are local (probe,).
+        moved: the change.
+    """
+    whitening = Whitening(factors, blocks)
+    whitened = whitening.apply(moved[None, :])
+    return math.sqrt(max(float(Nuisances(whitening.factors).inner(whitened, whitened)[0, 0]), 0.0))
 
 
 def table_text(found: Distinguishability) -> str:

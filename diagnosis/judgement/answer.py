@@ -1,7 +1,7 @@
 """The answer of a diagnosis, and its form as a file."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from ...errors import InputError
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 VERDICTS = ("no_gap", "explained", "explained_in_part", "ambiguous", "unknown_effect")
 EXPLAINED = ("explained", "explained_in_part")
 _LEFT_LISTED = 5
+_PLOTTED = 12  # hypotheses, the most probable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +99,11 @@ class Diagnosis(Result):
     task: Mapping[str, Any] | None = None
 
     @property
+    def leading(self) -> tuple[Cause, ...]:
+        """The causes that are named, most probable first."""
+        return tuple(cause for cause in self.causes if cause.effect in self.named)
+
+    @property
     def compared(self) -> Problem:
         """What was compared.
 
@@ -129,11 +135,18 @@ class Diagnosis(Result):
 
     def plot_gap(self, ax: Any = None) -> Any:
         """The gap on held-out probes before and after, by axis, with the floor of measured against measured; returns the axes."""
-        return plot_gap(self, ax=axes_or_new(ax))
+        gap = self.gap
+        return plot_gap_rows([("all", gap.before, gap.after, gap.floor), *self.held_out], ax=axes_or_new(ax))
 
     def plot(self, ax: Any = None) -> Any:
         """Probability of every hypothesis that was weighed, the most probable first; returns the axes."""
-        return plot_probabilities(self, ax=axes_or_new(ax))
+        axes = axes_or_new(ax)
+        shown = sorted(self.hypotheses, key=lambda item: -item.probability)[:_PLOTTED]
+        axes.barh(range(len(shown)), [item.probability for item in shown], color="#1f5fa8")
+        axes.set_yticks(range(len(shown)), [" + ".join(item.effects) or "no gap" for item in shown])
+        axes.invert_yaxis()
+        axes.set(xlabel="probability", xlim=(0, 1))
+        return axes
 
     def _table(self) -> Table:
         rows = [
@@ -161,12 +174,6 @@ def _diagnosis_from_fields(values: dict[str, Any]) -> Diagnosis:
     return Diagnosis(**values)
 
 
-def plot_gap(diagnosis: Diagnosis, *, ax: Any) -> Any:
-    """See `Diagnosis.plot_gap`."""
-    gap = diagnosis.gap
-    return plot_gap_rows([("all", gap.before, gap.after, gap.floor), *diagnosis.held_out], ax=ax)
-
-
 def plot_gap_rows(rows: Sequence[tuple[str, float, float, float]], *, ax: Any) -> Any:
     """The gap before and after with its floor, a bar each, from rows of (name, before, after, floor); returns the axes."""
     for place, (_, before, after, floor) in enumerate(rows):
@@ -178,16 +185,6 @@ def plot_gap_rows(rows: Sequence[tuple[str, float, float, float]], *, ax: Any) -
     ax.invert_yaxis()
     ax.set_xlabel("gap on held-out probes (1 = nothing but noise)")
     ax.legend(frameon=False)
-    return ax
-
-
-def plot_probabilities(diagnosis: Diagnosis, *, ax: Any, most: int = 12) -> Any:
-    """See `Diagnosis.plot`."""
-    shown = sorted(diagnosis.hypotheses, key=lambda item: -item.probability)[:most]
-    ax.barh(range(len(shown)), [item.probability for item in shown], color="#1f5fa8")
-    ax.set_yticks(range(len(shown)), [" + ".join(item.effects) or "no gap" for item in shown])
-    ax.invert_yaxis()
-    ax.set(xlabel="probability", xlim=(0, 1))
     return ax
 
 
@@ -253,12 +250,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
         "format": "raytwin-diagnosis",
         "version": 2,
         "verdict": diagnosis.verdict,
-        "gap": {
-            "before": diagnosis.gap.before,
-            "after": diagnosis.gap.after,
-            "floor": diagnosis.gap.floor,
-            "shrinks_by": interval(diagnosis.gap.shrinks_by),
-        },
+        "gap": asdict(diagnosis.gap) | {"shrinks_by": interval(diagnosis.gap.shrinks_by)},
         "causes": [
             {
                 "effect": cause.effect,
@@ -284,17 +276,7 @@ def diagnosis_answer(diagnosis: Diagnosis, *, inputs: Mapping[str, Any] | None =
         ],
         "probability_no_gap": diagnosis.probability_no_gap,
         "probability_unknown": diagnosis.probability_unknown,
-        "where": [
-            {
-                "axis": place.axis,
-                "series": place.series,
-                "statistic": place.statistic,
-                "z": place.z,
-                "location": place.location,
-                "unit": place.unit,
-            }
-            for place in diagnosis.where
-        ],
+        "where": [asdict(place) for place in diagnosis.where],
         "ambiguous_with": [list(pair) for pair in diagnosis.ambiguous_with],
         "next_measurement": diagnosis.next_measurement,
         "held_out": [

@@ -205,14 +205,14 @@ def _shapes(size: tuple[int, ...]) -> tuple[NDArray[np.float64], ...]:
 
     Standard deviations fall as one over the order.
     """
-    from numpy.polynomial.legendre import legval
+    from numpy.polynomial.legendre import legvander
 
-    y, x = (np.linspace(-1.0, 1.0, length) for length in size)
+    down, across = (legvander(np.linspace(-1.0, 1.0, length), scales.SHAPE_ORDER) for length in size)
     numbers = [(i, k) for i in range(scales.SHAPE_ORDER + 1) for k in range(scales.SHAPE_ORDER + 1 - i) if i or k]
     total = math.sqrt(sum(1.0 / (i + k) ** 2 for i, k in numbers))
     result = []
     for i, k in numbers:
-        shape = np.outer(legval(y, np.eye(i + 1)[i]), legval(x, np.eye(k + 1)[k]))
+        shape: NDArray[np.float64] = np.outer(down[:, i], across[:, k])
         result.append(scales.SHAPE_SD / (i + k) / total / float(np.sqrt(np.mean(shape**2))) * shape)
     return tuple(result)
 

@@ -162,9 +162,9 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         if diagnosis.next_measurement:
             text += f" To tell them apart: {diagnosis.next_measurement['text']}."
         return text
-    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
     named = "; ".join(
-        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}" for cause in leading
+        f"{title_of(cause.effect)}, {strength_text(cause)}, probability {cause.probability:.2f}"
+        for cause in diagnosis.leading
     )
     text = f"{where} It is explained by: {named}. {figures}"
     if gap.shrinks_by is not None:
@@ -179,7 +179,7 @@ def rest_text(diagnosis: Diagnosis) -> str:
     """By how much laws of what is named are off here, and where they leave most; empty where they fit."""
     if diagnosis.verdict != "explained_in_part":
         return ""
-    leading = [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
+    leading = diagnosis.leading
     off = [f"{title_of(cause.effect)} by some {100.0 * cause.level:.0f} %" for cause in leading if cause.level > 0.0]
     told = f"; these laws seem to be off here: {', '.join(off)}" if off else ""
     left = leading[0].left if leading else ()

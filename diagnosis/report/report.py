@@ -110,9 +110,7 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "ambiguous":
         names = [title_of(cause.effect) for cause in diagnosis.causes[:3]]
         return _sentence(f"{' or '.join(names)}: these data cannot distinguish them")
-    named = _sentence(
-        " and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in _leading(diagnosis))
-    )
+    named = _sentence(" and ".join(f"{title_of(cause.effect)}, {strength_text(cause)}" for cause in diagnosis.leading))
     return f"{named}: its law leaves a rest" if diagnosis.verdict == "explained_in_part" else named
 
 
@@ -174,7 +172,7 @@ def next_steps(diagnosis: Diagnosis) -> list[dict[str, str]]:
         "Use the improved twin that lies beside this page; every command takes it.",
         "raytwin predict twin.h5 --kv 60 --power-w 40 --exposure-ms 20",
     )
-    return [*([use] if diagnosis.added else []), *measured, *_confirmed_by(_leading(diagnosis))]
+    return [*([use] if diagnosis.added else []), *measured, *_confirmed_by(diagnosis.leading)]
 
 
 def _confirmed_by(causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, str]]:
@@ -186,15 +184,11 @@ def _confirmed_by(causes: "list[Cause] | tuple[Cause, ...]") -> list[dict[str, s
     ]
 
 
-def _leading(diagnosis: Diagnosis) -> list[Cause]:
-    return [cause for cause in diagnosis.causes if cause.effect in diagnosis.named]
-
-
 def _key_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
     gap = diagnosis.gap
     found = [
         {"value": f"{cause.probability:.2f}", "text": f"probability of {title_of(cause.effect).lower()}"}
-        for cause in _leading(diagnosis)
+        for cause in diagnosis.leading
     ]
     if diagnosis.mislabelled:
         found = []

@@ -228,21 +228,22 @@ def _tiff_pages(path: Path) -> Iterator[NDArray[Any]]:
             if not file.series:
                 raise ValueError("no image in it")
             series = file.series[0]
-            if series.ndim > 2 and len(series.pages) == series.shape[0]:
+            colour = (
+                "S" in series.axes
+            )  # samples of one pixel: "YXS", or "SYX" where colours stand in planes of their own
+            if not colour and series.ndim > 2 and len(series.pages) == series.shape[0]:
                 pages: Iterator[Any] = (page.asarray() for page in series.pages)
             else:
                 whole = np.asarray(series.asarray())
-                pages = iter([whole] if whole.ndim == 2 or _is_colour(whole) else whole)
+                if colour:
+                    whole = np.moveaxis(whole, series.axes.index("S"), -1)
+                pages = iter([whole] if whole.ndim == 2 + colour else whole)
             for page in pages:
                 yield one_channel(path, np.asarray(page))
     except (InputError, GeneratorExit):
         raise
     except Exception as error:  # tifffile raises struct, value, index and codec errors at damaged files
         raise damaged(path, error) from None
-
-
-def _is_colour(values: NDArray[Any]) -> bool:
-    return values.ndim == 3 and values.shape[-1] in (3, 4) and values.dtype == np.uint8
 
 
 def _raw_images(path: Path, raw: RawLayout | None) -> Iterator[NDArray[Any]]:

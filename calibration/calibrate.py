@@ -26,7 +26,7 @@ from .next_measurement import advice, voltages_within_reach
 from .output_table import OutputTable
 from .photon_transfer import PhotonTransfer, compute_photon_transfer
 from .priors import PRIORS
-from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for
+from .spectral_fit import SpectralFit, Transmission, contradicts, fit_evidence, fit_spectrum, model_for, unlike_output
 from .transmission_table import TransmissionTable
 from .tube import DoseData, dose_data, fit_without_strays, table_evidence
 from .wedges import measure_transmissions, wedge_evidence
@@ -131,6 +131,7 @@ def calibrate_twin(
                 )
             evidence["spectrum"] = fit_evidence(fit)
             evidence |= table_evidence(spectral, doses, output=output_table, transmission=transmission_table)
+            warnings += unlike_output(fit)
             if contradicts(fit):
                 warnings.append(
                     f"levels and gains do not fit the spectral model (chi-square {fit.chi_square:.0f} for {fit.data}"

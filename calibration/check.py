@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas
 
 _JUMP = 0.03  # of the signal from one frame to the next: the largest plausible rms of a tube's output
-_EVEN = 3e-3  # pixels of X-ray panels and cameras respond less alike than this (rms) before correction: 0.5 % and more
+_EVEN = 3e-3  # pixels of raw flats respond less alike than this (rms): panels by 0.5 % and more, a CCD under even light by 0.43 %
 _HOW = {
     SceneChange.STRUCTURE: "edges have moved in {share:.0f} % of the field",
     SceneChange.SHAPE: "the shape of the field changes by {shape:.0f} %",
@@ -479,9 +479,9 @@ def _series_findings(scan: SeriesScan, acquisition: AcquisitionFile, dark_DN: fl
             add(FindingCode.LEVEL_JUMP, frame=jump[0], percent=100.0 * jump[1])
     raw = not item.corrected & {"gain", "log"} and not any(one.code is FindingCode.SATURATED for one in found)
     if item.kind == "flat" and raw and item.n_frames > 1:
-        pattern = frame_signs.fixed_pattern(scan.mean_DN - offset_DN, scan.differences, item.n_frames)
-        if pattern.at_most < _EVEN:
-            add(FindingCode.FLAT_CORRECTED, percent=100.0 * pattern.at_most)
+        uneven = frame_signs.most_uneven(scan.mean_DN - offset_DN, scan.differences, item.n_frames)
+        if uneven < _EVEN:
+            add(FindingCode.FLAT_CORRECTED, percent=100.0 * uneven)
     return found
 
 

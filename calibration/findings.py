@@ -96,7 +96,7 @@ _ENTRIES: dict[FindingCode, _Entry] = {
     FindingCode.CONSTANT: _Entry(Severity.ERROR, "every value is {value:g} DN: no picture was taken"),
     FindingCode.SATURATED: _Entry(
         Severity.ERROR,
-        "{percent:.2g} % of the values stand at {top:g} DN: saturated; lower the current or the exposure",
+        "{percent:.3g} % of the values stand at {top:g} DN: saturated; lower the current or the exposure",
     ),
     FindingCode.CLIPPED: _Entry(
         Severity.WARNING,

@@ -4,7 +4,6 @@ Each function states the law that raw frames follow and returns what departs fro
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -238,16 +237,11 @@ def swapped_rows(pattern: NDArray[np.float32], reference: NDArray[np.float32]) -
     return None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FixedPattern:
-    """Pixel-to-pixel response of a flat, rms relative to the signal, and the most that it can be."""
+def most_uneven(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.float64], frames: int) -> float:
+    """The most by which pixels of a flat can differ in their response: rms over the signal, of neighbours or over the field.
 
-    relative: float
-    at_most: float
-
-
-def fixed_pattern(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.float64], frames: int) -> FixedPattern:
-    """Spread of neighbouring pixels' response in a mean flat, freed of the temporal noise that is left in the mean.
+    Gain maps take away the pattern of pixels, and what is uneven over the field with it. Temporal noise that is left in the mean is
+    not counted. inf: without light or differences.
 
     Args:
         mean_signal_DN: mean of `frames` frames less the dark (row, column).
@@ -256,16 +250,18 @@ def fixed_pattern(mean_signal_DN: NDArray[np.float64], differences: NDArray[np.f
     """
     level = float(np.median(mean_signal_DN))
     if not level > 0 or not differences.size:
-        return FixedPattern(relative=math.nan, at_most=math.inf)
+        return math.inf
+
+    def variance(values: NDArray[np.float64]) -> float:
+        return (1.4826 * float(np.median(np.abs(values - np.median(values))))) ** 2
 
     def steps(values: NDArray[np.float64]) -> float:
-        found = np.diff(values, axis=-1)
-        return (1.4826 * float(np.median(np.abs(found - np.median(found))))) ** 2 / 2.0
+        return variance(np.diff(values, axis=-1)) / 2.0
 
-    temporal = steps(differences) / 2.0 / frames
-    both = steps(mean_signal_DN)
-    pixels = mean_signal_DN.size
     # error of a robust variance (efficiency 0.37); steps share pixels
-    error = both * math.sqrt(2.0 / 0.37 * 2.0 / pixels)
-    excess = max(both - temporal, 0.0)
-    return FixedPattern(relative=math.sqrt(excess) / level, at_most=math.sqrt(excess + 5.0 * error) / level)
+    error = math.sqrt(2.0 / 0.37 * 2.0 / mean_signal_DN.size)
+    most = max(
+        max(of(mean_signal_DN) - of(differences) / 2.0 / frames, 0.0) + 5.0 * error * of(mean_signal_DN)
+        for of in (steps, variance)
+    )
+    return math.sqrt(most) / level

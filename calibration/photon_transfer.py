@@ -24,6 +24,7 @@ from .frame_checks import repeated_frame_indices, same_scene
 from .frame_sums import sum_frames
 from .full_scale import full_scale_reached, reaches, top_of_range
 from .noise_of_flats import PIECE_BYTES, FlatNoise, FlatPair, fit_flat_noise, pairs_of_singles
+from .noise_power import SMALLEST_SQUARE_PX
 from .repeated_frames import (
     OPEN,
     Beam,
@@ -174,6 +175,14 @@ def _calibrating_series(acquisition: AcquisitionFile, tell: Progress) -> _Sessio
     shapes = {item.shape for item in [*flats, *darks]}
     if len(shapes) > 1:
         raise InputError(of, received=f"frames of shapes {sorted(shapes)}", expected="darks and flats of one shape")
+    rows, columns = next(iter(shapes))
+    if min(rows, columns) < SMALLEST_SQUARE_PX:
+        raise InputError(
+            of,
+            received=f"frames of {rows} x {columns} pixels",
+            expected=f"{SMALLEST_SQUARE_PX} x {SMALLEST_SQUARE_PX} pixels or more",
+            remedy="check that the files are no colour pictures and that rows and columns of raw files are as stated",
+        )
     tell("copies of frames")
     warnings: list[str] = []
     flats, darks = _without_copies(flats, warnings), _without_copies(darks, warnings)

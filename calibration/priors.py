@@ -223,6 +223,11 @@ MEASURED_SPECTRUM: dict[str, Prior] = {
     "kV_variance": Prior(centre=0.0, sd=1e-4, reason="in the measured spectrum: what differs between voltages stays"),
 }
 FREE_OUTPUT = Prior(centre=0.0, sd=3.0, reason="distance or pixel pitch not declared: no absolute output")
+UNLIKE_OUTPUT = Prior(
+    centre=0.0,
+    sd=20.0,
+    reason="far from the model's: loads, distance or pixel pitch are not as labelled, by nobody knows how much",
+)
 UNDECLARED_SCINTILLATOR = Prior(
     centre=-0.1, sd=0.5, low=-1.6, high=1.6, reason="scintillator not declared: CsI 0.5 mm or Gd2O2S 0.15 mm assumed"
 )

@@ -57,6 +57,7 @@ from .priors import (
     SHARES_CORRELATION,
     TABLE_SHARE,
     UNDECLARED_SCINTILLATOR,
+    UNLIKE_OUTPUT,
     Prior,
     ripple_from_latent,
     spread_of,
@@ -96,7 +97,8 @@ OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 class SpectralFit:
     """Posterior and how well it was drawn: effective sample size of the last round, chi-square at the best point.
 
-    discrepancy: median and 95 % interval of the learned relative sd of a level and of a gain beyond the parameters.
+    discrepancy: median and 95 % interval of the learned relative sd of a level and of a gain beyond the parameters. output: the
+    tube's over the model's, where it is so far from 1 that labels must be wrong and nothing else was learnt from it; None elsewhere.
     """
 
     posterior: SpectralPosterior
@@ -104,11 +106,22 @@ class SpectralFit:
     chi_square: float
     data: int
     discrepancy: Mapping[str, tuple[float, float, float]]
+    output: float | None = None
 
 
 def contradicts(fit: SpectralFit) -> bool:
     """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
     return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
+
+
+def unlike_output(fit: SpectralFit) -> list[str]:
+    """A warning where the tube's output cannot be what the labels say; else none."""
+    if fit.output is None:
+        return []
+    return [
+        f"output is {fit.output:.3g} times what a tube gives at the stated loads, distances and pixel pitch: check their values and"
+        " units (ms, mA, mm, uGy); the spectrum was found without it"
+    ]
 
 
 def fit_evidence(fit: SpectralFit) -> dict[str, Any]:
@@ -160,6 +173,11 @@ _DISCREPANCIES = {
     "kerma": KERMA_DISCREPANCY,
     "ratio": RATIO_DISCREPANCY,
 }
+_OUTPUT = "log_output"
+# standard deviations of the prior from which on the output is looked at, and of prior and data from which on it is not believed:
+# Gaussian, 3 in 1000 lines with right labels have it
+_OUTPUT_LOOKED_AT, _UNLIKE = 2.0, 3.0
+_Sampled = tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.float64]], float]
 _OF_DETECTOR = ("rate", "gain", "transmission", "signal_ratio")
 
 
@@ -359,8 +377,21 @@ def fit_spectrum(
     beams: dict[OpenBeam, int] = {}
     data = [*_data(known, transmissions, instrument, noise, beams), *_dose_data(kermas, ratios, beams)]
     fixed = {"level": level_discrepancy, "gain": gain_discrepancy}
-    posterior = _Posterior(model, priors, tuple(beams), data, fixed, _repeated_levels(repeats))
-    best, samples, discrepancies, effective = posterior.sample(rng)
+
+    def sampled(with_priors: dict[str, Prior]) -> tuple[_Posterior, _Sampled]:
+        posterior = _Posterior(model, with_priors, tuple(beams), data, fixed, _repeated_levels(repeats))
+        return posterior, posterior.sample(rng)
+
+    posterior, (best, samples, discrepancies, effective) = sampled(priors)
+    output = None
+    place, believed = model.names.index(_OUTPUT), priors[_OUTPUT]
+    if believed is PRIORS[_OUTPUT] and abs(best[place]) > _OUTPUT_LOOKED_AT * believed.sd:
+        # believed, a slip of units would be made up for by the spectrum
+        other, found = sampled(priors | {_OUTPUT: UNLIKE_OUTPUT})
+        logarithm = found[1][:, place]
+        if abs(float(np.mean(logarithm))) > _UNLIKE * math.hypot(float(np.std(logarithm)), believed.sd):
+            posterior, (best, samples, discrepancies, effective) = other, found
+            output, priors = math.exp(float(np.median(logarithm))), priors | {_OUTPUT: UNLIKE_OUTPUT}
     names = model.names
     voltages = [level.kV or 0.0 for level in known] or [kV for kV, _ in read]
     measured = [level.filters for level in known] or [filters for _, filters in read]
@@ -394,6 +425,7 @@ def fit_spectrum(
             name: tuple(float(value) for value in np.quantile(draws, [0.5, 0.025, 0.975]))  # type: ignore[misc]
             for name, draws in discrepancies.items()
         },
+        output=output,
     )
 
 

@@ -17,7 +17,7 @@ from ..generator.line.twin_spectrum import model_of_posterior
 from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
 from .dose_data import DOSIMETER_CALIBRATION, DOSIMETER_HARDNESS, KermaRatio, KermaReading
 from .output_table import OutputTable
-from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum
+from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output
 from .transmission_table import TransmissionTable
 
 # A setting is left out where its departure from all the others happens to one table in a thousand. Its standard deviation is
@@ -29,6 +29,7 @@ _EFFICIENCY = 0.37
 _LEAST_TO_JUDGE = 4
 _MOST_STRAYS = 5  # one in so many: beyond, the table is not mostly right
 _RARE = 0.05
+_TRIED = 4  # without each of which the others are fitted: one that is far off bends the fit, and another departs more from it
 _OF_TUBE = ("inherent_filtration_mm_Al", "kV_error", "log_output", "log_mu_")
 
 
@@ -101,6 +102,7 @@ def calibrate_tube(
     evidence = {"spectrum": fit_evidence(found)} | table_evidence(
         posterior, kept, output=output, transmission=transmission
     )
+    warnings += unlike_output(found)
     if contradicts(found):
         warnings.append(
             f"the tables do not fit any spectrum of this tube (chi-square {found.chi_square:.0f} for {found.data} data):"
@@ -135,15 +137,12 @@ def fit_without_strays(
     found, kept = fit(data), data
     warnings = list(data.notes)
     for _ in range(len(data.kermas) // _MOST_STRAYS + len(data.ratios) // _MOST_STRAYS):
-        suspect = _suspect(found.posterior, kept)
-        if suspect is None:
-            break
         # what is wrong pulls the fit towards itself, and is judged by a fit that has not seen it
-        others = DoseData(
-            kermas=tuple(item for item in kept.kermas if item is not suspect),
-            ratios=tuple(item for item in kept.ratios if item is not suspect),
-        )
-        refit = fit(others)
+        refits = [(item, _without(kept, item)) for item in _suspects(found, kept)]
+        if not refits:
+            break
+        tried = [(fit(others), others, item) for item, others in refits]
+        refit, others, suspect = min(tried, key=lambda one: one[0].chi_square)
         departure = _stray(refit.posterior, others, suspect)
         if departure is None:
             break
@@ -236,21 +235,30 @@ def departures(
     return np.array(read), np.array(behind)
 
 
-def _suspect(posterior: SpectralPosterior, data: DoseData) -> KermaReading | KermaRatio | None:
-    """The datum that departs most from a fit of all, if so much is rare among so many Gaussian ones, or None."""
+def _suspects(fit: SpectralFit, data: DoseData) -> list[KermaReading | KermaRatio]:
+    """Data that depart from a fit of all by what is rare among so many Gaussian ones, the farthest first, `_TRIED` at most.
+
+    All of the farthest, where they contradict the fit: a few that it bends to scatter as widely as the one that bends it.
+    """
     from scipy.special import ndtri
 
-    worst: tuple[float, KermaReading | KermaRatio | None] = (0.0, None)
+    limit = 0.0 if contradicts(fit) else 1.0
+    found: list[tuple[float, KermaReading | KermaRatio]] = []
     kinds: tuple[Sequence[KermaReading | KermaRatio], ...] = (data.kermas, data.ratios)
-    for items, departure in zip(kinds, departures(posterior, data.kermas, data.ratios), strict=True):
+    for items, departure in zip(kinds, departures(fit.posterior, data.kermas, data.ratios), strict=True):
         if len(items) <= _LEAST_TO_JUDGE:
             continue
         own = np.array([item.relative_sd for item in items])
         size = np.abs(departure) / np.hypot(_scatter(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
-        place = int(np.argmax(size))
-        if size[place] > max(1.0, worst[0]):
-            worst = (float(size[place]), items[place])
-    return worst[1]
+        found += [(float(one), item) for one, item in zip(size, items, strict=True) if one > limit]
+    return [item for _, item in sorted(found, key=lambda one: -one[0])[:_TRIED]]
+
+
+def _without(data: DoseData, left_out: KermaReading | KermaRatio) -> DoseData:
+    return DoseData(
+        kermas=tuple(item for item in data.kermas if item is not left_out),
+        ratios=tuple(item for item in data.ratios if item is not left_out),
+    )
 
 
 def _stray(posterior: SpectralPosterior, others: DoseData, suspect: KermaReading | KermaRatio) -> float | None:

@@ -1,6 +1,7 @@
 """`raytwin check`: what is broken is told in one line of the right series; what is good is not suspected; damage is told."""
 
 import json
+import math
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -168,3 +169,15 @@ def test_code_steps_averages_zeros_and_tops_are_read_off_the_numbers():
     assert frame_signs.share_at_zero(whole) is None
     assert frame_signs.pile_up_at_top(np.minimum(whole, 1030.0)) == pytest.approx((1030.0, 0.16), abs=0.02)
     assert frame_signs.pile_up_at_top(whole) is None
+
+
+@pytest.mark.parametrize(("pixels", "field", "raw"), [(0.0, 0.0, False), (0.006, 0.0, True), (0.001, 0.005, True)])
+def test_frames_are_even_where_neither_pixels_nor_the_field_differ(pixels, field, raw):
+    """A CCD's pixels respond alike to a tenth of a per cent, and even light is not that even."""
+    rng = np.random.default_rng(2)
+    shape, frames = (80, 100), 8
+    response = 1.0 + pixels * rng.standard_normal(shape) + field * np.linspace(-1.7, 1.7, shape[1])
+    taken = 2000.0 * response + 10.0 * rng.standard_normal((frames, *shape))
+    found = frame_signs.most_uneven(taken.mean(axis=0), np.diff(taken, axis=0), frames)
+    assert found > math.hypot(pixels, field) * 0.9
+    assert (found > 0.003) == raw

@@ -239,6 +239,33 @@ def test_one_wrong_row_among_many_is_named_and_left_out(tmp_path):
     assert twin.spectral.interval("inherent_filtration_mm_Al").high < 4.0
 
 
+def test_a_reading_a_thousand_times_too_large_does_not_bend_the_fit_towards_itself(tmp_path):
+    """Another reading departs farther from the fit of all."""
+    rows = dose_rows(SETTINGS)
+    rows[0] = (*rows[0][:4], f"{1000.0 * float(rows[0][4]):.6g}", 1)
+    twin = calibrate_tube(
+        rng=np.random.default_rng(1), output=read_output_table(written(tmp_path / "doses.csv", HEADER, rows))
+    )
+    (told,) = [text for text in twin.warnings if "left out" in text]
+    assert told.startswith("line 2 (40 kV)")
+    filtration = twin.spectral.interval("inherent_filtration_mm_Al")
+    assert filtration.low <= FILTRATION_MM_AL <= filtration.high
+
+
+def test_a_slip_of_units_in_a_dose_table_is_named_and_bends_no_filtration(tube, tmp_path):
+    """Kerma in mGy: a common factor, which says nothing of the spectrum."""
+    rows = [(*row[:4], f"{0.001 * float(row[4]):.6g}", 1) for row in dose_rows(SETTINGS)]
+    twin = calibrate_tube(
+        rng=np.random.default_rng(1), output=read_output_table(written(tmp_path / "doses.csv", HEADER, rows))
+    )
+    (told,) = [text for text in twin.warnings if text.startswith("output is")]
+    assert float(told.split()[2]) == pytest.approx(0.001 * OUTPUT, rel=0.2)
+    assert not any(text.startswith("output is") for text in tube.warnings)
+    found, right = (one.spectral.interval("inherent_filtration_mm_Al") for one in (twin, tube))
+    assert found.value == pytest.approx(right.value, abs=0.15)
+    assert found.low <= FILTRATION_MM_AL <= found.high
+
+
 def test_a_tube_twin_reads_back_and_is_no_whole_twin(tube, tmp_path):
     path = tmp_path / "tube.h5"
     write_twin(path, tube)

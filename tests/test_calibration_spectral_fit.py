@@ -1,6 +1,7 @@
 """The spectral posterior: derivatives, intervals that hold for lines drawn from the priors, tables, wedges, spectra."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,6 +194,23 @@ def test_draws_meet_the_levels_where_the_model_bends(model, escape):
         exact = float(np.log(model.signal(truth[None, :], beam).rate_DN_per_mAs[0]))
         assert abs(float(np.mean(draws)) - exact) < 3e-4
         assert np.std(draws) == pytest.approx(0.001, rel=0.15)  # the sampling noise that the levels state
+
+
+@pytest.mark.parametrize("factor", [1e-6, 0.25, 1000.0])
+def test_labels_of_another_unit_are_named_and_bend_no_filtration(model, factor):
+    """Exposures in s for ms, a pitch in um for mm, a current four times too high: the output cannot be the tube's."""
+    full = typical(model, inherent_filtration_mm_Al=1.6)
+    levels = levels_of(model, full, BEAMS)
+    slipped = [
+        replace(one, rate_DN_per_mAs=estimate_from_sd(factor * one.rate_DN_per_mAs.value, 0.001 * factor))
+        for one in levels
+    ]
+    right, wrong = (fit_spectrum(one, INSTRUMENT, rng=np.random.default_rng(3)) for one in (levels, slipped))
+    assert right.output is None
+    assert wrong.output == pytest.approx(factor, rel=0.3)
+    filtration = wrong.posterior.interval("inherent_filtration_mm_Al")
+    assert filtration.low <= 1.6 <= filtration.high
+    assert filtration.value == pytest.approx(right.posterior.interval("inherent_filtration_mm_Al").value, abs=0.4)
 
 
 def test_more_levels_narrow_the_prediction(model):

@@ -156,6 +156,27 @@ def test_raw_files_are_read_by_their_layout(tmp_path):
         import_images(root, tmp_path / "o.h5")
 
 
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+def test_a_colour_tiff_of_sixteen_bits_is_one_image(tmp_path, planes):
+    """Not a stack of as many images as it has rows."""
+    root = tmp_path / "tiff"
+    root.mkdir()
+    grey = image(6)
+
+    def write(colours):
+        values = np.stack(colours, axis=-1 if planes == "contig" else 0)
+        tifffile.imwrite(root / "a.tif", values, photometric="rgb", planarconfig=planes)
+
+    write([grey] * 3)
+    (root / "raytwin.toml").write_text("[[series]]\nkind='flat'\nfiles='*.tif'\n")
+    import_images(root, tmp_path / "o.h5")
+    with open_acquisition(tmp_path / "o.h5") as acquisition:
+        np.testing.assert_array_equal(acquisition.series[0].read_frames(), [grey])
+    write([grey, grey, grey + 1])
+    with pytest.raises(InputError, match=r"a.tif: got an image of shape \(.*3\); expected one grey value a pixel"):
+        import_images(root, tmp_path / "o.h5")
+
+
 def test_eight_bit_grey_and_grey_stored_as_colour_are_grey(tmp_path):
     root = tmp_path / "png"
     root.mkdir()

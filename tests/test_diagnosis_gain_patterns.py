@@ -19,14 +19,10 @@ GOOD = np.ones(SHAPE, dtype=bool)
 SIGNAL = np.full(SHAPE, 1000.0)
 
 
-def of_pattern(pattern):
-    return np.array([pattern.pixel_DN2, pattern.blocks_DN2, pattern.rows_DN2, pattern.columns_DN2])
-
-
 def mean_of_drawn(factor_of_seed, count=300):
     """Mean statistics of so many panels with a pattern of 1 % rms."""
     found = [
-        of_pattern(pattern_statistics(SIGNAL * (factor_of_seed(seed) - 1.0), SIGNAL, clean=GOOD, good=GOOD))
+        pattern_statistics(SIGNAL * (factor_of_seed(seed) - 1.0), SIGNAL, clean=GOOD, good=GOOD)
         for seed in range(count)
     ]
     return np.mean(found, axis=0)
@@ -37,7 +33,7 @@ def test_what_tiles_leave_in_a_pattern_is_the_mean_over_panels_with_drawn_gains(
     def tiles(seed):
         return TilePattern(rms=0.01, side_px=side_px, strips_share=strips_share, seed=seed)
 
-    known = of_pattern(shares_of_tiles(SHAPE, tiles(0)).times(10.0**2))
+    known = 10.0**2 * shares_of_tiles(SHAPE, tiles(0))
     # the smooth surface that is taken off first leaves a little of itself between the blocks
     np.testing.assert_allclose(mean_of_drawn(lambda seed: tile_gain(tiles(seed), SHAPE)), known, rtol=0.08, atol=1e-3)
 
@@ -47,7 +43,7 @@ def test_what_pixels_that_are_alike_leave_is_the_mean_over_panels_with_drawn_gai
     def drawn(seed):
         return gain_pattern(FixedPattern(rms=0.01, seed=seed, correlation_px=correlation_px), SHAPE)
 
-    known = of_pattern(shares_of_pixels(SHAPE, correlation_px).times(10.0**2))
+    known = 10.0**2 * shares_of_pixels(SHAPE, correlation_px)
     np.testing.assert_allclose(mean_of_drawn(drawn), known, rtol=0.12, atol=2e-3)
     panels = np.stack([drawn(seed) for seed in range(60)]) - 1.0
     assert panels.std() == pytest.approx(0.01, rel=0.03)

@@ -54,7 +54,7 @@ def test_variances_of_pixels_lines_blocks_and_frames_are_those_of_drawn_frames(c
         found.pixel(1): np.mean(frames[:, labels == 1] ** 2),
         found.together(0, 1): np.mean(frames[:, :, 1:] * frames[:, :, :-1]),
         found.together(1, 0): np.mean(frames[:, 1:] * frames[:, :-1]),
-        found.block(8): np.mean(blocks**2),
+        found.frame(8, 8): np.mean(blocks**2),
         found.frame(*SHAPE): np.mean(frames.mean(axis=(1, 2)) ** 2),
     }
     for known, value in seen.items():
@@ -88,9 +88,7 @@ def test_a_fixed_pattern_shows_the_lines_of_its_few_frames(column_share, togethe
         flicker=LineFlicker(rms=rms, column_share=column_share, together_lines=together_lines),
     )
     wanted = line_pattern(expected, level_DN**2)
-    for name in ("pixel_DN2", "blocks_DN2", "rows_DN2", "columns_DN2"):
-        mean = np.mean([getattr(one, name) for one in seen])
-        assert mean == pytest.approx(getattr(wanted, name), rel=0.1, abs=1e-6 * level_DN), name
+    np.testing.assert_allclose(np.mean(seen, axis=0), wanted, rtol=0.1, atol=1e-6 * level_DN)
 
 
 def test_without_light_or_flicker_only_offsets_are_left():
@@ -101,12 +99,12 @@ def test_without_light_or_flicker_only_offsets_are_left():
         flicker=None,
         signal_DN=np.zeros((1, 1)),
     )
-    found = LineNoise.of(expected, None)
+    found = LineNoise.of(expected, SimpleNamespace(areas=SimpleNamespace(parts=range(4))))
     assert (found.pixel(), found.pixel(3), found.rows(), found.columns()) == (5.0, 5.0, 4.0, 1.0)
     assert [found.together(0, 1), found.together(2, 0), found.together(1, 1)] == pytest.approx(
         [4.0, 1.0, 0.0], abs=1e-3
     )
-    assert found.block(8) == pytest.approx(5.0 / 8.0, rel=1e-3)
+    assert found.frame(8, 8) == pytest.approx(5.0 / 8.0, rel=1e-3)
     assert found.frame(10, 20) == pytest.approx(0.4 + 0.05, rel=1e-3)
 
 

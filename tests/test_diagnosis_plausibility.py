@@ -9,6 +9,7 @@ import pytest
 
 from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
+from raytwin.diagnosis.checks.beam_suspects import lit_darks
 from raytwin.diagnosis.checks.label_suspects import LEAST_EVIDENCE
 from raytwin.diagnosis.checks.map_suspects import _inherent_mm_Al, _scaled
 from raytwin.diagnosis.checks.plausibility import check_plausibility
@@ -108,6 +109,24 @@ def test_right_labels_raise_no_doubt(session):
     found = found_in(session)
     assert found.suspects == ()
     assert found.unusable == {}
+
+
+@pytest.mark.parametrize(
+    ("bits", "excess_DN", "found"), [(8, 60, 1), (8, 10, 0), (10, 60, 1), (14, 60, 0), (None, 60, 0)]
+)
+def test_a_lit_dark_lies_above_the_others_by_a_share_of_a_small_range_and_by_more_than_a_large_one_drifts(
+    bits, excess_DN, found
+):
+    def reading(name, kind, level_DN, index):
+        return SimpleNamespace(
+            name=name, mean_DN=np.full((4, 4), level_DN), series=SimpleNamespace(kind=kind, index=index)
+        )
+
+    darks = [reading(f"dark{number}", "dark", 20.0, number) for number in range(3)]
+    darks.append(reading("lit", "dark", 20.0 + excess_DN, 3))
+    flats = [reading("flat", "flat", 150.0, 4)]
+    suspects = lit_darks(darks, flats, np.ones((4, 4), bool), bits=bits)
+    assert [one.series for one in suspects] == [("lit",)] * found
 
 
 @pytest.mark.slow

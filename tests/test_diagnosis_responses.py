@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,10 +58,10 @@ def twin(dark_DN=7.0):
     return SimpleNamespace(maps=maps, levels=())
 
 
-def maps_of(kept, means_DN, expected, copies=0):
-    """Dark and gain map; copies: frames of each series that are copies of others."""
+def maps_of(kept, means_DN, expected, copies=MappingProxyType({})):
+    """Dark and gain map; copies: frames of a series that are copies of others, by name."""
     looks = {
-        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames - copies)
+        item.name: SimpleNamespace(mean_DN=means_DN[item.name], frames=item.series.n_frames - copies.get(item.name, 0))
         for item in kept
         if item.name in means_DN
     }
@@ -140,6 +140,11 @@ def test_darks_of_the_same_exposure_average_and_their_noise_falls_with_the_frame
     maps = maps_of([*darks, scene], means, {item.name: expectation(0.0, white_DN2=4.0) for item in darks})
     np.testing.assert_allclose(maps.darks.under(scene), 103.0)
     assert maps.dark_noise(scene, np.array(1000.0)) == pytest.approx(4.0 / 40)
+    copied = maps_of(
+        [*darks, scene], means, {item.name: expectation(0.0, white_DN2=4.0) for item in darks}, copies={"many": 20}
+    )
+    np.testing.assert_allclose(copied.darks.under(scene), 102.0)
+    assert copied.dark_noise(scene, np.array(1000.0)) == pytest.approx(4.0 / 20)
 
 
 def test_without_calibrating_series_dark_and_gain_are_the_twins_and_corrected_series_stay():
@@ -169,8 +174,11 @@ def test_the_gain_map_weighs_flats_by_signal_to_noise_and_shows_what_the_model_d
     # as of one flat of all the quanta: 20 frames of 4000
     assert maps.gain_quantum == pytest.approx(1.0 / (20 * 4000.0))
     assert maps.gain_white == 0.0
-    # a fifth of them copies: as many quanta fewer
-    assert maps_of([dark, *flats], means, expected, copies=4).gain_quantum == pytest.approx(1.0 / (16 * 4000.0))
+    # copies bring no quanta: of one flat of those that are left
+    fewer = maps_of([dark, *flats], means, expected, copies={"weak": 4, "strong": 12})
+    quanta = {"weak": 16 * 1000.0, "strong": 8 * 3000.0}
+    assert fewer.gain_quantum == pytest.approx(1.0 / sum(quanta.values()))
+    assert fewer.shares == pytest.approx({name: one / sum(quanta.values()) for name, one in quanta.items()})
     assert [tuple(place) for place in np.argwhere(~maps.good)] == [(3, 4)]
 
 

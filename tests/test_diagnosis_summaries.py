@@ -12,7 +12,6 @@ from raytwin.diagnosis.model.changes import variants_of
 from raytwin.diagnosis.model.curves import node_weights
 from raytwin.diagnosis.model.defects import memory_of
 from raytwin.diagnosis.model.placing import _smeared
-from raytwin.diagnosis.probes.fixed_pattern import Pattern
 from raytwin.diagnosis.probes.frame_scalars import _log_variance_of_steps, measured_scalars
 from raytwin.diagnosis.probes.lost_bits import rounded_kurtosis
 from raytwin.diagnosis.probes.map_probes import MapProjection, Template
@@ -474,7 +473,7 @@ def fields_of_context(labels, names):
         "previous_signal_DN": None,
         "calibrates": False,
         "codes_usable": False,
-        "pattern_noise": Pattern(pixel_DN2=1.0, blocks_DN2=1.0, rows_DN2=None, columns_DN2=None),
+        "pattern_noise": np.array([1.0, 1.0, np.nan, np.nan]),
         "quantum_DN2": 100.0,
         "dark_DN": 0.0,
         "counts_all_outliers": False,

@@ -11,28 +11,32 @@ from .readings import FRAMES_READ, Reading, Suspect, mean_of
 _NO_BEAM = 0.01  # of the level that a flat should have for its tube load
 _CLEAR_QUANTA = 5.0  # standard deviations of a variance above that of a dark
 _ENERGY_RANGE = 4.0  # times between the signals of quanta of the softest and of a usual beam
-_DARK_EXCESS = 0.05  # of the weakest flat that a dark may lie above the other darks
+_DARK_EXCESS = 0.05  # of the weakest flat, that a dark may lie above the other darks
+# the same whatever the flats: twice the catalogue's largest drift of a dark; of few bits _DARK_EXCESS of the panel's range
+_DRIFTS_DN = 200.0
 _RELEASED = 0.08  # of the exposures before, which an image lag may leave in a dark
 _WEAK = 0.1  # of the flats' usual level, below which a flat's pattern says nothing of a shadow
 _SHADOW_IN_FLAT = 0.35  # spread of the logarithm of a flat against other flats
 
 
-def lit_darks(darks: Sequence[Reading], lit: Sequence[Reading], good: NDArray[np.bool_]) -> list[Suspect]:
-    """Darks that lie far above the darkest one: there was a beam."""
+def lit_darks(
+    darks: Sequence[Reading], lit: Sequence[Reading], good: NDArray[np.bool_], *, bits: int | None
+) -> list[Suspect]:
+    """Darks that lie far above the others: there was a beam. bits: of the ADC; None: unknown, and taken as many."""
     if len(darks) < 2 or not lit:
         return []
-    levels = [float(np.median(item.mean_DN[good])) for item in darks]
-    lowest = min(levels)
-    beams = [float(np.median(item.mean_DN[good])) for item in lit if item.series.kind == "flat" or len(lit) < 3]
+    level_DN = {item.name: float(np.median(item.mean_DN[good])) for item in (*darks, *lit)}
+    lowest = min(level_DN[item.name] for item in darks)
+    beams = [level_DN[item.name] for item in lit if item.series.kind == "flat" or len(lit) < 3]
     # without flats the thinnest object stands for them
-    weakest = min(beams) if beams else max(float(np.median(item.mean_DN[good])) for item in lit)
+    weakest = min(beams) if beams else max(level_DN[item.name] for item in lit)
+    drifts_DN = _DRIFTS_DN if bits is None else min(_DRIFTS_DN, _DARK_EXCESS * 2.0**bits)
     found = []
-    for item, level in zip(darks, levels, strict=True):
-        rest = [one for one, other in zip(levels, darks, strict=True) if other is not item]
-        excess = level - float(np.median(rest))
-        before = [float(np.median(one.mean_DN[good])) for one in lit if one.series.index < item.series.index]
+    for item in darks:
+        excess = level_DN[item.name] - float(np.median([level_DN[one.name] for one in darks if one is not item]))
+        before = [level_DN[one.name] for one in lit if one.series.index < item.series.index]
         released = _RELEASED * max((one - lowest for one in before[-3:]), default=0.0)
-        if excess > max(_DARK_EXCESS * (weakest - lowest), released, 200.0):
+        if excess > max(_DARK_EXCESS * (weakest - lowest), released, drifts_DN):
             found.append(
                 Suspect(
                     series=(item.name,),
@@ -49,10 +53,9 @@ def flats_without_beam(judged: list[Reading], good: NDArray[np.bool_]) -> tuple[
     found, left = [], []
     # per mAs, or per ms: a short exposure is weak by right
     rates = {item.name: item.level_DN / math.exp(item.label.log_load) for item in flats}
-    loads = {item.name: item.label.load is None for item in flats}
     dim = set()
     for item in flats:
-        alike = [rate for name, rate in rates.items() if loads[name] == loads[item.name]]
+        alike = [rates[one.name] for one in flats if (one.label.load is None) == (item.label.load is None)]
         if rates[item.name] <= _NO_BEAM * float(np.median(alike)):
             dim.add(item.name)
     gains = [item.gain_DN for item in flats if item.name not in dim and item.gain_DN > 0]

@@ -18,6 +18,7 @@ Validity: needs several series; a session whose labels are all wrong in the same
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,15 @@ _SUSPECT_Z = 3.5
 _MOST_SUSPECTS = 10
 _PRICE_OF_A_SETTING = 2.0  # natural logarithm, of more than one word being wrong
 _MOST_CHANGES = 4
-_THINGS = ("tube voltage", "filters", "exposure time", "tube load", "setting")
+# what a finding says is wrong, and the fields of a label that hold it
+_THINGS: dict[str, tuple[str, ...]] = {
+    "tube voltage": ("kV",),
+    "filters": ("filters",),
+    "exposure time": ("exposure_ms",),
+    "tube load": ("load",),
+    "setting": ("kV", "load", "exposure_ms", "filters"),
+}
+_Covariance = Callable[[Sequence[int], Sequence[Label]], FloatArray]
 _Candidate = tuple[float, list[Label], tuple[int, ...], str]  # price, labelling, series it changes, in words
 
 
@@ -46,7 +55,7 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
     """Series that fit far better with a label of other series; the likeliest change first, then the next on top of it."""
     features = _features(judged, maps)
     labels = [item.label for item in judged]
-    names = [item.name for item in judged]
+    names, kinds = [item.name for item in judged], [item.series.kind for item in judged]
 
     def evidence(candidate: Sequence[Label]) -> float:
         return sum(feature.log_evidence(candidate) for feature in features)
@@ -61,20 +70,13 @@ def relabelled(judged: Sequence[Reading], maps: LabelModel) -> list[Suspect]:
             for index, z in feature.left_out(labels).items():
                 strange[index] = max(strange.get(index, 0.0), z)
         suspects = sorted((i for i, z in strange.items() if z > _SUSPECT_Z), key=lambda i: -strange[i])[:_MOST_SUSPECTS]
-        best, change, texts = 0.0, list(labels), ""
-        which: tuple[int, ...] = ()
-        kinds = [item.series.kind for item in judged]
-        for price, candidate, members, text in (
-            *_exchanged_groups(labels, names, kinds),
-            *_candidates(suspects, labels, names),
-        ):
-            gained = evidence(candidate) - current - price
-            if gained > best:
-                best, change, texts, which = gained, candidate, text, members
+        candidates = [*_exchanged_groups(labels, names, kinds), *_candidates(suspects, labels, names)]
+        gains = [evidence(candidate) - current - price for price, candidate, _, _ in candidates]
+        best = max(gains, default=0.0)
         if not best > LEAST_EVIDENCE:
             break
-        found.append(Suspect(series=tuple(names[index] for index in which), text=texts, evidence=best))
-        labels = change
+        _, labels, members, text = candidates[gains.index(best)]
+        found.append(Suspect(series=tuple(names[index] for index in members), text=text, evidence=best))
         current = evidence(labels)
     return found
 
@@ -87,7 +89,7 @@ class _Feature:
     values: FloatArray
     own_sd: FloatArray
     expected: Callable[[int, Label], float]
-    covariance: Callable[[Sequence[int], Sequence[Label]], FloatArray]
+    covariance: _Covariance
 
     def log_evidence(self, labels: Sequence[Label]) -> float:
         from scipy.linalg import cholesky, solve_triangular
@@ -115,154 +117,126 @@ def _same(keys: Sequence[object]) -> FloatArray:
     return np.array([[float(one == other) for other in keys] for one in keys])
 
 
+_Numbers = dict[int, tuple[float, float]]  # value and its own standard deviation, by number of the series
+
+
 def _features(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
-    features = []
-    since = [item.since for item in judged]
+    def since(members: Sequence[int]) -> FloatArray:
+        """1 where both of two series came after the calibration."""
+        late = np.array([float(judged[index].since) for index in members])
+        return np.outer(late, late)
 
-    def beams(members: Sequence[int], labels: Sequence[Label]) -> tuple[FloatArray, FloatArray]:
-        keys = [label.beam for label in labels]
-        later = [(key, since[index]) for key, index in zip(keys, members, strict=True)]
-        late = np.array([float(since[index]) for index in members])
-        return _same(keys), _same(later) * np.outer(late, late)
+    def unknown(labels: Sequence[Label], *, load_needed: bool) -> FloatArray:
+        """1 for two series of one beam whose level, or noise over signal, no model gives."""
+        free = [float(maps.weights(label) is None or (load_needed and label.load is None)) for label in labels]
+        return _same([label.beam for label in labels]) * np.outer(free, free)
 
-    def free(labels: Sequence[Label]) -> FloatArray:
-        """Beams whose level no model gives."""
-        keys = [label.beam for label in labels]
-        unknown = [float(label.load is None or maps.weights(label) is None) for label in labels]
-        return _same(keys) * np.outer(unknown, unknown) * _OWN_BEAM_SD**2
-
-    levels: dict[int, tuple[float, float]] = {}
-    for index, item in enumerate(judged):
-        if item.series.kind == "flat":
-            levels[index] = (math.log(item.level_DN), math.hypot(_LEVEL_SDS["series"], item.released))
-        else:
-            depth = maps.depth(item.series.scene, item.label)
-            if depth is None or item.picture is None:
-                continue
-            open_DN = open_field(item.picture, depth, maps.good)
-            if open_DN is not None and open_DN > 0:
-                sd = math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
-                levels[index] = (math.log(open_DN), sd)
-
-    def level_covariance(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
-        _, later = beams(members, labels)
-        voltage = _same([label.kV for label in labels])
-        late = np.array([float(since[index]) for index in members])
+    def of_levels(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
+        later, voltage = since(members), _same([label.kV for label in labels])
         taken = np.array([maps.taken_by_filters(label) for label in labels])
         return np.asarray(
             _CONSTANT_SD**2
-            + voltage * (_LEVEL_SDS["voltage"] ** 2 + _LEVEL_SDS["voltage"] ** 2 * np.outer(late, late))
-            + voltage * _LEVEL_SDS["filters"] ** 2 * np.outer(taken, taken)
-            + _LEVEL_SDS["beam"] ** 2 * later
-            + free(labels)
+            + _LEVEL_SDS["voltage"] ** 2 * voltage * (1.0 + later)
+            + _LEVEL_SDS["filters"] ** 2 * voltage * np.outer(taken, taken)
+            + _LEVEL_SDS["beam"] ** 2 * _same([label.beam for label in labels]) * later
+            + _OWN_BEAM_SD**2 * unknown(labels, load_needed=True)
         )
 
-    if len(levels) > 1:
-        features.append(
-            _Feature(
-                tuple(levels),
-                np.array([value for value, _ in levels.values()]),
-                np.array([sd for _, sd in levels.values()]),
-                lambda index, label: maps.log_level(label),
-                level_covariance,
-            )
-        )
-    gains = {
-        index: (
-            math.log(item.gain_DN),
-            math.hypot(
-                _GAIN_SDS["beam"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0),
-                item.gain_sd,
-                item.released,
-            ),
-        )
-        for index, item in enumerate(judged)
-        if item.gain_DN > 0
-    }
-
-    def gain_covariance(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
-        same, later = beams(members, labels)
-        late = [float(since[index]) for index in members]
-        unknown = [float(maps.weights(label) is None) for label in labels]
+    def of_gains(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
+        later, beam = since(members), _same([label.beam for label in labels])
         return np.asarray(
             _CONSTANT_SD**2
-            + _GAIN_SDS["since"] ** 2 * np.outer(late, late)
-            + _GAIN_SDS["beam"] ** 2 * same
-            + _GAIN_SDS["beam"] ** 2 * later
-            + same * np.outer(unknown, unknown)
+            + _GAIN_SDS["since"] ** 2 * later
+            + _GAIN_SDS["beam"] ** 2 * beam * (1.0 + later)
+            + unknown(labels, load_needed=False)
         )
 
-    if len(gains) > 1:
-        features.append(
-            _Feature(
-                tuple(gains),
-                np.array([value for value, _ in gains.values()]),
-                np.array([sd for _, sd in gains.values()]),
-                lambda index, label: maps.log_gain(label),
-                gain_covariance,
-            )
-        )
-    features += _attenuation(judged, maps)
+    def of_attenuations(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
+        places = [(judged[index].series.scene, judged[index].series.source_object_mm) for index in members]
+        return np.asarray(_ATTENUATION_SDS["all"] ** 2 + _ATTENUATION_SDS["placement"] ** 2 * _same(places))
+
+    depths, covered = _attenuations(judged, maps)
+
+    def attenuation(index: int, label: Label) -> float:
+        depth = maps.depth(judged[index].series.scene, label)
+        # the deepest parts are where scatter fills in: the median weighs them no more than others
+        return 0.0 if depth is None else math.log(max(float(np.median(depth[covered[index]])), 1e-3))
+
+    features = []
+    for numbers, expected, covariance in (
+        (_levels(judged, maps), lambda _, label: maps.log_level(label), of_levels),
+        (_gains(judged), lambda _, label: maps.log_gain(label), of_gains),
+        (depths, attenuation, of_attenuations),
+    ):
+        if len(numbers) > 1:
+            values, sds = np.array(list(numbers.values())).T
+            features.append(_Feature(tuple(numbers), values, sds, expected, covariance))
     return features
 
 
-def _attenuation(judged: Sequence[Reading], maps: LabelModel) -> list[_Feature]:
-    shadows: dict[int, tuple[FloatArray, NDArray[np.bool_]]] = {}
+def _levels(judged: Sequence[Reading], maps: LabelModel) -> _Numbers:
+    """Logarithms of the open field's level."""
+    found: _Numbers = {}
     for index, item in enumerate(judged):
-        if item.series.kind != "object":
+        if item.series.kind == "flat":
+            found[index] = math.log(item.level_DN), math.hypot(_LEVEL_SDS["series"], item.released)
             continue
         depth = maps.depth(item.series.scene, item.label)
+        if depth is None or item.picture is None:
+            continue
+        open_DN = open_field(item.picture, depth, maps.good)
+        if open_DN is not None and open_DN > 0:
+            found[index] = math.log(open_DN), math.hypot(_LEVEL_SDS["series"], _OBJECT_EXTRA, item.released)
+    return found
+
+
+def _gains(judged: Sequence[Reading]) -> _Numbers:
+    """Logarithms of noise over signal."""
+    found: _Numbers = {}
+    for index, item in enumerate(judged):
+        if item.gain_DN > 0:
+            beam_sd = _GAIN_SDS["beam"] + (_OBJECT_EXTRA if item.series.kind == "object" else 0.0)
+            found[index] = math.log(item.gain_DN), math.hypot(beam_sd, item.gain_sd, item.released)
+    return found
+
+
+def _attenuations(judged: Sequence[Reading], maps: LabelModel) -> tuple[_Numbers, dict[int, NDArray[np.bool_]]]:
+    """Logarithms of the median -log T behind objects, and the pixels (row, column) that it is taken over, by number of the series."""
+    found: _Numbers = {}
+    pixels: dict[int, NDArray[np.bool_]] = {}
+    for index, item in enumerate(judged):
+        depth = maps.depth(item.series.scene, item.label) if item.series.kind == "object" else None
         measured = None if depth is None else measured_depth(item, depth)
         if depth is None or measured is None:
             continue
         covered = (depth > 0.05) & (depth < DEEPEST) & maps.good
-        if covered.sum() >= 50 and float(np.median(measured[covered])) > 0.02:
-            shadows[index] = (measured, covered)
-    if len(shadows) < 2:
-        return []
-
-    def expected(index: int, label: Label) -> float:
-        covered = shadows[index][1]
-        depth = maps.depth(judged[index].series.scene, label)
-        if depth is None:
-            return 0.0
-        # the deepest parts are where scatter fills in: the median weighs them no more than others
-        return math.log(max(float(np.median(depth[covered])), 1e-3))
-
-    def covariance(members: Sequence[int], labels: Sequence[Label]) -> FloatArray:
-        places = [(judged[index].series.scene, judged[index].series.source_object_mm) for index in members]
-        return np.asarray(_ATTENUATION_SDS["all"] ** 2 + _ATTENUATION_SDS["placement"] ** 2 * _same(places))
-
-    depths = np.array([float(np.median(measured[covered])) for measured, covered in shadows.values()])
-    released = np.array([judged[index].released for index in shadows])
-    sds = np.hypot(_ATTENUATION_SDS["series"], released / np.maximum(depths, 0.1))
-    return [_Feature(tuple(shadows), np.log(depths), sds, expected, covariance)]
+        middle = float(np.median(measured[covered])) if covered.sum() >= 50 else 0.0
+        if middle > 0.02:
+            pixels[index] = covered
+            found[index] = math.log(middle), math.hypot(_ATTENUATION_SDS["series"], item.released / max(middle, 0.1))
+    return found, pixels
 
 
 def _exchanged_groups(labels: Sequence[Label], names: Sequence[str], kinds: Sequence[str]) -> list[_Candidate]:
     """Labellings in which two tube voltages are exchanged in all flats, all objects or both."""
     voltages = sorted({label.kV for label in labels if label.kV is not None})
+    groups = {"all flats": ("flat",), "all objects": ("object",), "all series": ("flat", "object")}
     result: list[_Candidate] = []
-    for place, low in enumerate(voltages):
-        for high in voltages[place + 1 :]:
-            exchange = {low: high, high: low}
-            for group, title in (
-                (("flat",), "all flats"),
-                (("object",), "all objects"),
-                (("flat", "object"), "all series"),
-            ):
-                members = tuple(
-                    index
-                    for index, (label, kind) in enumerate(zip(labels, kinds, strict=True))
-                    if kind in group and label.kV in exchange
-                )
-                if len({labels[index].kV for index in members}) < 2 or (len(group) > 1 and len(set(kinds)) < 2):
-                    continue
-                changed = list(labels)
-                for index in members:
-                    changed[index] = replace(labels[index], kV=exchange[labels[index].kV or 0.0])
-                text = f"{low:g} kV and {high:g} kV look exchanged in {title} ({names[members[0]]} and others)"
-                result.append((0.0, changed, members, text))
+    for low, high in combinations(voltages, 2):
+        exchange = {low: high, high: low}
+        for title, group in groups.items():
+            members = tuple(
+                index
+                for index, (label, kind) in enumerate(zip(labels, kinds, strict=True))
+                if kind in group and label.kV in exchange
+            )
+            if len({labels[index].kV for index in members}) < 2 or (len(group) > 1 and len(set(kinds)) < 2):
+                continue
+            changed = list(labels)
+            for index in members:
+                changed[index] = replace(labels[index], kV=exchange[labels[index].kV or 0.0])
+            text = f"{low:g} kV and {high:g} kV look exchanged in {title} ({names[members[0]]} and others)"
+            result.append((0.0, changed, members, text))
     return result
 
 
@@ -271,25 +245,24 @@ def _candidates(suspects: Sequence[int], labels: Sequence[Label], names: Sequenc
     result: list[_Candidate] = []
     for what in _THINGS:
         price = _PRICE_OF_A_SETTING if what == "setting" else 0.0
+        values = [_value(label, what) for label in labels]
+        donors: dict[str, Label] = {}
+        for value, label in zip(values, labels, strict=True):
+            donors.setdefault(value, label)
         for index in suspects:
-            seen = {_value(labels[index], what)}
-            for donor in labels:
-                if _value(donor, what) in seen:
-                    continue
-                seen.add(_value(donor, what))
-                changed = list(labels)
-                changed[index] = _takes(labels[index], what, donor)
-                text = f"{names[index]} is labelled {_value(labels[index], what)}, but looks like {_value(donor, what)}"
-                result.append((price, changed, (index,), text))
-        for place, index in enumerate(suspects):
-            for other in suspects[place + 1 :]:
-                if _value(labels[index], what) == _value(labels[other], what):
-                    continue
+            for value, donor in donors.items():
+                if value != values[index]:
+                    changed = list(labels)
+                    changed[index] = _takes(labels[index], what, donor)
+                    text = f"{names[index]} is labelled {values[index]}, but looks like {value}"
+                    result.append((price, changed, (index,), text))
+        for index, other in combinations(suspects, 2):
+            if values[index] != values[other]:
                 changed = list(labels)
                 changed[index] = _takes(labels[index], what, labels[other])
                 changed[other] = _takes(labels[other], what, labels[index])
                 text = (
-                    f"{names[index]} ({_value(labels[index], what)}) and {names[other]} ({_value(labels[other], what)})"
+                    f"{names[index]} ({values[index]}) and {names[other]} ({values[other]})"
                     f" look as if their {what} were exchanged"
                 )
                 result.append((price, changed, (index, other), text))
@@ -298,29 +271,15 @@ def _candidates(suspects: Sequence[int], labels: Sequence[Label], names: Sequenc
 
 def _takes(label: Label, what: str, donor: Label) -> Label:
     """The label with one thing of another's."""
-    changes: dict[str, dict[str, Any]] = {
-        "tube voltage": {"kV": donor.kV},
-        "filters": {"filters": donor.filters},
-        "exposure time": {"exposure_ms": donor.exposure_ms},
-        "tube load": {"load": donor.load},
-        "setting": {
-            "kV": donor.kV,
-            "filters": donor.filters,
-            "exposure_ms": donor.exposure_ms,
-            "load": donor.load,
-        },
-    }
-    return replace(label, **changes[what])
+    changes: dict[str, Any] = {field: getattr(donor, field) for field in _THINGS[what]}
+    return replace(label, **changes)
 
 
 def _value(label: Label, what: str) -> str:
-    filters = text_from_filters(label.filters) or "no filter"
-    voltage = "unknown kV" if label.kV is None else f"{label.kV:g} kV"
-    if what == "tube voltage":
-        return voltage
-    if what == "filters":
-        return filters
-    if what == "exposure time":
-        return f"{label.exposure_ms or 0:g} ms"
-    load = "unknown load" if label.load is None else f"{label.load[1]:g} {label.load[0].rsplit('_', 1)[1]}"
-    return load if what == "tube load" else f"{voltage}, {load}, {label.exposure_ms or 0:g} ms, {filters}"
+    texts = {
+        "kV": "unknown kV" if label.kV is None else f"{label.kV:g} kV",
+        "load": "unknown load" if label.load is None else f"{label.load[1]:g} {label.load[0].rsplit('_', 1)[1]}",
+        "exposure_ms": f"{label.exposure_ms or 0:g} ms",
+        "filters": text_from_filters(label.filters) or "no filter",
+    }
+    return ", ".join(texts[field] for field in _THINGS[what])

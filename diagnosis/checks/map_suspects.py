@@ -4,6 +4,7 @@ Judged by how well the picture's shadow fits its map, against the same map turne
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -90,7 +91,7 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
     shows = shadow > 0.05 + 6.0 * noise
     if float(np.max(depth)) < 0.02:
         return f"the thickness maps of {scene} are empty, but its frames show a shadow" if shows else ""
-    if float(np.std(np.clip(depth, 0.0, DEEPEST))) < 0.03:
+    if not _varies(depth):
         return ""
     if not shows:
         # a thin object's shadow is no deeper than noise may be, and there all the same
@@ -100,25 +101,26 @@ def _unlike(scene: str, members: Sequence[Reading], maps: LabelModel, others: Se
     own = _correlation(picture, depth, stride)
     if not own < _FITS:
         return ""
-    best, name = own, ""
-    for turn, change in _TURNS.items():
-        turned = change(depth)
-        if turned.shape == depth.shape:
-            value = _correlation(picture, turned, stride)
-            if value > best:
-                best, name = value, f"the same maps {turn}"
+    candidates = {f"the same maps {turn}": change(depth) for turn, change in _TURNS.items()}
     for other in others:
-        if other != scene:
-            candidate = maps.depth(other, item.label)
-            if candidate is not None and float(np.std(np.clip(candidate, 0.0, DEEPEST))) > 0.03:
-                value = _correlation(picture, candidate, stride)
-                if value > best:
-                    best, name = value, f"the maps of {other}"
+        theirs = maps.depth(other, item.label) if other != scene else None
+        if theirs is not None and _varies(theirs):
+            candidates[f"the maps of {other}"] = theirs
+    best, name = own, ""
+    for words, candidate in candidates.items():
+        value = _correlation(picture, candidate, stride) if candidate.shape == depth.shape else -1.0
+        if value > best:
+            best, name = value, words
     if name and 1.0 - best < _FITS_BETTER * (1.0 - own) and best > 0.9:
         return f"the thickness maps of {scene} do not fit its frames (correlation {own:.3f}); {name} would ({best:.3f})"
     if own < _FITS_NOT:
         return f"the thickness maps of {scene} do not fit the shadow in its frames (correlation {own:.2f})"
     return ""
+
+
+def _varies(depth: FloatArray) -> bool:
+    """Whether a map's -log T has anything that a shadow could be compared with."""
+    return float(np.std(np.clip(depth, 0.0, DEEPEST))) >= 0.03
 
 
 def _correlation(picture: FloatArray, depth: FloatArray, stride: int) -> float:
@@ -168,17 +170,14 @@ def _scales_of_map(item: Reading, maps: LabelModel, inherent_mm_Al: float) -> li
         if half.sum() < 30:
             continue
 
-        def left(place: int, half: NDArray[np.bool_] = half) -> float:
-            other = maps.depth(item.series.scene, item.label, math.exp(_LOG_FACTORS[place]), inherent_mm_Al)
+        def left(log_factor: float, half: NDArray[np.bool_] = half) -> float:
+            other = maps.depth(item.series.scene, item.label, math.exp(log_factor), inherent_mm_Al)
             # edges lie where they lie: the median of the differences
             return math.nan if other is None else float(np.median(measured[half] - other[half]))
 
         # longer paths leave less in every pixel: the factor that leaves nothing is found by halving
-        low, high = 0, len(_LOG_FACTORS) - 1
-        while high - low > 1:
-            middle_one = (low + high) // 2
-            low, high = (middle_one, high) if left(middle_one) > 0 else (low, middle_one)
-        found.append(_LOG_FACTORS[low if abs(left(low)) <= abs(left(high)) else high])
+        first = bisect_left(_LOG_FACTORS, True, key=lambda log_factor: not left(log_factor) > 0)
+        found.append(min(_LOG_FACTORS[max(first - 1, 0) : first + 1], key=lambda log_factor: abs(left(log_factor))))
     return found
 
 

@@ -7,7 +7,7 @@ instead.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,8 @@ from .readings import (
 
 _PIXELS = 96  # a side that are looked at
 _SATURATED = 0.03  # share of the pixels at the top of the range; bad pixels alone are fewer
-_RELEASED_LATER, _REMEMBERED = (
-    0.02,
-    3,
-)  # of the exposures before, which an image lag may leave in the last frames of a lit series; so many of them
+_RELEASED_LATER = 0.02  # of the exposures before, which an image lag may leave in the last frames of a lit series
+_REMEMBERED = 3  # exposures before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,19 +76,16 @@ def check_plausibility(
         InputError: frames that cannot be read, or that are fractions of something and no detector numbers.
     """
     (progress or (lambda stage: None))("labels")
-    shapes = {item.shape for item in acquisition.series}
-    if len(shapes) > 1:
-        return Plausibility(suspects=(), unusable={})
-    stride = max(1, math.ceil(min(shapes.pop()) / _PIXELS))
-    found = _read(acquisition, calibrating, stride)
-    for item in found.readings:
+    stride = max(1, math.ceil(min(acquisition.series[0].shape) / _PIXELS))
+    readings, found = _read(acquisition, calibrating, stride)
+    for item in readings:
         if explained and item.name in explained:
             item.without(explained[item.name], stride)
-    darks = [item for item in found.readings if item.series.kind == "dark"]
-    lit = [item for item in found.readings if item.series.kind in ("flat", "object")]
+    darks = [item for item in readings if item.series.kind == "dark"]
+    lit = [item for item in readings if item.series.kind in ("flat", "object")]
     refuse_fractions(lit)
-    good = good_pixels(found.readings)
-    suspects = lit_darks(darks, lit, good)
+    good = good_pixels(readings)
+    suspects = lit_darks(darks, lit, good, bits=acquisition.instrument.bits)
     known = _Darks(readings=_less(darks, suspects), twins_DN=dark_DN, good=good, stride=stride)
     dim, judged = flats_without_beam(_measured(lit, known), good)
     _flatten(judged, good)
@@ -103,24 +98,11 @@ def check_plausibility(
     maps = LabelModel(acquisition, model, stride, good)
     misfits = wrong_maps(judged, maps)
     suspects = [*suspects, *dim, *shadowed, *misfits, *relabelled(_less(judged, misfits), maps)]
-    return Plausibility(
-        suspects=tuple(sorted(suspects, key=lambda item: -item.evidence)),
-        unusable=found.unusable,
-        saturated=frozenset(found.saturated),
-    )
+    return replace(found, suspects=tuple(sorted(suspects, key=lambda item: -item.evidence)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Read:
-    """Readings in order of time; what cannot be used -> why; names of what was lit too much."""
-
-    readings: list[Reading]
-    unusable: dict[str, str]
-    saturated: set[str]
-
-
-def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int) -> _Read:
-    """The series at every `stride`th pixel, less those whose frames say nothing."""
+def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int) -> tuple[list[Reading], Plausibility]:
+    """Readings, at every `stride`th pixel and in order of time, and what cannot be used."""
     readings: list[Reading] = []
     unusable: dict[str, str] = {}
     saturated: set[str] = set()
@@ -150,7 +132,7 @@ def _read(acquisition: AcquisitionFile, calibrating: frozenset[str], stride: int
         if top and found.series.kind in ("flat", "object"):
             saturated.add(name)
     readings.sort(key=lambda item: item.series.index)
-    return _Read(readings=readings, unusable=unusable, saturated=saturated)
+    return readings, Plausibility(suspects=(), unusable=unusable, saturated=frozenset(saturated))
 
 
 def _less(readings: Sequence[Reading], suspects: Sequence[Suspect]) -> list[Reading]:

@@ -21,8 +21,9 @@ LEAST_GAIN = 0.05  # of a pixel in use
 class CalibratedDarks:
     """Darks as the calibrating series show them; the twin's where there are none.
 
-    Fields: twin; weights: of each calibrating dark in the dark of an exposure (ms), by name; means_DN (row, column),
-    white_DN2 (row, column or 1, 1; of one frame) and frames of the calibrating darks, by name.
+    Fields: twin; weights: of each calibrating dark in the dark of an exposure (ms), by name; means_DN (row, column) and
+    white_DN2 (row, column or 1, 1; of one frame) of the calibrating darks, by name; frames of the calibrating series, copies left
+    out, by name.
     """
 
     twin: Twin
@@ -57,7 +58,7 @@ class CalibratedMaps:
     show over that map, smooth, by name of series, where it stands in; gain_quantum, gain_white: relative variance of one pixel's
     gain, correlated as quanta are, and white; gain_darks: change of the gain, 1/DN, when a calibrating dark is brighter, by
     name: what is subtracted from a series as bright as the calibrating flats was subtracted from these as well; good (row,
-    column): pixels in use; frames of the calibrating flats, by name.
+    column): pixels in use; frames: as those of the darks.
     """
 
     darks: CalibratedDarks
@@ -128,21 +129,25 @@ def calibrated_maps(
     """
     darks = [item for item in kept if item.calibrates and item.series.kind == "dark"]
     flats = [item for item in kept if item.calibrates and item.series.kind == "flat"]
+    # copies of a frame say nothing more
+    frames = {item.name: looks[item.name].frames for item in (*darks, *flats)}
     under = CalibratedDarks(
         twin=twin,
-        weights={exposure: _dark_weights(darks, exposure) for exposure in dict.fromkeys(map(exposure_of, kept))},
+        weights={
+            exposure: _dark_weights(darks, frames, exposure) for exposure in dict.fromkeys(map(exposure_of, kept))
+        },
         means_DN={item.name: looks[item.name].mean_DN for item in darks},
         white_DN2={item.name: expected[item.name].white_variance_DN2 for item in darks},
-        frames={item.name: looks[item.name].frames for item in darks},
+        frames=frames,
     )
-    shares = _flat_shares(flats, expected, good)
+    shares = _flat_shares(flats, expected, frames, good)
     gain = np.zeros(good.shape) if flats else _gain_of_twin(twin)
     quantum = white = 0.0
     gain_darks = dict.fromkeys(under.white_DN2, 0.0)
     for item in flats:
         model = expected[item.name]
         share = shares[item.name] / mean_over(model.signal_DN, good)
-        weight = share**2 / looks[item.name].frames
+        weight = share**2 / frames[item.name]
         quantum += weight * mean_over(model.quantum_variance_DN2, good)
         white += weight * mean_over(model.white_variance_DN2, good)
         for name, part in under.weights_under(item).items():
@@ -165,40 +170,41 @@ def calibrated_maps(
         gain_white=white,
         gain_darks=gain_darks,
         good=lit,
-        frames={item.name: looks[item.name].frames for item in flats},
+        frames=frames,
     )
 
 
 def _flat_shares(
-    flats: Sequence[SessionSeries], expected: Mapping[str, ExpectedSeries], good: NDArray[np.bool_]
+    flats: Sequence[SessionSeries],
+    expected: Mapping[str, ExpectedSeries],
+    frames: Mapping[str, int],
+    good: NDArray[np.bool_],
 ) -> dict[str, float]:
     """Share of each calibrating flat in the gain map: as its signal-to-noise ratio squared."""
     weights = {}
     for item in flats:
         model = expected[item.name]
         variance = mean_over(model.quantum_variance_DN2 + model.white_variance_DN2, good)
-        weights[item.name] = mean_over(model.signal_DN, good) ** 2 / max(variance, 1e-12) * item.series.n_frames
+        weights[item.name] = mean_over(model.signal_DN, good) ** 2 / max(variance, 1e-12) * frames[item.name]
     total = sum(weights.values())
     return {name: value / total for name, value in weights.items()}
 
 
-def _dark_weights(darks: Sequence[SessionSeries], exposure_ms: float) -> dict[str, float]:
+def _dark_weights(darks: Sequence[SessionSeries], frames: Mapping[str, int], exposure_ms: float) -> dict[str, float]:
     """Weights with which calibrating darks add up to the dark of an exposure; empty without darks."""
     if not darks:
         return {}
-    same = [item for item in darks if abs((item.series.exposure_ms or 0.0) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
-    if same:
-        frames = sum(item.series.n_frames for item in same)
-        return {item.name: item.series.n_frames / frames for item in same}
-    x = np.array([item.series.exposure_ms or 0.0 for item in darks])
-    n = np.array([item.series.n_frames for item in darks], dtype=float)
-    if np.ptp(x) <= 0:
-        return {item.name: float(w) for item, w in zip(darks, n / n.sum(), strict=True)}
+    same = [item for item in darks if abs(exposure_of(item) - exposure_ms) <= 1e-6 * max(exposure_ms, 1)]
+    used = same or darks
+    x = np.array([exposure_of(item) for item in used])
+    n = np.array([frames[item.name] for item in used], dtype=float)
+    if same or np.ptp(x) <= 0:
+        return dict(zip((item.name for item in used), (n / n.sum()).tolist(), strict=True))
     # a straight line through the darks, evaluated at the exposure: linear in the darks
     design = np.stack([np.ones_like(x), x], axis=1)
     solved = np.linalg.solve(design.T @ (n[:, None] * design), design.T * n)
     weights = np.array([1.0, exposure_ms]) @ solved
-    return {item.name: float(w) for item, w in zip(darks, weights, strict=True)}
+    return dict(zip((item.name for item in used), weights.tolist(), strict=True))
 
 
 def _gain_of_twin(twin: Twin) -> NDArray[np.float64]:

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ..probes.fixed_pattern import smooth_part
-from ..probes.lasting import lasting_pixels
+from ..probes.lasting import OUTLYING, lasting_pixels
 from ..session.even_maps import near_steps, signal_map
 from ..session.session import SessionSeries
 from ..session.summaries import LEAST_NOISE_DN2, FirstLook
 from .calibrated_maps import CalibratedMaps
 from .changes import DUST_LIMIT
 
-_OUTLYING = 8.0  # standard deviations from which a pixel stands out
 _LEAST_SCENES, _NEARLY_ALWAYS = 4, 0.9  # unlike objects, and share of their series, that show what is the panel's own
 _MOST_OUTLYING = 0.1  # share of the pixels; more of them are a pattern
 
@@ -58,7 +57,7 @@ def new_outliers(
         centre = float(np.median(residual[good]))
         spread = 1.4826 * float(np.median(np.abs(residual[good] - centre)))
         departs = np.abs(residual - centre)
-        out = departs > _OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
+        out = departs > OUTLYING * max(spread, math.sqrt(LEAST_NOISE_DN2 / look.frames))
         if item.series.kind == "flat":
             dusty |= out
             out &= departs > DUST_LIMIT * signal_map(expected[item.name], shape)
@@ -107,7 +106,7 @@ def _out_in_every_object(
             even = ~near_steps(signal)
             views += even
             spread = max(1.4826 * float(np.median(np.abs(residual[good]))), 1e-9)
-            times += even & (np.abs(residual) > _OUTLYING * spread)
+            times += even & (np.abs(residual) > OUTLYING * spread)
             seen_in[item.series.scene] = even | seen_in.get(item.series.scene, np.zeros_like(even))
             scenes = np.sum(list(seen_in.values()), axis=0)
             found |= (scenes >= _LEAST_SCENES) & (times >= _NEARLY_ALWAYS * views)

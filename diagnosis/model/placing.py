@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, Scalar
-from ..probes.registration import LARGEST_PX, Placement, left_over, register, register_drawn
+from ..probes.registration import (
+    ANYWHERE_SD_PX,
+    LARGEST_PX,
+    SEEN_PX,
+    Placement,
+    left_over,
+    register,
+    register_drawn,
+    without_border,
+)
 from ..probes.straight_edge import straight_scene
 from ..session.even_maps import full_size, signal_map
 from ..session.session import SessionSeries
@@ -19,15 +28,11 @@ from .point_maps import sampled_at_points
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
 _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
-_PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
-_CLOSER = 0.5  # of the displacement: what a round may add to it
 # an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
 # was found 1.5 px from where it lies with a box of that length
 _BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
 _GAUSSIANS_PX = (2.0, 3.0, 4.0, 6.0)
 _SMEARED, _SMEARED_SIZES = 0.7, 3  # share of what is left that one of so many blurs must leave for others to be tried
-_BETWEEN_POINTS_PX = 1.0 / math.sqrt(12.0)  # standard deviation of a place that may be anywhere in a pixel
-_SEEN_PX = 0.3  # standard deviation below which a displacement is a probe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,9 +173,9 @@ def _placement(
     else:
         # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
         found, blur = _smeared(members, seen, pictured, noises, clean, found)
-        for _ in range(_PLACEMENTS):
+        for _ in range(2):
             rest = register(seen, blur(drawn((found.row_px, found.column_px))), noises, clean)
-            if math.hypot(rest.row_px, rest.column_px) > _CLOSER * math.hypot(found.row_px, found.column_px):
+            if math.hypot(rest.row_px, rest.column_px) > 0.5 * math.hypot(found.row_px, found.column_px):
                 break  # it leads away: something else is seen than a displacement
             found = replace(rest, row_px=found.row_px + rest.row_px, column_px=found.column_px + rest.column_px)
     # nowhere near its maps: compared as it is, and the gap says so
@@ -234,10 +239,7 @@ def _as_it_is(pictures: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.fl
 
 def inside(mask: NDArray[np.bool_], placement: Placement) -> NDArray[np.bool_]:
     """The mask (row, column) less the border that a displaced picture does not cover."""
-    margin = 2 + math.ceil(max(abs(placement.row_px), abs(placement.column_px)))
-    covered = np.zeros_like(mask)
-    covered[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin]
-    return covered
+    return without_border(mask, 2 + math.ceil(max(abs(placement.row_px), abs(placement.column_px))))
 
 
 def displacement_probes(placement: Placement, *, between_points: bool) -> list[Scalar]:
@@ -245,7 +247,7 @@ def displacement_probes(placement: Placement, *, between_points: bool) -> list[S
 
     between_points: the scene's borders lie anywhere between the points of its maps, along lines of pixels.
     """
-    stated_px = math.hypot(scales.POSITION_SD_PX, _BETWEEN_POINTS_PX if between_points else 0.0)
+    stated_px = math.hypot(scales.POSITION_SD_PX, ANYWHERE_SD_PX if between_points else 0.0)
     return [
         Scalar(
             axis="sharpness",
@@ -259,5 +261,5 @@ def displacement_probes(placement: Placement, *, between_points: bool) -> list[S
             (ALONG_ROWS, placement.row_px, placement.row_sd_px),
             (ALONG_COLUMNS, placement.column_px, placement.column_sd_px),
         )
-        if sd < _SEEN_PX
+        if sd < SEEN_PX
     ]

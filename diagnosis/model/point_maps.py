@@ -9,6 +9,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ..session.even_maps import local_range
+
 _LEAST_STEP = 0.1  # of the largest thickness, over three pixels' distance
 _WHOLE = 0.95  # share of such a step that lies between two neighbours: of borders that cut pixels anywhere, one in ten
 _MOSTLY = 0.7  # share of a map's borders
@@ -53,9 +55,9 @@ def blurred_between_points(
     Source: R. T. Whitaker, Reducing aliasing artifacts in iso-surfaces of binary volumes, IEEE Symposium on Volume
         Visualization 2000, 23-32, doi:10.1109/VV.2000.10000.
     """
-    from scipy.ndimage import gaussian_filter, gaussian_filter1d, maximum_filter, minimum_filter
+    from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-    jump = maximum_filter(signal, 5) - minimum_filter(signal, 5)
+    jump = local_range(signal, 2)
     result = []
     for image in thickness_mm.values():
         thick = np.asarray(image) > 0.5 * float(np.max(image))

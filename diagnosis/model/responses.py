@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.series_request import SeriesRequest
-from ..probes.fixed_pattern import OUTLIER_SD, Pattern, pattern_noise, pattern_of, sum_of_patterns
+from ..probes.fixed_pattern import OUTLIER_SD, Pattern, pattern_noise, pattern_of
 from ..probes.line_scalars import line_pattern
 from ..probes.model_scalars import expected_scalars, with_pattern
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, FIXED
@@ -353,7 +353,7 @@ def _context(
         expected, clean, seen.looks[item.name].frames, *noise_of_maps, lines=kind == "flat" and bool(maps.shares)
     )
     read_DN2 = mean_over(expected.white_variance_DN2, clean) if maps.read_DN2 is None else maps.read_DN2
-    stands_out_DN = max(OUTLIER_SD * math.sqrt(noise.pixel_DN2), DUST_LIMIT * max(signal_DN, 0.0))
+    stands_out_DN = max(OUTLIER_SD * math.sqrt(noise[0]), DUST_LIMIT * max(signal_DN, 0.0))
     return ScalarContext(
         kind=kind,
         frames=frames,
@@ -407,9 +407,10 @@ def _with_patterns(
     if FIXED not in values:
         return dict(values)
     weights = {} if "offset" in item.series.corrected else maps.darks.weights[exposure_of(item)]
-    standing = [pattern_of(moved)]
-    standing += [lines[name].times(weight**2 / maps.darks.frames[name]) for name, weight in weights.items()]
+    standing = pattern_of(moved)
+    for name, weight in weights.items():
+        standing += weight**2 / maps.darks.frames[name] * lines[name]
     for name, share in maps.shares.items():
         there = share * signals_DN[item.name] / max(signals_DN[name], 1e-9)
-        standing.append(lines[name].times(there**2 / maps.frames[name]))
-    return with_pattern(values, sum_of_patterns(standing), context.pattern_noise)
+        standing += there**2 / maps.frames[name] * lines[name]
+    return with_pattern(values, standing, context.pattern_noise)

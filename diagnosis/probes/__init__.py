@@ -15,5 +15,4 @@ Files:
     noise_correlation   correlation of neighbouring pixels' noise, summed
     lost_bits           kurtosis of rounded noise
     _projection_loops   templates weighed by the noise, compiled
-    _moving_loops       sums over fading pictures, compiled
 """

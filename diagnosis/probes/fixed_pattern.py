@@ -2,11 +2,14 @@
 
 A gain map that changed pixel by pixel shows in all of them as its grain does. Lines that changed as a whole (seams of tiles,
 readout lines) show in the means of rows or columns far above what single pixels' changes leave there.
+
+A pattern is an array (4,) of variances, DN^2, NaN where one cannot be seen: half the mean square of differences of neighbours along
+rows; the same of means of blocks of BLOCK_PX; of rows and of columns a sixth of the mean square of second differences of the lines'
+means (smooth shapes leave nothing there). Of independent patterns in one frame they add up.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.line_state import FixedPattern, TilePattern
 from ..session.even_maps import mean_over
-from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2
+from ..session.summaries import BLOCK_PX, LEAST_NOISE_DN2, in_blocks
 from .noise_correlation import autocovariance, correlation_sum
 
 OUTLIER_SD = 7.0
@@ -27,41 +30,7 @@ _OUT_OF_NEIGHBOURS = 3.0  # times the distance of their quartiles; of noise 7 st
 _LINE_CLEAN = 0.2  # share of a line's pixels that do not stand out, below which the line as a whole may have changed
 _LINE_CHANGE = 0.15  # relative change of a line's gain beyond which it counts as a defect
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pattern:
-    """Variances that stand in a mean frame, DN^2; None: cannot be seen.
-
-    Fields: pixel_DN2, half the mean square of differences of neighbours along rows; blocks_DN2, the same of means of blocks of
-    BLOCK_PX; rows_DN2, columns_DN2, a sixth of the mean square of second differences of the lines' means (smooth shapes leave
-    nothing there).
-    """
-
-    pixel_DN2: float
-    blocks_DN2: float | None
-    rows_DN2: float | None
-    columns_DN2: float | None
-
-    def times(self, factor: float) -> "Pattern":
-        """All variances times a factor."""
-        blocks, rows, columns = (
-            None if one is None else factor * one for one in (self.blocks_DN2, self.rows_DN2, self.columns_DN2)
-        )
-        return Pattern(pixel_DN2=factor * self.pixel_DN2, blocks_DN2=blocks, rows_DN2=rows, columns_DN2=columns)
-
-
-def sum_of_patterns(patterns: Iterable[Pattern]) -> Pattern:
-    """What stands in a mean frame where all of these do; what cannot be seen of one counts as nothing."""
-    given = tuple(patterns)
-    return Pattern(
-        pixel_DN2=sum(one.pixel_DN2 for one in given),
-        blocks_DN2=sum(one.blocks_DN2 or 0.0 for one in given),
-        rows_DN2=sum(one.rows_DN2 or 0.0 for one in given),
-        columns_DN2=sum(one.columns_DN2 or 0.0 for one in given),
-    )
-
-
-NO_PATTERN = Pattern(pixel_DN2=0.0, blocks_DN2=0.0, rows_DN2=0.0, columns_DN2=0.0)
+Pattern = NDArray[np.float64]  # (4,), variances, DN^2, in the order that the module's docstring gives
 
 
 def pattern_noise(
@@ -84,12 +53,11 @@ def pattern_noise(
     rows, columns = (max(float(mask.mean()) * length, 1.0) for length in mask.shape)
     pixel = q * (1.0 - autocovariance(model, 0, 1)) + w
     block = (q * correlation_sum(model, BLOCK_PX, BLOCK_PX) + w) / BLOCK_PX**2
-    return Pattern(
-        pixel_DN2=pixel,
-        blocks_DN2=block,
-        rows_DN2=(q * _second_difference(model, mask.shape[1], along=1) + w) / columns if lines else None,
-        columns_DN2=(q * _second_difference(model, mask.shape[0], along=0) + w) / rows if lines else None,
-    )
+    if not lines:
+        return np.array([pixel, block, math.nan, math.nan])
+    of_rows = (q * _second_difference(model, mask.shape[1], along=1) + w) / columns
+    of_columns = (q * _second_difference(model, mask.shape[0], along=0) + w) / rows
+    return np.array([pixel, block, of_rows, of_columns])
 
 
 def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> float:
@@ -105,7 +73,7 @@ def _second_difference(model: ExpectedSeries, length: int, *, along: int) -> flo
 
 @lru_cache(maxsize=64)
 def shares_of_pixels(shape: tuple[int, int], correlation_px: float) -> Pattern:
-    """What pixels' gains of variance 1 DN^2, alike over so many pixels, add to the variances of a `Pattern` over a panel."""
+    """What pixels' gains of variance 1 DN^2, alike over so many pixels, add to a pattern over a panel."""
     field = FixedPattern(rms=1.0, seed=0, correlation_px=correlation_px)
 
     def of_means(length: int, apart: int = 0) -> float:
@@ -115,19 +83,14 @@ def shares_of_pixels(shape: tuple[int, int], correlation_px: float) -> Pattern:
 
     one, two = field.correlation(1.0), field.correlation(2.0)
     bent = float(6.0 - 8.0 * one + 2.0 * two) / 6.0
-    of_rows, of_columns = (bent * of_means(length) for length in (shape[1], shape[0]))
     block = of_means(BLOCK_PX)
-    return Pattern(
-        pixel_DN2=float(1.0 - one),
-        blocks_DN2=block * (block - of_means(BLOCK_PX, BLOCK_PX)),
-        rows_DN2=of_rows,
-        columns_DN2=of_columns,
-    )
+    of_blocks = block * (block - of_means(BLOCK_PX, BLOCK_PX))
+    return np.array([1.0 - one, of_blocks, bent * of_means(shape[1]), bent * of_means(shape[0])])
 
 
 @lru_cache(maxsize=64)
 def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
-    """What gains of tiles of variance 1 DN^2 add to the variances of a `Pattern` over a panel of `shape`.
+    """What gains of tiles of variance 1 DN^2 add to a pattern over a panel of `shape`.
 
     All of these are differences of neighbours, so that each is a sum over the tiles of squared differences of the shares that
     neighbours have in a tile.
@@ -150,12 +113,9 @@ def shares_of_tiles(shape: tuple[int, int], tiles: TilePattern) -> Pattern:
         return float(np.sum(inside.mean(axis=0) ** 2))
 
     of_blocks = differing(blocks(column_in)) * (strips + alone * float(np.mean(np.sum(blocks(row_in) ** 2, axis=1))))
-    return Pattern(
-        pixel_DN2=differing(column_in),
-        blocks_DN2=of_blocks,
-        rows_DN2=alone * bent(row_in) * of_mean(column_in),
-        columns_DN2=bent(column_in) * (strips + alone * of_mean(row_in)),
-    )
+    of_rows = alone * bent(row_in) * of_mean(column_in)
+    of_columns = bent(column_in) * (strips + alone * of_mean(row_in))
+    return np.array([differing(column_in), of_blocks, of_rows, of_columns])
 
 
 def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -163,11 +123,7 @@ def smooth_part(residual: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArr
     rows, columns = residual.shape
     if min(rows, columns) < _LEAST_SURFACE:
         return np.zeros(residual.shape)
-    whole = residual[: rows - rows % BLOCK_PX, : columns - columns % BLOCK_PX]
-    inside = mask[: whole.shape[0], : whole.shape[1]]
-    part = np.where(inside, whole, np.nan).reshape(
-        whole.shape[0] // BLOCK_PX, BLOCK_PX, whole.shape[1] // BLOCK_PX, BLOCK_PX
-    )
+    part = in_blocks(np.where(mask, residual, np.nan))
     filled = np.moveaxis(part, 1, 2).reshape(part.shape[0], part.shape[2], -1)
     known = np.count_nonzero(np.isfinite(filled), axis=-1) > BLOCK_PX**2 // 2
     if np.count_nonzero(known) < 16:
@@ -212,53 +168,42 @@ def pattern_statistics(
     pair = clean[:, 1:] & clean[:, :-1]
     step = (level[:, 1:] - level[:, :-1])[pair]
     pixel = float(np.mean(step**2)) / 2.0
-    rows, columns = (side - side % BLOCK_PX for side in clean.shape)
-    part = clean[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
-    weight = part.sum(axis=(1, 3))
-    values = np.where(clean, level, 0.0)[:rows, :columns].reshape(part.shape).sum(axis=(1, 3))
+    weight = in_blocks(clean).sum(axis=(1, 3))
+    values = in_blocks(np.where(clean, level, 0.0)).sum(axis=(1, 3))
     means = values / np.maximum(weight, 1)
     # neighbouring blocks' differences: free of the smooth shapes that the map probes hold
     across = (means[:, 1:] - means[:, :-1])[(weight[:, 1:] > 32) & (weight[:, :-1] > 32)]
-    lines: tuple[float | None, float | None] = (None, None)
-    if signal_DN is not None:
-        # a whole line that changed a little is a line, not a row of defects
-        changed = good & (np.abs(residual) < _LINE_CHANGE * signal_DN)
-        lines = _of_lines(level, clean, changed), _of_lines(level.T, clean.T, changed.T)
-    return Pattern(
-        pixel_DN2=pixel,
-        blocks_DN2=float(np.mean(across**2)) / 2.0 if across.size >= _LEAST_BLOCKS else None,
-        rows_DN2=lines[0],
-        columns_DN2=lines[1],
-    )
+    of_blocks = float(np.mean(across**2)) / 2.0 if across.size >= _LEAST_BLOCKS else math.nan
+    if signal_DN is None:
+        return np.array([pixel, of_blocks, math.nan, math.nan])
+    # a whole line that changed a little is a line, not a row of defects
+    changed = good & (np.abs(residual) < _LINE_CHANGE * signal_DN)
+    return np.array([pixel, of_blocks, _of_lines(level, clean, changed), _of_lines(level.T, clean.T, changed.T)])
 
 
-def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: NDArray[np.bool_]) -> float | None:
-    """A sixth of the mean square of second differences of the means of rows, DN^2."""
+def _of_lines(residual: NDArray[np.float64], clean: NDArray[np.bool_], changed: NDArray[np.bool_]) -> float:
+    """A sixth of the mean square of second differences of the means of rows, DN^2; NaN: too few can be seen."""
     # a stretch of defects is no line that changed: of that nearly all stands out
     use = np.where((clean.mean(axis=1) >= _LINE_CLEAN)[:, None], clean, changed)
     seen = use.mean(axis=1) >= 0.5
     means = np.where(use, residual, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
     bent = (means[2:] - 2.0 * means[1:-1] + means[:-2])[seen[2:] & seen[1:-1] & seen[:-2]]
-    return float(np.mean(bent**2)) / 6.0 if bent.size >= _LEAST_LINES else None
+    return float(np.mean(bent**2)) / 6.0 if bent.size >= _LEAST_LINES else math.nan
 
 
 def pattern_of(change_DN: NDArray[np.floating]) -> Pattern:
-    """What a change of the mean frame (row, column or 1, 1), DN, leaves in the variances of a `Pattern`."""
+    """What a change of the mean frame (row, column or 1, 1), DN, leaves in a pattern."""
     if change_DN.size == 1:
-        return NO_PATTERN
+        return np.zeros(4)
     change = change_DN.astype(np.float64)
     bent = (np.diff(change.mean(axis=axis), n=2) for axis in (1, 0))
     rows, columns = (float(np.mean(one**2)) / 6.0 if one.size else 0.0 for one in bent)
     if min(change.shape) >= _LEAST_SURFACE:
         to_surface, at_pixels = _to_surface(*change.shape)
-        change = change - at_pixels @ (to_surface @ _block_means(change).ravel())
-    across = np.diff(_block_means(change), axis=1)
-    return Pattern(
-        pixel_DN2=float(np.mean(np.diff(change, axis=1) ** 2)) / 2.0,
-        blocks_DN2=float(np.mean(across**2)) / 2.0 if across.size else 0.0,
-        rows_DN2=rows,
-        columns_DN2=columns,
-    )
+        change = change - at_pixels @ (to_surface @ in_blocks(change).mean(axis=(1, 3)).ravel())
+    across = np.diff(in_blocks(change).mean(axis=(1, 3)), axis=1)
+    pixel, block = (float(np.mean(one**2)) / 2.0 if one.size else 0.0 for one in (np.diff(change, axis=1), across))
+    return np.array([pixel, block, rows, columns])
 
 
 @lru_cache(maxsize=4)
@@ -266,14 +211,6 @@ def _to_surface(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[n
     """What makes of means of blocks the cubic surface's factors (term, block), and its terms at pixels (row, column, term)."""
     at_blocks, at_pixels = _cubic_terms(rows, columns)
     return np.asarray(np.linalg.pinv(at_blocks.reshape(-1, at_blocks.shape[2])), dtype=np.float64), at_pixels
-
-
-def _block_means(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means of whole blocks of an image (block row, block column)."""
-    rows, columns = (side - side % BLOCK_PX for side in image.shape)
-    return np.asarray(
-        image[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX).mean(axis=(1, 3))
-    )
 
 
 def count_outliers(

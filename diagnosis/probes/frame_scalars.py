@@ -91,10 +91,13 @@ class _Found:
     context: ScalarContext
     scalars: list[Scalar] = field(default_factory=list)
 
-    def add(self, axis: str, name: str, unit: str, value: float, sampling: float, floor: str) -> None:
-        """One more, unless it is no number."""
+    def add(
+        self, axis: str, name: str, unit: str, value: float, sampling: float, floor: str, *, of: float = 1.0
+    ) -> None:
+        """One more, unless it is no number; floor: one of FLOORS, a share of `of`."""
         if math.isfinite(value) and math.isfinite(sampling):
-            sd = math.hypot(sampling, FLOORS[floor])
+            value, sampling = float(value), float(sampling)
+            sd = math.hypot(sampling, FLOORS[floor] * float(of))
             self.scalars.append(Scalar(axis=axis, name=name, unit=unit, value=value, sd=sd, sampling_sd=sampling))
 
     @property
@@ -209,32 +212,22 @@ class _Found:
         """Distance of the numbers that occur."""
         if self.context.codes_usable and self.summary.distinct_codes > 1:
             step_DN = (self.summary.code_range - 1) / (self.summary.distinct_codes - 1)
-            sd = FLOORS["codes"] * step_DN
-            self.scalars.append(Scalar(axis="tails", name="codes", unit="DN", value=step_DN, sd=sd, sampling_sd=0.0))
+            self.add("tails", "codes", "DN", step_DN, 0.0, "codes", of=step_DN)
 
     def fixed_pattern(self, pattern: Pattern) -> None:
         """What stands in the mean frame, in units of what noise leaves there: a pattern's rms, which is what a strength means."""
-        expected, least = self.context.pattern_noise, LEAST_NOISE_DN2 / self.summary.frames
         rows, columns = self.context.good.shape
-        for name, found_DN2, noise_DN2, pixels in (
-            (FIXED, pattern.pixel_DN2, expected.pixel_DN2, 1),
-            (FIXED_BLOCKS, pattern.blocks_DN2, expected.blocks_DN2, BLOCK_PX**2),
-        ):
-            if found_DN2 is not None and noise_DN2 is not None:
-                value = math.sqrt(max(found_DN2, least / pixels) / noise_DN2)
-                sampling = value * math.sqrt(0.75 * pixels / self.n_good)
-                sd = math.hypot(sampling, value * FLOORS[name])
-                self.scalars.append(
-                    Scalar(axis="position", name=name, unit="sd", value=value, sd=sd, sampling_sd=sampling)
-                )
+        pixels = np.array([1, BLOCK_PX**2, columns, rows])  # whose mean it is
+        least_DN2 = LEAST_NOISE_DN2 / self.summary.frames / pixels
+        ratios = np.maximum(pattern, least_DN2) / self.context.pattern_noise
+        for name, value, count in zip((FIXED, FIXED_BLOCKS), np.sqrt(ratios[:2]), pixels[:2], strict=True):
+            sampling = value * math.sqrt(0.75 * count / self.n_good)
+            self.add("position", name, "sd", value, sampling, name, of=value)
         # lines may stand out a hundredfold: logarithms; second differences share lines
-        for name, found_DN2, noise_DN2, lines, pixels in (
-            (FIXED_ROWS, pattern.rows_DN2, expected.rows_DN2, rows, columns),
-            (FIXED_COLUMNS, pattern.columns_DN2, expected.columns_DN2, columns, rows),
+        for name, value, lines in zip(
+            (FIXED_ROWS, FIXED_COLUMNS), 0.5 * np.log(ratios[2:]), (rows, columns), strict=True
         ):
-            if found_DN2 is not None and noise_DN2 is not None:
-                value = 0.5 * math.log(max(found_DN2, least / pixels) / noise_DN2)
-                self.add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
+            self.add("position", name, "1", value, 1.0 / math.sqrt(lines), "fixed_pattern lines")
 
 
 def _log_variance_of_steps(values: NDArray[np.float64], freedom: float) -> tuple[float, float]:

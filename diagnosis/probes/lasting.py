@@ -22,7 +22,7 @@ _MOST = 0.15  # share of the pixels; more of them are a picture that fades, not 
 _AROUND_PX, _MOST_AROUND = 5, 0.35  # the same of a square around one: of 10 % by chance one square in 500
 _DRAWN = 4000  # pixels of which chances are counted: 1 % of a share of one half
 _SEED = 0x7E1E
-_OUTLYING = 8.0  # standard deviations of its mean from which a pixel stands out, as in `model.defects`
+OUTLYING = 8.0  # standard deviations of its mean from which a pixel stands out
 
 
 @lru_cache(maxsize=64)
@@ -102,7 +102,7 @@ def _in_darks(law: TelegraphPixels, darks: tuple[tuple[int, int], ...]) -> tuple
         height_reads, levels = _levels(law, frames, averaged, number)
         noise = np.random.default_rng([_SEED, number]).standard_normal((frames, _DRAWN)) / math.sqrt(averaged)
         value = height_reads / averaged * levels + noise
-        stands.append(np.abs(value.mean(axis=0)) > _OUTLYING / math.sqrt(frames * averaged))
+        stands.append(np.abs(value.mean(axis=0)) > OUTLYING / math.sqrt(frames * averaged))
         if frames >= LEAST_FRAMES:
             noisier, memory = _limits(frames)
             stack, pair = value.var(axis=0, ddof=1), 0.5 * np.mean(np.diff(value, axis=0) ** 2, axis=0)

@@ -1,104 +1,97 @@
 """What noise of lines adds to scalar probes: offsets of rows and columns, and lines that flicker with the light."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
-from ...generator.line.line_state import EACH_LINE, LineFlicker, between_lines
+from ...generator.line.line_state import between_lines
 from ..session.summaries import BLOCK_PX
-from .fixed_pattern import Pattern, sum_of_patterns
+from .fixed_pattern import Pattern
 from .scalar_context import ScalarContext
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LineNoise:
-    """Variances, DN^2, of what rows and columns of one frame have in common.
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What rows and columns have in common for one reason.
 
-    Fields: row, column: of offsets, the same with and without light; together_lines: over which these fade; flicker: of lines with
-    the light, None: none; squares: mean square of the signal over all good pixels and over those of each label; of_rows, of_columns:
-    mean square of the signal's means along rows and columns.
+    Fields: row, column: variances, DN^2, of flicker relative; together_lines: over which it fades; squares: what these are multiplied
+    with in all good pixels, and in those of each label: 1, of flicker the mean square of the signal; of_rows, of_columns: the same of
+    means along rows and columns.
     """
 
     row: float
     column: float
-    together_lines: float = EACH_LINE
-    flicker: LineFlicker | None = None
-    squares: tuple[float, ...] = (0.0,)
-    of_rows: float = 0.0
-    of_columns: float = 0.0
+    together_lines: float
+    squares: tuple[float, ...]
+    of_rows: float = 1.0
+    of_columns: float = 1.0
+
+    def pixel(self, label: int | None) -> tuple[float, float]:
+        """Variances of rows and of columns in single pixels, DN^2: of all good ones, or of a label's."""
+        square = self.squares[0 if label is None else 1 + label]
+        return self.row * square, self.column * square
+
+
+@dataclass(frozen=True, slots=True)
+class LineNoise:
+    """Variances, DN^2, of what rows and columns of one frame have in common.
+
+    parts: offsets, the same with and without light, and lines that flicker with it.
+    """
+
+    parts: tuple[_Part, ...]
 
     @staticmethod
     def of(expected: ExpectedSeries, context: ScalarContext) -> "LineNoise":
         """Of a series as the model expects it."""
-        flicker = expected.flicker
-        alone = LineNoise(
-            row=expected.row_variance_DN2,
-            column=expected.column_variance_DN2,
-            together_lines=expected.offsets_together_lines,
-        )
-        if flicker is None:
-            return alone
-        signal = np.asarray(expected.signal_DN, dtype=np.float64)
-        whole, labels = context.areas.means(signal**2)
-        of_rows, of_columns = (float(np.mean(signal.mean(axis=axis) ** 2)) for axis in (1, 0))
-        return replace(
-            alone,
-            flicker=flicker,
-            squares=(whole, *map(float, labels)),
-            of_rows=of_rows,
-            of_columns=of_columns,
-        )
+        offsets, *flicker = _variances(expected)
+        parts = [_Part(*offsets, squares=(1.0,) * (1 + len(context.areas.parts)))]
+        if flicker:
+            signal = np.asarray(expected.signal_DN, dtype=np.float64)
+            whole, labels = context.areas.means(signal**2)
+            lines = (float(np.mean(signal.mean(axis=axis) ** 2)) for axis in (1, 0))
+            parts.append(_Part(*flicker[0], (whole, *map(float, labels)), *lines))
+        return LineNoise(tuple(parts))
 
     def pixel(self, label: int | None = None) -> float:
         """Of single pixels: of all good ones, or of a label's."""
-        return self.row + self.column + float(self._shares(self._square(label)).sum())
+        return sum(sum(part.pixel(label)) for part in self.parts)
 
     def together(self, down: int, right: int, label: int | None = None) -> float:
         """Covariance of pixels so many rows and columns apart."""
-        found = self.row * between_lines(down, self.together_lines)
-        found += self.column * between_lines(right, self.together_lines)
-        if self.flicker is None:
-            return found
-        fades = np.array([self.flicker.correlation(down), self.flicker.correlation(right)])
-        return found + float(self._shares(self._square(label)) @ fades)
+        total = 0.0
+        for part in self.parts:
+            row, column = part.pixel(label)
+            total += row * between_lines(down, part.together_lines) + column * between_lines(right, part.together_lines)
+        return total
 
     def rows(self) -> float:
         """Of rows' offsets, each the mean of all its pixels."""
-        return self.row + float(self._shares(self.of_rows)[0])
+        return sum(part.row * part.of_rows for part in self.parts)
 
     def columns(self) -> float:
         """Of columns' offsets."""
-        return self.column + float(self._shares(self.of_columns)[1])
-
-    def block(self, side: int) -> float:
-        """Of means over side x side pixels."""
-        found = (self.row + self.column) * of_mean(side, self.together_lines)
-        return found + float(self._shares(self._square(None)).sum()) * self._of_mean(side)
+        return sum(part.column * part.of_columns for part in self.parts)
 
     def frame(self, rows: int, columns: int) -> float:
-        """Of means over a frame."""
-        found = self.row * of_mean(rows, self.together_lines) + self.column * of_mean(columns, self.together_lines)
-        if self.flicker is None:
-            return found
-        by_row, by_column = self._shares(self._square(None))
-        return found + float(by_row) * self._of_mean(rows) + float(by_column) * self._of_mean(columns)
+        """Of means over a frame or a part of it, so many rows and columns large."""
+        total = 0.0
+        for part in self.parts:
+            row, column = part.pixel(None)
+            total += row * of_mean(rows, part.together_lines) + column * of_mean(columns, part.together_lines)
+        return total
 
-    def _square(self, label: int | None) -> float:
-        return self.squares[0 if label is None or self.flicker is None else 1 + label]
 
-    def _shares(self, square: float) -> NDArray[np.float64]:
-        """Variance of rows' and of columns' factors at a mean square of the signal."""
-        if self.flicker is None:
-            return np.zeros(2)
-        share = self.flicker.column_share
-        return np.asarray(self.flicker.rms**2 * square * np.array([1.0 - share, share]))
-
-    def _of_mean(self, count: int) -> float:
-        """Variance of the mean of so many lines' factors over that of one."""
-        return 1.0 / count if self.flicker is None else of_mean(count, self.flicker.together_lines)
+def _variances(expected: ExpectedSeries) -> list[tuple[float, float, float]]:
+    """Variances of rows and of columns, and over how many lines they fade: of offsets, DN^2; of flicker, relative, if any."""
+    found = [(expected.row_variance_DN2, expected.column_variance_DN2, expected.offsets_together_lines)]
+    flicker = expected.flicker
+    if flicker is not None:
+        of_columns = flicker.column_share * flicker.rms**2
+        found.append((flicker.rms**2 - of_columns, of_columns, flicker.together_lines))
+    return found
 
 
 @lru_cache(maxsize=64)
@@ -110,27 +103,18 @@ def of_mean(count: int, together_lines: float) -> float:
 
 
 def line_pattern(expected: ExpectedSeries, signal2_DN2: float) -> Pattern:
-    """What rows and columns of one frame have in common, as a fixed pattern's statistics show it; signal2_DN2: mean square signal."""
-    found = [_of_lines(expected.row_variance_DN2, expected.column_variance_DN2, expected.offsets_together_lines)]
-    flicker = expected.flicker
-    if flicker is not None:
-        of_light = flicker.rms**2 * signal2_DN2
-        share = flicker.column_share
-        found.append(_of_lines((1.0 - share) * of_light, share * of_light, flicker.together_lines))
-    return sum_of_patterns(found)
+    """What rows and columns of one frame have in common, as a fixed pattern shows it; signal2_DN2: mean square signal.
 
-
-def _of_lines(rows_DN2: float, columns_DN2: float, together_lines: float) -> Pattern:
-    """Of variances of rows and of columns; neighbours along rows, pixels or blocks, lie in other columns of the same rows."""
-    bent = bent_share(together_lines)
-    # half the mean square of differences of means over neighbouring blocks
-    of_blocks = 2.0 * (of_mean(BLOCK_PX, together_lines) - of_mean(2 * BLOCK_PX, together_lines))
-    return Pattern(
-        pixel_DN2=(1.0 - between_lines(1, together_lines)) * columns_DN2,
-        blocks_DN2=of_blocks * columns_DN2,
-        rows_DN2=bent * rows_DN2,
-        columns_DN2=bent * columns_DN2,
-    )
+    Neighbours along rows, pixels or blocks, lie in other columns of the same rows.
+    """
+    total = np.zeros(4)
+    for (rows, columns, together), square in zip(_variances(expected), (1.0, signal2_DN2), strict=False):
+        bent = bent_share(together)
+        # half the mean square of differences of means over neighbouring blocks
+        of_blocks = 2.0 * (of_mean(BLOCK_PX, together) - of_mean(2 * BLOCK_PX, together))
+        of_pixels = 1.0 - between_lines(1, together)
+        total += square * np.array([of_pixels * columns, of_blocks * columns, bent * rows, bent * columns])
+    return total
 
 
 def bent_share(together_lines: float) -> float:

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from ..session.summaries import PIECE_FRAMES, kurtosis_excess
 
 _COARSEST, _FINEST = 0.04, 0.7  # noise in steps: below, hardly a pixel jumps; above, rounding leaves a Gaussian
-_NODES = 25
-_POINTS = 8192  # of the quadrature
 
 
 def rounded_kurtosis(sd_steps: float, frames: int) -> float:
@@ -33,10 +31,11 @@ def _table(frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """
     from scipy.special import ndtri
 
-    mean = (np.arange(_POINTS) + 0.5) / _POINTS
+    points = 8192
+    mean = (np.arange(points) + 0.5) / points
     noise = np.random.default_rng(0).permuted(np.tile(ndtri(mean), (frames, 1)), axis=1)
-    nodes = np.geomspace(_COARSEST, _FINEST, _NODES)
-    values = np.zeros(_NODES)
+    nodes = np.geomspace(_COARSEST, _FINEST, 25)
+    values = np.zeros(nodes.size)
     for number, sd in enumerate(nodes):
         steps = np.diff(np.rint(mean + sd * noise), axis=0) ** 2
         inside = steps / np.maximum(steps.mean(axis=0), 1e-12)

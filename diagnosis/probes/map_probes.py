@@ -15,7 +15,7 @@ from .registration import gradient
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Template:
     """A map (row, column) to project on, DN, and what it stands for."""
 
@@ -39,7 +39,6 @@ class MapProjection:
         quantum_DN2: NDArray[np.floating],
         white_DN2: NDArray[np.floating],
         autocovariance_table: NDArray[np.floating],
-        tolerance: float = 1e-3,
     ) -> None:
         """`quantum_DN2`, `white_DN2` (row, column): variances of the mean frame's correlated and white parts."""
         weight = np.where(mask, 1.0 / np.maximum(np.asarray(quantum_DN2 + white_DN2, dtype=np.float64), 1e-30), 0.0)
@@ -62,7 +61,7 @@ class MapProjection:
         columns: list[NDArray[np.float64]] = []
         for number in range(len(used)):
             rest = float(left[number, number])
-            if rest > tolerance * own[number]:
+            if rest > 1e-3 * own[number]:
                 chosen.append(number)
                 columns.append(left[number] / math.sqrt(rest))
                 left -= np.outer(columns[-1], columns[-1])
@@ -149,77 +148,45 @@ def _separated(table: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray
 
 def smooth_templates(signal_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, kind: str) -> list[Template]:
     """Level, gradients and curvatures across the field, relative to the signal (darks: in DN)."""
-    rows, columns = mask.shape
-    y = np.linspace(-1.0, 1.0, rows)[:, None]
-    x = np.linspace(-1.0, 1.0, columns)[None, :]
-    base = np.ones(mask.shape) if kind in ("dark", "afterglow") else np.asarray(signal_DN, dtype=np.float64)
-    unit = "DN" if kind in ("dark", "afterglow") else "1"
-    shapes = [
-        ("level", "whole field", np.ones(mask.shape)),
-        ("position", "along columns", x + 0 * y),
-        ("position", "along rows", y + 0 * x),
-        ("position", "curved along columns", x**2 + 0 * y),
-        ("position", "curved along rows", y**2 + 0 * x),
-        ("position", "diagonal", x * y),
-        ("position", "cubic along columns", x**3 + 0 * y),
-        ("position", "cubic along rows", y**3 + 0 * x),
-    ]
-    result = [Template(axis=axis, name=name, unit=unit, image=base * shape) for axis, name, shape in shapes]
+    base, unit = np.asarray(signal_DN, dtype=np.float64), "1"
+    if kind in ("dark", "afterglow"):
+        base, unit = np.ones(mask.shape), "DN"
+    y, x = np.meshgrid(*(np.linspace(-1.0, 1.0, length) for length in mask.shape), indexing="ij")
+    shapes = {
+        "along columns": x,
+        "along rows": y,
+        "curved along columns": x**2,
+        "curved along rows": y**2,
+        "diagonal": x * y,
+        "cubic along columns": x**3,
+        "cubic along rows": y**3,
+    }
     # left half against right, upper against lower quarter: seams of tiles and panels
-    for count, axis_name in ((2, "halves"), (4, "quarters")):
-        for direction in (0, 1):
-            index = (np.arange(mask.shape[direction]) * count // mask.shape[direction]) % 2
-            step = np.where(index == 0, 1.0, -1.0)
-            step_map = step[:, None] * np.ones(mask.shape) if direction == 0 else step[None, :] * np.ones(mask.shape)
-            result.append(
-                Template(
-                    axis="position",
-                    name=f"{axis_name} along {'rows' if direction == 0 else 'columns'}",
-                    unit=unit,
-                    image=base * step_map,
-                )
-            )
-    return result
+    for name, count in (("halves", 2), ("quarters", 4)):
+        for along, place, length in zip(("rows", "columns"), np.indices(mask.shape), mask.shape, strict=True):
+            shapes[f"{name} along {along}"] = np.where(place * count // length % 2 == 0, 1.0, -1.0)
+    level = Template("level", "whole field", unit, base)
+    return [level, *(Template("position", name, unit, base * shape) for name, shape in shapes.items())]
 
 
 def transmission_templates(
-    signal_DN: NDArray[np.floating], open_DN: NDArray[np.floating], mask: NDArray[np.bool_], *, bins: int = 6
+    signal_DN: NDArray[np.floating], open_DN: NDArray[np.floating], mask: NDArray[np.bool_]
 ) -> list[Template]:
-    """Bins of transmission: the signal where -log T lies in each, relative; the open field apart."""
+    """Six bins of transmission: the signal where -log T lies in each, relative; the open field apart."""
     log_t = -np.log(np.clip(np.asarray(signal_DN / np.maximum(open_DN, 1e-12), dtype=np.float64), 1e-9, None))
     covered = mask & (log_t > 0.02)
-    result = [
-        Template(axis="level", name="open field", unit="1", image=np.where(mask & ~covered, signal_DN, 0.0)),
-    ]
-    if covered.sum() < 64:
-        return result
     # behind 6 and more nothing of the primary is left to speak of: one bin, in DN of the open field
     shadow = covered & (log_t > 6.0)
-    if shadow.sum() >= 32:
-        result.append(
-            Template(
-                axis="level",
-                name="shadow, -log T above 6",
-                unit="1",
-                image=np.where(shadow, np.asarray(open_DN, dtype=np.float64), 0.0),
-            )
-        )
     lit = covered & ~shadow
-    if lit.sum() < 64:
-        return result
-    edges = np.unique(np.quantile(log_t[lit], np.linspace(0, 1, bins + 1)))
-    for low, high in pairwise(edges):
-        inside = lit & (log_t >= low) & (log_t <= high)
-        if inside.sum() >= 32:
-            result.append(
-                Template(
-                    axis="level",
-                    name=f"-log T {low:.2f}-{high:.2f}",
-                    unit="1",
-                    image=np.where(inside, signal_DN, 0.0),
-                )
-            )
-    return result
+    parts = [("open field", mask & ~covered, signal_DN)]
+    if covered.sum() >= 64 and shadow.sum() >= 32:
+        parts.append(("shadow, -log T above 6", shadow, open_DN))
+    if lit.sum() >= 64:
+        for low, high in pairwise(np.unique(np.quantile(log_t[lit], np.linspace(0, 1, 7)))):
+            inside = lit & (log_t >= low) & (log_t <= high)
+            if inside.sum() >= 32:
+                parts.append((f"-log T {low:.2f}-{high:.2f}", inside, signal_DN))
+    return [Template("level", name, "1", np.where(inside, image, 0.0)) for name, inside, image in parts]
 
 
 def edge_templates(signal_DN: NDArray[np.floating]) -> list[Template]:
@@ -232,25 +199,17 @@ def edge_templates(signal_DN: NDArray[np.floating]) -> list[Template]:
     y = (np.arange(rows) - (rows - 1) / 2)[:, None] / rows
     x = (np.arange(columns) - (columns - 1) / 2)[None, :] / columns
     result = [
-        Template(axis="sharpness", name="shift along columns", unit="px", image=dx),
-        Template(axis="sharpness", name="shift along rows", unit="px", image=dy),
-        Template(axis="sharpness", name="magnification", unit="1", image=x * dx + y * dy),
-        Template(axis="sharpness", name="rotation", unit="rad", image=x * dy - y * dx),
+        Template("sharpness", "shift along columns", "px", dx),
+        Template("sharpness", "shift along rows", "px", dy),
+        Template("sharpness", "magnification", "1", x * dx + y * dy),
+        Template("sharpness", "rotation", "rad", x * dy - y * dx),
     ]
     for sigma in (0.6, 1.5, 4.0):
         for axis, name in ((1, "columns"), (0, "rows")):
             blurred = gaussian_filter1d(image, sigma, axis=axis, mode="nearest")
-            result.append(
-                Template(axis="sharpness", name=f"blur of {sigma:g} px along {name}", unit="1", image=blurred - image)
-            )
+            result.append(Template("sharpness", f"blur of {sigma:g} px along {name}", "1", blurred - image))
     for sigma in (8.0, 20.0):
         if sigma < 0.4 * min(image.shape):
-            result.append(
-                Template(
-                    axis="sharpness",
-                    name=f"tail of {sigma:g} px",
-                    unit="1",
-                    image=gaussian_filter(image, sigma, mode="nearest") - image,
-                )
-            )
+            blurred = gaussian_filter(image, sigma, mode="nearest")
+            result.append(Template("sharpness", f"tail of {sigma:g} px", "1", blurred - image))
     return result

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...generator.frames.line_model import ExpectedSeries
 from ...generator.line.rounding import variance_before_rounding
 from ..session.summaries import BLOCK_PX, LAGS, LEAST_NOISE_DN2
-from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles, sum_of_patterns
+from .fixed_pattern import Pattern, shares_of_pixels, shares_of_tiles
 from .lasting import BY_CHANCE, chance_in_flat, chances
 from .line_scalars import LineNoise, line_pattern
 from .lost_bits import rounded_kurtosis
@@ -104,7 +104,7 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
         of_column = (column + moving.columns()) * rows + row + line_q * correlation_sum(expected, rows, 1) + mean_w
         values["row_ratio"], values["column_ratio"] = over_total(of_row), over_total(of_column)
     of_block = line_q * correlation_sum(expected, BLOCK_PX, BLOCK_PX) + mean_w
-    values["block_ratio"] = over_total(of_block + BLOCK_PX**2 * (lines.block(BLOCK_PX) + moved))
+    values["block_ratio"] = over_total(of_block + BLOCK_PX**2 * (lines.frame(BLOCK_PX, BLOCK_PX) + moved))
     temporal = np.atleast_1d(np.asarray(expected.temporal_correlation, dtype=np.float64))
     full = max(mean_q + mean_w + lines.pixel() + moved, LEAST_NOISE_DN2)
     for step in (1, 2):
@@ -125,29 +125,21 @@ def _noise_scalars(expected: ExpectedSeries, context: ScalarContext, profile: ND
 
 def _pattern_scalars(expected: ExpectedSeries, context: ScalarContext) -> dict[str, float]:
     """What stands in the mean frame of a flat or dark that does not calibrate: pattern, its blocks and lines, outliers."""
-    values: dict[str, float] = {}
     shape = context.good.shape
     signal2 = context.reference_signal_DN**2 if context.kind == "flat" else 0.0
     # lines that change leave their mean
-    standing = [line_pattern(expected, signal2).times(1.0 / context.frames)]
+    standing = line_pattern(expected, signal2) / context.frames
     if expected.gain_pattern is not None:
         pixels = shares_of_pixels(shape, expected.gain_pattern.correlation_px)
-        standing.append(pixels.times(PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2))
+        standing += PATTERN_PIXEL_SHARE * expected.gain_pattern.rms**2 * signal2 * pixels
     if expected.tile_pattern is not None:
-        tiles = shares_of_tiles(shape, expected.tile_pattern)
-        standing.append(tiles.times(expected.tile_pattern.rms**2 * signal2))
+        standing += expected.tile_pattern.rms**2 * signal2 * shares_of_tiles(shape, expected.tile_pattern)
     # more quanta's noise in the frames is more of it in their mean
     mean_q, _ = context.areas.means(expected.quantum_variance_DN2)
     added = (mean_q - context.quantum_DN2) / context.frames
-    standing.append(
-        Pattern(
-            pixel_DN2=added * (1.0 - autocovariance(expected, 0, 1)),
-            blocks_DN2=added * correlation_sum(expected, BLOCK_PX, BLOCK_PX) / BLOCK_PX**2,
-            rows_DN2=added / shape[1],
-            columns_DN2=added / shape[0],
-        )
-    )
-    values |= with_pattern({}, sum_of_patterns(standing), context.pattern_noise)
+    of_blocks = correlation_sum(expected, BLOCK_PX, BLOCK_PX) / BLOCK_PX**2
+    standing += added * np.array([1.0 - autocovariance(expected, 0, 1), of_blocks, 1.0 / shape[1], 1.0 / shape[0]])
+    values = with_pattern({}, standing, context.pattern_noise)
     # about half of the hot ones are lost in a flat's light
     hot, bad = expected.hot_pixel_share, expected.bad_pixel_share
     seen = _jumping(expected, context)[1] + (hot if context.kind == "dark" else bad - 0.5 * hot)
@@ -163,20 +155,13 @@ def with_pattern(values: Mapping[str, float], standing: Pattern, noise: Pattern)
     The roots of variances of pixels and blocks over those of noise, and half their logarithm for rows and columns.
     """
     result = dict(values)
-    for name, more, own in (
-        (FIXED, standing.pixel_DN2, noise.pixel_DN2),
-        (FIXED_BLOCKS, standing.blocks_DN2, noise.blocks_DN2),
-    ):
-        if own is not None:
-            result[name] = math.sqrt(max(values.get(name, 1.0) ** 2 + (more or 0.0) / own, _LEAST_PATTERN))
-    if noise.rows_DN2 is None or noise.columns_DN2 is None:
-        return result
-    for name, more, own in (
-        (FIXED_ROWS, standing.rows_DN2, noise.rows_DN2),
-        (FIXED_COLUMNS, standing.columns_DN2, noise.columns_DN2),
-    ):
-        before = math.exp(2.0 * values.get(name, 0.0))
-        result[name] = 0.5 * math.log(max(before + (more or 0.0) / own, _LEAST_PATTERN))
+    pixel, block, rows, columns = map(float, standing / noise)
+    for name, more in ((FIXED, pixel), (FIXED_BLOCKS, block)):
+        result[name] = math.sqrt(max(values.get(name, 1.0) ** 2 + more, _LEAST_PATTERN))
+    for name, more in ((FIXED_ROWS, rows), (FIXED_COLUMNS, columns)):
+        if not math.isnan(more):
+            before = math.exp(2.0 * values.get(name, 0.0))
+            result[name] = 0.5 * math.log(max(before + more, _LEAST_PATTERN))
     return result
 
 

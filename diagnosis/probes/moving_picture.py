@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from ...generator.frames.line_model import ExpectedSeries
 from ..session.summaries import LEAST_NOISE_DN2, PIECE_FRAMES
-from ._moving_loops import own_parts, sums_of_lines, sums_of_products
 from .scalar_context import ScalarContext
 
 _KURTOSIS_PIXELS = 2048  # in which a fading picture's is computed
@@ -49,24 +48,25 @@ class MovingPicture:
         if context.kind in ("flat", "object"):
             shape *= areas.pixels(expected.signal_DN)
             shape /= max(float(shape.mean()), 1e-12)
-        largest = own_parts(pixels, shape)
+        pixels -= np.outer(pixels.mean(axis=1), shape)
+        largest = np.maximum(pixels.max(axis=1), -pixels.min(axis=1))
         # a hundredth of a DN adds nothing to any variance
         kept = [at for at, (_, course) in enumerate(changing) if largest[at] * float(np.ptp(course)) > 0.01]
         if not kept:
             return _STILL
         pixels = pixels[kept]
         profiles = np.stack([changing[at][1] - changing[at][1].mean() for at in kept])
-        # those without label lie before the first
-        starts = np.array([0, *(part.start for part in areas.parts), areas.order.size], dtype=np.intp)
-        sums = sums_of_products(pixels, starts)
-        counts = np.maximum(np.diff(starts), 1)[1:, None, None]
-        lines = sums_of_lines(pixels, areas.order, *good.shape)
-        means = [own / np.maximum(good.sum(axis=axis), 1) for own, axis in zip(lines, (1, 0), strict=True)]
+        rows, columns = np.divmod(areas.order, good.shape[1])
+        lines = []
+        for axis, number in ((1, rows), (0, columns)):
+            counts = good.sum(axis=axis)
+            sums = [np.bincount(number, weights=one, minlength=len(counts)) for one in pixels]
+            lines.append(_mean_product(np.array(sums) / np.maximum(counts, 1)))
         steps = np.diff(profiles, axis=1)
         stride = max(areas.order.size // _KURTOSIS_PIXELS, 1)
         return MovingPicture(
-            (sums.sum(axis=0) / max(areas.order.size, 1), *(sums[1:] / counts)),
-            tuple(_mean_product(one) for one in means),
+            (_mean_product(pixels), *(_mean_product(pixels[:, part]) for part in areas.parts)),
+            tuple(lines),
             0.5 * steps @ steps.T / steps.shape[1],
             profiles,
             areas.order[::stride],

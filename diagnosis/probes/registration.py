@@ -13,23 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.spread._fine_picture import FINE
+from ..session.even_maps import local_range
 
 RENDER_SHARE = 0.1  # of the local range: how well a pixel that an edge cuts is rendered
 # shares of the local range that count as noise, round by round: far from the solution a picture's curvature is no evidence
 _CAUTION = (0.5, 0.3, 0.15, *(RENDER_SHARE,) * 3)
 _SETTLED_PX = 0.0005  # step below which a further one with the same share changes nothing
 LARGEST_PX = 6.0  # displacement beyond which a scene is not where it is said to be
+SEEN_PX = 0.3  # standard deviation below which a displacement is seen
 _STRAY_PX = 2.0  # radius over which light that strays is taken as even
-_WEAK = 0.05
+_WEAK = 0.05  # of what shows along the other direction
 _BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
-_DRAWN_ROUNDS, _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = 6, 0.03, 0.002
+_DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = (
+    0.03,
+    0.002,
+)  # of differences of drawn pictures; below which a further step changes nothing
 _LARGEST_STEP_PX = 0.25
 _SAME_SLOPES_PX = 0.1  # step after which slopes are drawn anew
 _WORTH_A_CELL = 0.98  # share of what is left from which a step further on helps
 _SHARP_BLUR_PX = 1.5  # standard deviation; the parabola through what an edge of it leaves errs by 0.004 px at most
-CELL_SD_PX = 1.0 / (FINE * math.sqrt(12.0))  # of a displacement that is known to a cell of the drawing
+ANYWHERE_SD_PX = 1.0 / math.sqrt(12.0)  # of a place that may be anywhere in a pixel
+CELL_SD_PX = ANYWHERE_SD_PX / FINE  # of a displacement that is known to a cell of the drawing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +50,7 @@ class Placement:
     @property
     def found(self) -> bool:
         """Whether anything in the scene has shown where it lies."""
-        return self.row_sd_px < 0.3 or self.column_sd_px < 0.3
+        return min(self.row_sd_px, self.column_sd_px) < SEEN_PX
 
 
 def gradient(image: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -68,12 +74,12 @@ def render_variance(
     return np.asarray(result**2, dtype=np.float64)
 
 
-def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.float64]:
-    """Largest less least signal (row, column) within `reach` pixels of each, DN."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    size = 2 * reach + 1
-    return np.asarray(maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size), dtype=np.float64)
+def without_border(mask: NDArray[np.bool_], margin_px: int = 3) -> NDArray[np.bool_]:
+    """The mask (row, column) less its outermost pixels."""
+    inner = (slice(margin_px, -margin_px),) * 2
+    left = np.zeros_like(mask)
+    left[inner] = mask[inner]
+    return left
 
 
 def fill(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -132,12 +138,9 @@ def register(
         variance: of the measured ones.
         mask: pixels to use; the outermost three are left out.
     """
-    inner = mask.copy()
-    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
-        edge[...] = False
+    inner = without_border(mask)
     current = np.zeros(2)
-    precision = np.eye(2)
-    covariance: NDArray[np.float64] = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+    covariance: NDArray[np.float64] = np.eye(2)
     splines = [_splines(fill(image, mask)) for image in measured]
     models = [np.asarray(model, dtype=np.float64) for model in expected]
     slopes = [np.stack(gradient(model))[:, inner] for model in models]
@@ -149,26 +152,18 @@ def register(
         if settled and caution == before:
             break
         placement = _placement(current, covariance)
-        normal, right = precision.copy(), precision @ current
+        normal, right = np.zeros((2, 2)), current.copy()
         for image, model, noise, design, doubtful in zip(splines, models, variance, slopes, doubts, strict=True):
-            picture = _resampled(image, placement)
             doubt = doubtful * caution**2
             weight = share / (noise + doubt)[inner]
-            level = model[inner]
-            level_weight = float((level * weight) @ level) + 1e-30
-            # a brighter beam is no light that strays: smoothed, what it leaves at an edge would look like a displacement
-            apart = picture - float((level * weight) @ picture[inner]) / level_weight * model
-            residual = (apart - _stray(apart, *_away(inner / (noise + 100.0 * doubt))))[inner]
-            cross = (design * weight) @ level
-            normal += (design * weight) @ design.T - np.outer(cross, cross) / level_weight
-            right += (design * weight) @ residual - cross * float((level * weight) @ residual) / level_weight
-        # along a single edge nothing shows the displacement: a weak direction stays where the prior has it
-        values, vectors = np.linalg.eigh(normal - precision)
-        weak = values < _WEAK * values[-1]
-        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
-        covariance = np.asarray((vectors * np.where(weak, 1.0, inverse)) @ vectors.T, dtype=np.float64)
+            away = _away(inner / (noise + 100.0 * doubt))
+            residual, level = _left(_resampled(image, placement), model, inner=inner, weight=weight, away=away)
+            more, toward = _slope(residual, level, design, weight)
+            normal += more
+            right += toward
+        inverse, covariance = _inverse(normal)
         # where the measured picture still lies further on than the model, the residual falls along the model's slope
-        step = -((vectors * inverse) @ vectors.T) @ right
+        step = -inverse @ right
         current = np.clip(current + np.clip(step, -1.0, 1.0), -LARGEST_PX, LARGEST_PX)
         settled = float(np.hypot(*step)) < _SETTLED_PX
     return _placement(current, covariance)
@@ -222,9 +217,7 @@ def register_drawn(
     """
     from scipy.ndimage import gaussian_filter
 
-    inner = mask.copy()
-    for edge in (inner[:3], inner[-3:], inner[:, :3], inner[:, -3:]):
-        edge[...] = False
+    inner = without_border(mask)
     images = [fill(image, mask) for image in measured]
     blur_px = _SHARP_BLUR_PX if whole_cells else 0.0
 
@@ -270,7 +263,7 @@ def register_drawn(
     rest = fit.of(models)
     covariance: NDArray[np.float64] = np.eye(2)
     slopes: list[NDArray[np.float64]] = []
-    for _ in range(_DRAWN_ROUNDS):
+    for _ in range(6):
         if not slopes:
             moved = [drawn((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
             slopes = [
@@ -278,12 +271,8 @@ def register_drawn(
                 for model, *pair in zip(models, *moved, strict=True)
             ]
         normal, right = fit.slope(models, slopes)
-        # along a single edge nothing shows the displacement: a weak direction stays where it is
-        values, vectors = np.linalg.eigh(normal)
-        weak = values < _WEAK * values[-1]
-        inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
-        covariance = np.asarray((vectors * np.where(weak, 1.0, inverse)) @ vectors.T, dtype=np.float64)
-        onward = np.clip(((vectors * inverse) @ vectors.T) @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        inverse, covariance = _inverse(normal)
+        onward = np.clip(inverse @ right, -_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         for part in (1.0, 0.4, 0.1):
             there = np.clip(current + part * onward, -LARGEST_PX, LARGEST_PX)
             pictures = drawn((float(there[0]), float(there[1])))
@@ -337,34 +326,74 @@ class _LeftOver:
     weights: Sequence[float]
     away: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
-    def _residuals(
-        self, models: Sequence[NDArray[np.floating]]
+    def _each(
+        self, models: Sequence[NDArray[np.float64]]
     ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float]]:
-        """Residual and level (pixel,) and weight of each image, the level fitted."""
+        """Residual, level (pixel,) and weight of each image."""
         for image, model, weight, away in zip(self.images, models, self.weights, self.away, strict=True):
-            level = np.asarray(model, dtype=np.float64)[self.inner]
-            power = float(level @ level) + 1e-30
-            # the level first, as in `register`
-            brighter = float(level @ image[self.inner]) / power
-            apart = np.asarray(image - brighter * model, dtype=np.float64)
-            residual = (apart - _stray(apart, *away))[self.inner]
-            share = float(level @ residual) / power
-            yield residual - share * level, level, weight
+            yield *_left(image, model, inner=self.inner, weight=weight, away=away), weight
 
-    def of(self, models: Sequence[NDArray[np.floating]]) -> float:
+    def of(self, models: Sequence[NDArray[np.float64]]) -> float:
         """Sum of squares."""
-        return sum(weight * float(residual @ residual) for residual, _, weight in self._residuals(models))
+        return sum(weight * float(residual @ residual) for residual, _, weight in self._each(models))
 
     def slope(
-        self, models: Sequence[NDArray[np.floating]], slopes: Sequence[NDArray[np.float64]]
+        self, models: Sequence[NDArray[np.float64]], slopes: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Normal matrix (2, 2) and right side (2,) of the step that leaves least, for slopes (2, pixel) of each picture."""
-        normal, right = np.zeros((2, 2)), np.zeros(2)
-        for (residual, level, weight), design in zip(self._residuals(models), slopes, strict=True):
-            cross = design @ level
-            normal += weight * (design @ design.T - np.outer(cross, cross) / (float(level @ level) + 1e-30))
-            right += weight * (design @ residual)
+        """The sum of `_slope` over all pictures, for slopes (2, pixel) of each."""
+        each = zip(self._each(models), slopes, strict=True)
+        found = [_slope(residual, level, design, weight) for (residual, level, weight), design in each]
+        normal, right = (np.sum(parts, axis=0) for parts in zip(*found, strict=True))
         return normal, right
+
+
+def _left(
+    picture: NDArray[np.float64],
+    model: NDArray[np.float64],
+    *,
+    inner: NDArray[np.bool_],
+    weight: NDArray[np.float64] | float,
+    away: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What a model leaves of a picture in the inner pixels, level and smooth light left free, and its level there, each (pixel,).
+
+    picture, model, inner (row, column); weight (pixel,), or one for all; away: see `_away`.
+    """
+    level = model[inner]
+    weighed = weight * level
+    power = float(weighed @ level) + 1e-30
+    # a brighter beam is no light that strays: smoothed, what it leaves at an edge would look like a displacement
+    apart = picture - float(weighed @ picture[inner]) / power * model
+    residual = (apart - _stray(apart, *away))[inner]
+    return residual - float(weighed @ residual) / power * level, level
+
+
+def _slope(
+    residual: NDArray[np.float64],
+    level: NDArray[np.float64],
+    design: NDArray[np.float64],
+    weight: NDArray[np.float64] | float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normal matrix (2, 2) and right side (2,) of the step that leaves least, the level left free.
+
+    residual, level: see `_left`; design: slopes of the picture (2, pixel).
+    """
+    weighed = weight * design
+    cross = weighed @ level
+    normal = weighed @ design.T - np.outer(cross, cross) / (float((weight * level) @ level) + 1e-30)
+    return normal, np.asarray(weighed @ residual)
+
+
+def _inverse(normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What makes of a right side a step, and the step's covariance, each (2, 2), with a prior of one pixel to either side.
+
+    Along a single edge nothing shows the displacement: a weak direction stays where it is, as uncertain as the prior has it.
+    """
+    values, vectors = np.linalg.eigh(normal)
+    weak = values < _WEAK * values[-1]
+    inverse = np.where(weak, 0.0, 1.0 / (np.maximum(values, 0.0) + 1.0))
+    step, covariance = ((vectors * one) @ vectors.T for one in (inverse, np.where(weak, 1.0, inverse)))
+    return step, covariance
 
 
 def _away(weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -384,10 +413,7 @@ def _stray(
 
 
 def _placement(values: NDArray[np.float64], covariance: NDArray[np.float64]) -> Placement:
-    sd = np.sqrt(np.diag(covariance))
+    sds = np.sqrt(np.diag(covariance) + 1e-3**2)  # none is known better than that
     return Placement(
-        row_px=float(values[0]),
-        column_px=float(values[1]),
-        row_sd_px=math.sqrt(float(sd[0] ** 2) + 1e-6),
-        column_sd_px=math.sqrt(float(sd[1] ** 2) + 1e-6),
+        row_px=float(values[0]), column_px=float(values[1]), row_sd_px=float(sds[0]), column_sd_px=float(sds[1])
     )

@@ -235,7 +235,7 @@ def _seen_series(
     Raises:
         InputError: there are none.
     """
-    stated, skipped = stated_series(session, acquisition, model.base.maps.shape)
+    stated, skipped = stated_series(session, acquisition)
     tell("expectation")
     expected, refused = model.expect_all(stated)
     skipped += refused

@@ -19,9 +19,9 @@ from ..probes.fixed_pattern import count_outliers, pattern_statistics
 from ..probes.frame_scalars import measured_scalars
 from ..probes.map_probes import MapProjection, Template, edge_templates, smooth_templates, transmission_templates
 from ..probes.probes import ProbeName, Scalar
-from ..probes.registration import RENDER_SHARE, local_range, render_variance
+from ..probes.registration import RENDER_SHARE, render_variance
 from ..probes.straight_edge import distance_px, scatter_share, straight_scene
-from ..session.even_maps import Map, full_size, near_steps, signal_map
+from ..session.even_maps import Map, full_size, local_range, near_steps, signal_map
 from ..session.summaries import LEAST_NOISE_DN2, SeriesSummary
 
 _NEIGHBOURS_PX = 5  # side of the squares whose mean says how much light is there
@@ -232,7 +232,7 @@ def series_probes(
         outliers = count_outliers(
             frame.residual_DN,
             noise,
-            pattern.pixel_DN2,
+            float(pattern[0]),
             clean=clean,
             good=good if lasting is None else good & ~lasting,
             least_DN=least_DN,

@@ -17,7 +17,6 @@ from ...generator.spread.psf import blur_variance_share
 
 _MODEL = "sampled"
 _WIDEST = 8.0  # squares that light may spread over
-_STEPS = 50  # of a bisection
 
 
 def twin_in_squares(twin: Twin, factor: int) -> Twin:
@@ -82,14 +81,14 @@ def _noise(noise: NoiseModel, factor: int) -> NoiseModel:
 
 def _width_that_leaves(share: float) -> float:
     """Spread, in squares, of quanta counted per square that leaves this share of their variance there."""
-    low, high = 0.0, _WIDEST
-    for _ in range(_STEPS):
-        middle = 0.5 * (low + high)
-        if blur_variance_share(_MODEL, middle) > share:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
+    from scipy.optimize import brentq
+
+    def too_much(width: float) -> float:
+        return blur_variance_share(_MODEL, width) - share
+
+    if too_much(_WIDEST) >= 0.0:
+        return _WIDEST
+    return float(brentq(too_much, 0.0, _WIDEST, xtol=1e-12))
 
 
 def _level(level: Level, noise: NoiseModel, factor: int) -> Level:

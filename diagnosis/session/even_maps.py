@@ -1,4 +1,7 @@
-"""Maps that are the same everywhere stand as (1, 1), which is quicker to add and to project; to that form, to full size, means."""
+"""Maps that are the same everywhere stand as (1, 1), which is quicker to add and to project; to that form, to full size, means.
+
+And what a map does around each of its pixels: its range there, and where it has a step.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +36,14 @@ def signal_map(expected: ExpectedSeries, shape: tuple[int, ...]) -> NDArray[np.f
 def mean_over(image: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:
     """Mean of a map over the pixels of a mask (row, column)."""
     return float(np.mean(full_size(image, mask.shape)[mask]))
+
+
+def local_range(signal_DN: NDArray[np.floating], reach: int = 1) -> NDArray[np.float64]:
+    """Largest less least signal (row, column) within `reach` pixels of each, DN."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    size = 2 * reach + 1
+    return np.asarray(maximum_filter(signal_DN, size) - minimum_filter(signal_DN, size), dtype=np.float64)
 
 
 def near_steps(signal: NDArray[np.floating]) -> NDArray[np.bool_]:

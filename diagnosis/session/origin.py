@@ -1,8 +1,7 @@
 """Whether a twin was calibrated from the very series that it is to be compared with."""
 
 import math
-from collections.abc import Iterator, Sequence
-from itertools import chain
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from ...generator.line.twin import Twin
 _MOST_SERIES = 12  # of each kind that are looked at
 _SURE = 10.0  # standard deviations of a variance of independent pixels; light spreads over a few
 _LEAST_SHARE = 0.05  # of a map's frames that a series must bring to be found
-_NO_NOISE = 1e-9  # DN^2
 _MOST_PAIRS = 8  # of frames that a series' noise is taken from
 
 
@@ -29,30 +27,28 @@ def made_of(twin: Twin, series: Sequence[Series]) -> bool:
     """
     good = twin.maps.bad_pixels == 0
     sure = max(_SURE * math.sqrt(2.0 / max(int(np.count_nonzero(good)), 1)), _LEAST_SHARE)
-    return any(ratio < 1.0 - sure for ratio in chain(_darks(twin, series, good), _flats(twin, series, good)))
+    for kind in ("dark", "flat"):
+        for item in [one for one in series if one.kind == kind and "gain" not in one.corrected][:_MOST_SERIES]:
+            mean_DN, noise_DN2 = _mean_and_noise(item, good)
+            if noise_DN2 > 1e-9 and any(
+                _variance(apart, good) / noise_DN2 < 1.0 - sure for apart in _from_maps(twin, item, mean_DN, good)
+            ):
+                return True
+    return False
 
 
-def _darks(twin: Twin, series: Sequence[Series], good: NDArray[np.bool_]) -> Iterator[float]:
-    """Variance of each dark's distance from the twin's dark over that of its own noise."""
-    for item in [one for one in series if one.kind == "dark"][:_MOST_SERIES]:
-        mean_DN, noise_DN2 = _mean_and_noise(item, good)
-        if noise_DN2 > _NO_NOISE:
-            yield _variance(mean_DN - twin.maps.dark_at(item.exposure_ms), good) / noise_DN2
-
-
-def _flats(twin: Twin, series: Sequence[Series], good: NDArray[np.bool_]) -> Iterator[float]:
-    """The same of each flat's shape and the twin's for its kV and filters."""
-    for item in [one for one in series if one.kind == "flat" and "gain" not in one.corrected][:_MOST_SERIES]:
-        layers = sorted(map(str, item.filters))
-        known = [level for level in twin.levels if level.kV == item.kV and sorted(map(str, level.filters)) == layers]
-        mean_DN, noise_DN2 = _mean_and_noise(item, good)
-        if "offset" not in item.corrected:
-            mean_DN = mean_DN - twin.maps.dark_at(item.exposure_ms)
-        level_DN = float(np.median(mean_DN[good]))
-        if level_DN <= 0.0 or noise_DN2 <= _NO_NOISE:
-            continue
-        for level in known:
-            yield _variance(mean_DN / level_DN - level.flat_shape, good) * level_DN**2 / noise_DN2
+def _from_maps(
+    twin: Twin, item: Series, mean_DN: NDArray[np.float64], good: NDArray[np.bool_]
+) -> list[NDArray[np.float64]]:
+    """Distance (row, column), DN, of a dark from the twin's, or of a flat from each shape it has for the kV and filters."""
+    less_dark_DN = mean_DN - twin.maps.dark_at(item.exposure_ms)
+    if item.kind == "dark":
+        return [less_dark_DN]
+    signal_DN = mean_DN if "offset" in item.corrected else less_dark_DN
+    level_DN = float(np.median(signal_DN[good]))
+    layers = sorted(map(str, item.filters))
+    known = [one for one in twin.levels if one.kV == item.kV and sorted(map(str, one.filters)) == layers]
+    return [signal_DN - level_DN * one.flat_shape for one in known] if level_DN > 0.0 else []
 
 
 def _mean_and_noise(item: Series, good: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:

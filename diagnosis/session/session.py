@@ -66,21 +66,12 @@ def calibrating_names(series: Sequence[Series]) -> frozenset[str]:
             chosen |= {item.name for item in before or darks}
         return frozenset(chosen)
     ordered = sorted((item for item in usable if item.panel_rotation_deg % 360.0 == 0.0), key=lambda item: item.index)
-    chosen = set()
-    seen_darks: set[float | None] = set()
-    seen_flats: set[tuple[object, ...]] = set()
+    first: dict[tuple[object, ...], str] = {}
     for item in ordered:
-        if item.kind == "dark":
-            if item.exposure_ms not in seen_darks:
-                seen_darks.add(item.exposure_ms)
-                chosen.add(item.name)
-            continue
         load = None if item.setting is None else item.setting.tube_load_mAs
-        key = (item.kV, item.filters, item.exposure_ms, load, item.source_detector_mm)
-        if key not in seen_flats:
-            seen_flats.add(key)
-            chosen.add(item.name)
-    return frozenset(chosen)
+        beam = () if item.kind == "dark" else (item.kV, item.filters, load, item.source_detector_mm)
+        first.setdefault((item.exposure_ms, *beam), item.name)
+    return frozenset(first.values())
 
 
 def only_own_noise(session: Sequence[SessionSeries]) -> bool:
@@ -129,30 +120,32 @@ def measured_levels(series: Sequence[Series]) -> dict[str, float]:
     def amount(item: Series, counted: bool) -> float:
         return float((item.photons_per_pixel if counted else item.exposure_ms) or 0.0)
 
+    def level(item: Series) -> float:
+        """Mean of a flat less the dark, DN; 0 where it cannot be told."""
+        if item.kind != "flat" or "log" in item.corrected:
+            return 0.0
+        if "offset" in item.corrected:
+            return _mean_DN(item)
+        if not darks:
+            return 0.0
+        return _mean_DN(item) - float(np.interp(item.exposure_ms or 0.0, *np.array(darks).T))
+
+    beams: dict[tuple[object, ...], list[Series]] = {}
+    for item in unknown:
+        beams.setdefault(beam(item), []).append(item)
     result: dict[str, float] = {}
-    for key in dict.fromkeys(beam(item) for item in unknown):
-        members = [item for item in unknown if beam(item) == key]
-        levels: dict[str, float] = {}
-        for item in members:
-            measurable = item.kind == "flat" and "log" not in item.corrected
-            if not measurable or not (darks or "offset" in item.corrected):
-                continue
-            dark = 0.0
-            if "offset" not in item.corrected:
-                exposures_ms, levels_DN = np.array(darks).T
-                dark = float(np.interp(item.exposure_ms or 0.0, exposures_ms, levels_DN))
-            levels[item.name] = _mean_DN(item) - dark
-        levels = {name: level for name, level in levels.items() if level > 0}
+    for members in beams.values():
+        levels = {item.name: found for item in members if (found := level(item)) > 0}
         counted = all((item.photons_per_pixel or 0.0) > 0 for item in members)
-        first = [item for item in members if item.name in levels and item.name in calibrating]
-        first = first or [item for item in members if item.name in levels]
+        measured = [item for item in members if item.name in levels]
+        first = [item for item in measured if item.name in calibrating] or measured
         if not first:
             continue
-        rates = np.array([levels[item.name] / amount(item, counted) for item in first])
+        weights = np.array([levels[item.name] for item in first])
+        rates = weights / [amount(item, counted) for item in first]
         if float(rates.max()) > _ONE_RATE * float(rates.min()):
             result |= levels
             continue
-        weights = np.array([levels[item.name] for item in first])
         rate = float(np.sum(weights * rates) / np.sum(weights))
         result |= {item.name: rate * amount(item, counted) for item in members if amount(item, counted) > 0}
     return result
@@ -189,8 +182,8 @@ def read_session(
     ordered = sorted(acquisition.series, key=lambda item: item.index)
     if not ordered:
         raise InputError(f"acquisition {acquisition.path}", received="no series", expected="darks and flats at least")
-    stated = any(item.role == "calibration" for item in ordered)
-    calibrating = frozenset() if calibrated_elsewhere and not stated else calibrating_names(ordered)
+    elsewhere = calibrated_elsewhere and all(item.role != "calibration" for item in ordered)
+    calibrating = frozenset() if elsewhere else calibrating_names(ordered)
     noiseless = frozenset() if calibrated_elsewhere else _noiseless_beams(ordered, calibrating)
     instrument = acquisition.instrument
     levels = measured_levels(ordered)
@@ -202,12 +195,13 @@ def read_session(
     silent = {item.name for item in lit_too_much}
     for item in sorted((*ordered, *lit_too_much), key=lambda item: item.index):
         exposure_ms = item.exposure_ms or 0.0
-        interval_ms = item.frame_interval_ms
-        if interval_ms is None:
-            interval_ms = exposure_ms * item.averaged + (instrument.readout_ms or 0.0)
         times_s = np.zeros(0) if item.time_s is None else item.time_s
-        if item.frame_interval_ms is None and len(times_s) > 1:
+        if item.frame_interval_ms is not None:
+            interval_ms = item.frame_interval_ms
+        elif len(times_s) > 1:
             interval_ms = 1000.0 * float(np.median(np.diff(times_s)))
+        else:
+            interval_ms = exposure_ms * item.averaged + (instrument.readout_ms or 0.0)
         clocked = len(times_s) > 0 and one_clock
         if clocked:
             start = float(times_s[0])
@@ -224,14 +218,8 @@ def read_session(
                 scenes[item.scene] = {material: scene.thickness_mm[material] for material in scene.thickness_mm}
             thickness = scenes[item.scene]
         calibrates = item.name in calibrating
-        if calibrated_elsewhere and not stated:
-            after = True
-        elif item.role is not None:
-            after = item.role != "calibration"
-        elif calibrates:
-            after = False
-        else:
-            after = not calibrates
+        stated_role = None if elsewhere else item.role
+        after = not calibrates if stated_role is None else stated_role != "calibration"
         request = SeriesRequest(
             kind=item.kind,
             setting=item.setting,

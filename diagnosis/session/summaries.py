@@ -4,7 +4,6 @@ The common factor of each frame (tube output, global offset) is taken out before
 kept beside it. Noise is judged from differences of successive frames, so that slow drift stays out of it.
 """
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -242,7 +241,7 @@ def summarise_series(
     frame_means = []
     codes: NDArray[np.int64] | None = np.zeros(0, dtype=np.int64)
     saturated = 0
-    blocks = _block_weights(good)
+    blocks = in_blocks(good).sum(axis=(1, 3), dtype=np.float32)
     row_count = np.maximum(use.sum(axis=1), 1.0)
     column_count = np.maximum(use.sum(axis=0), 1.0)
     code_parts: list[NDArray[Any]] = []
@@ -273,7 +272,7 @@ def summarise_series(
             # each line counts as it has pixels: of a dead one few are left, whose mean is as noisy as a pixel
             row_sum += float(np.mean(d.sum(axis=2) ** 2 / row_count)) / shape[1] / 2.0 * len(d)
             column_sum += float(np.mean(d.sum(axis=1) ** 2 / column_count)) / shape[0] / 2.0 * len(d)
-            block = _block_means(d, good, blocks)
+            block = _block_means(d, blocks)
             block_sum += float(np.mean(block**2)) / 2.0 * len(d) if block.size else 0.0
         if len(x) > 3:
             centred = cleaned - cleaned.mean(axis=0)
@@ -316,18 +315,9 @@ def summarise_series(
 
 def _codes(values: NDArray[np.integer[Any]]) -> tuple[int, int]:
     """How many whole numbers occur between the 1st and 99th percentile, and how many there are from first to last of them."""
-    least = int(values.min())
-    counts = np.bincount((values - values.min()).astype(np.intp))
-    below = np.cumsum(counts)
-
-    def percentile(share: float) -> float:
-        place = share * (values.size - 1)
-        first, second = np.searchsorted(below, [math.floor(place), math.ceil(place)], side="right")
-        return float(first + (second - first) * (place - math.floor(place)))
-
-    low, high = int(percentile(0.01) + least) - least, int(percentile(0.99) + least) - least
-    there = np.flatnonzero(counts[max(low, 0) : high + 1])
-    return there.size, int(there[-1] - there[0]) + 1
+    low, high = (int(one) for one in np.percentile(values, [1, 99]))
+    there = np.unique(values[(values >= low) & (values <= high)])
+    return there.size, int(there[-1]) - int(there[0]) + 1
 
 
 def _standing_still(raw: NDArray[Any], d2: NDArray[np.float32], good: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -355,17 +345,14 @@ def _shifted(shape: tuple[int, int], dr: int, dc: int) -> tuple[tuple[slice, sli
     return first, second
 
 
-def _block_weights(good: NDArray[np.bool_]) -> NDArray[np.float32]:
-    rows, columns = (side - side % BLOCK_PX for side in good.shape)
-    part = good[:rows, :columns].reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
-    return np.asarray(part.sum(axis=(1, 3)), dtype=np.float32)
+def in_blocks(images: NDArray[Any]) -> NDArray[Any]:
+    """Whole blocks of BLOCK_PX of images (..., row, column), as (..., block row, row, block column, column)."""
+    rows, columns = (side // BLOCK_PX for side in images.shape[-2:])
+    whole = images[..., : rows * BLOCK_PX, : columns * BLOCK_PX]
+    return whole.reshape(*images.shape[:-2], rows, BLOCK_PX, columns, BLOCK_PX)
 
 
-def _block_means(d: NDArray[np.float32], good: NDArray[np.bool_], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means over blocks (n, block): only blocks with three good pixels in four."""
-    rows, columns = (side - side % BLOCK_PX for side in good.shape)
-    if rows == 0 or columns == 0:
-        return np.zeros((len(d), 0), np.float32)
-    part = d[:, :rows, :columns].reshape(len(d), rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
+def _block_means(d: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means over blocks (n, block) that have three good pixels in four; weights (block row, block column): how many they have."""
     keep = weights >= 0.75 * BLOCK_PX**2
-    return np.asarray((part.sum(axis=(2, 4)) / np.maximum(weights, 1.0))[:, keep], dtype=np.float32)
+    return np.asarray((in_blocks(d).sum(axis=(2, 4)) / np.maximum(weights, 1.0))[:, keep], dtype=np.float32)

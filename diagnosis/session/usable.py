@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acquisition.acquisition_io import AcquisitionFile
-from ...errors import InputError
 from ...generator.frames.line_model import ExpectedSeries
-from .even_maps import full_size, signal_map
+from .even_maps import full_size, local_range, signal_map
 from .session import SessionSeries
 from .summaries import LEAST_NOISE_DN2, FirstLook, SeriesSummary, look_at_series, summarise_series
 
@@ -54,27 +53,15 @@ def counted_copies(kept: Sequence[SessionSeries], looks: Mapping[str, FirstLook]
 
 
 def stated_series(
-    session: Sequence[SessionSeries], acquisition: AcquisitionFile, shape: tuple[int, int]
+    session: Sequence[SessionSeries], acquisition: AcquisitionFile
 ) -> tuple[list[SessionSeries], list[str]]:
-    """Series that say what the model must know, and why each of the others cannot be used.
-
-    Raises:
-        InputError: a series of another detector than the twin's (shape: its rows and columns).
-    """
+    """Series that say what the model must know, and why each of the others cannot be used."""
     usable: list[SessionSeries] = []
     skipped: list[str] = []
     for item in session:
-        series = item.series
-        if series.shape != shape:
-            raise InputError(
-                f"series {series.name}",
-                received=f"frames of {series.shape}",
-                expected=f"the twin's detector of {shape}",
-                remedy="diagnose sessions of the detector that the twin was calibrated from",
-            )
         reason = _why_not(item, acquisition)
         if reason:
-            skipped.append(f"{series.name}: {reason}")
+            skipped.append(f"{item.name}: {reason}")
         else:
             usable.append(item)
     return usable, skipped
@@ -134,9 +121,7 @@ def look_at_all(
             if (readable[item.name] & good).sum() < min(_LABEL_PIXELS, good.sum() / 2):
                 left_out[item.name] = f"{item.name}: so dark that noise below 0 was cut off in nearly all pixels"
                 continue
-        labels[item.name], label_names[item.name] = _labels(
-            signal, float(signal.max()), item.series.kind, good & readable[item.name]
-        )
+        labels[item.name], label_names[item.name] = _labels(signal, item.series.kind, good & readable[item.name])
         tell(f"frames of {item.name}")
         looks[item.name] = look_at_series(
             item.series.iter_frames(),
@@ -205,14 +190,13 @@ def _pattern(item: SessionSeries, signal: NDArray[np.float64], usable: NDArray[n
 
 
 def _labels(
-    signal: NDArray[np.float64], open_DN: float, kind: str, good: NDArray[np.bool_]
+    signal: NDArray[np.float64], kind: str, good: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Noise labels: the whole field, or quartiles of signal away from edges."""
     if kind != "object":
         return np.where(good, 0, -1).astype(np.int64), ("field",)
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    flatness = (maximum_filter(signal, 5) - minimum_filter(signal, 5)) / np.maximum(signal, 1e-9)
+    open_DN = float(signal.max())
+    flatness = local_range(signal, 2) / np.maximum(signal, 1e-9)
     usable = good & (flatness < 0.15) & (signal > 0.01 * open_DN)
     if usable.sum() < 64:
         usable = good

@@ -10,7 +10,10 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter, median_filter
 
+from raytwin.acquisition import open_acquisition
 from raytwin.cli import main
+from raytwin.diagnosis.session.origin import made_of
+from raytwin.generator.twins.twin_io import read_twin
 
 ROOT = Path(__file__).parents[1]
 FRAMES = ROOT / "data" / "real" / "flexray"
@@ -34,10 +37,15 @@ def own_calculation(folder, *, smooth_px):
 
 
 @pytest.fixture(scope="module")
-def answer(tmp_path_factory):
+def line(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line")
     assert main(["import", "images", str(FRAMES), "-o", str(folder / "line.h5")]) == 0
-    return calibrated(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def answer(line):
+    return calibrated(line)
 
 
 def calibrated(folder):
@@ -48,6 +56,13 @@ def calibrated(folder):
     with contextlib.redirect_stdout(said):
         assert main(["calibrate", str(folder / "line.h5"), "-o", str(folder / "twin.h5"), "--json"]) == 0
     return json.loads(said.getvalue())
+
+
+def test_a_twin_of_single_averaged_frames_knows_the_session_it_was_made_of(line, answer):
+    """Compared with themselves these frames are closer to their maps than any noise: they had been an unknown effect."""
+    with open_acquisition(line / "line.h5") as acquisition:
+        assert made_of(read_twin(line / "twin.h5"), acquisition.of_kind("dark"))
+        assert not made_of(read_twin(line / "twin.h5"), acquisition.of_kind("object"))
 
 
 def test_the_intervals_of_the_crop_hold_a_calculation_of_its_own(answer):

@@ -12,6 +12,7 @@ from ...generator.line.twin import Twin
 _MOST_SERIES = 12  # of each kind that are looked at
 _SURE = 10.0  # standard deviations of a variance of independent pixels; light spreads over a few
 _LEAST_SHARE = 0.05  # of a map's frames that a series must bring to be found
+_ROUNDING = 1e-6  # relative, of maps that are kept in single precision
 _MOST_PAIRS = 8  # of frames that a series' noise is taken from
 
 
@@ -30,9 +31,9 @@ def made_of(twin: Twin, series: Sequence[Series]) -> bool:
     for kind in ("dark", "flat"):
         for item in [one for one in series if one.kind == kind and "gain" not in one.corrected][:_MOST_SERIES]:
             mean_DN, noise_DN2 = _mean_and_noise(item, good)
-            if noise_DN2 > 1e-9 and any(
-                _variance(apart, good) / noise_DN2 < 1.0 - sure for apart in _from_maps(twin, item, mean_DN, good)
-            ):
+            # of a single frame no noise is seen: a map of nothing else is that frame
+            least_DN2 = noise_DN2 * (1.0 - sure) or (_ROUNDING * float(np.max(np.abs(mean_DN)))) ** 2
+            if any(_variance(apart, good) < least_DN2 for apart in _from_maps(twin, item, mean_DN, good)):
                 return True
     return False
 

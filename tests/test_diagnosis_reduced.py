@@ -532,8 +532,8 @@ def test_pauses_that_no_session_states_are_sought_with_a_lag_and_those_it_states
         with open_acquisition(path) as acquisition:
             stated = {item.request.pause_stated for item in read_session(acquisition) if item.series.kind == "flat"}
             problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=wanted)
-        assert any(item.effect == "row_noise" for item in problem.variants)
-        return stated, [item for item in problem.variants if item.effect == "image_lag"]
+        assert any(item.effect == "row_noise" for item in problem.curves)
+        return stated, [item.variant for item in problem.curves if item.effect == "image_lag"]
 
     (known, plain), (unknown, asking) = lags(line / "session.h5"), lags(timeless)
     assert (known, unknown) == ({True}, {False})

@@ -73,10 +73,10 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         levels: of discrepancy.
         exact: the law is taken as exact: a first look, at a fraction of the cost.
     """
-    coarse = curve.log_strengths()
+    own, coarse = curve.variant, curve.log_strengths()
     sharp = _Terms(observed, curve)
     strengths, value = sharp.closed_in(coarse)
-    first = log_integral(strengths, value, curve.low, curve.high)
+    first = log_integral(strengths, value, own.low, own.high)
     found = [(first, strengths, value)]
     if not exact:
         start = float(strengths[int(np.argmax(value))])
@@ -87,9 +87,9 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
         likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
     return CurveFit(
         curve=curve,
-        by_level=by_level + curve.log_prior,
-        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + curve.log_prior,
-        log_evidence=_over_levels(by_level, frequencies) + curve.log_prior,
+        by_level=by_level + own.log_prior,
+        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + own.log_prior,
+        log_evidence=_over_levels(by_level, frequencies) + own.log_prior,
         level=0.0 if exact else levels.levels[likeliest],
         strengths=found[likeliest][1],
         log_likelihood=found[likeliest][2],
@@ -186,7 +186,7 @@ def _at_level(
         # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
         weak = strengths < _WEAK * best
         value = np.where(weak, sharp.at(strengths)[0], value)
-        found = log_integral(strengths, value, curve.low, curve.high), strengths, value
+        found = log_integral(strengths, value, curve.variant.low, curve.variant.high), strengths, value
         before, best = best, float(strengths[int(np.argmax(value))])
         if abs(math.log(best / before)) < _SETTLED:
             break

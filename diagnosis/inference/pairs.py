@@ -68,7 +68,11 @@ def weigh_pairs(
 
     def curves(effect: str, other: str) -> list[Curve]:
         own = [fit.curve for fit in singles[effect].fits]
-        return own + [curve for curve in beside if (curve.effect, curve.beside) == (effect, other)]
+        return own + [
+            curve
+            for curve in beside
+            if curve.effect == effect and curve.variant.beside is not None and curve.variant.beside.id == other
+        ]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
@@ -152,7 +156,8 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     )
     first, second = pair.fits[strong], pair.fits[weak]
     left = second
-    if first.curve.course == "steady" and second.curve.course != "steady" and observed.steady is not None:
+    courses = first.curve.variant.course, second.curve.variant.course
+    if courses[0] == "steady" != courses[1] and observed.steady is not None:
         _, beside = _beside_first(observed, first.point, weak)
         second, left = (
             replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
@@ -196,7 +201,7 @@ def left_in_place(
     top = float(shape.log_likelihood.max())
     likelihood = np.exp(shape.log_likelihood - top)
     left = float(np.trapezoid(likelihood * density, np.log(shape.strengths))) + float(likelihood[0]) * low
-    there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
+    there = log_integral(second.strengths, second.log_likelihood, second.curve.variant.low, second.curve.variant.high)
     return top + math.log(max(left, 1e-300)) - there
 
 
@@ -213,7 +218,7 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
         another: the effect is only like the curve's.
         any_strength: that the curve is tried at, none more plausible than another.
     """
-    curve = point.curve
+    curve, variant = point.curve, point.curve.variant
     slope, curvature = observed.told_of_strength(point)
     width = 1.0 / (curvature + point.strength_sd**-2)
     free = 0.5 * (slope**2 * width + math.log(width / point.strength_sd**2))
@@ -221,6 +226,6 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
     x = strengths / point.strength - 1.0  # responses are nearly straight in the strength
     pull = 0.0 if strengths[0] < point.strength < strengths[-1] else slope
     within = log_integral(
-        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if any_strength else (curve.low, curve.high))
+        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if any_strength else (variant.low, variant.high))
     )
-    return curve.log_prior + point.share + log_frequency(point.level, another=another) + within - free
+    return variant.log_prior + point.share + log_frequency(point.level, another=another) + within - free

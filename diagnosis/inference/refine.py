@@ -5,8 +5,9 @@ standard deviations would be refused for that coarseness alone; so what leads is
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,10 @@ from ...generator.effects.effect import Placement
 from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import CurveFit
-from .discrepancy import USUAL_LEVEL
 from .inference import Hypothesis
 from .observed import Observed, Point
 from .refine_tasks import Task, tasks_of
-from .search import curve_of, searched
+from .search import searched
 from .seen import Blocks, Responder, Seen, Whitener
 
 SEEN_FROM = 3.0  # standard deviations from none at which an effect shows: a session can test it, and it is refined
@@ -31,7 +31,6 @@ _OTHER_ONSET = 0.5  # share of the leading evidence from which a start with the 
 def refine(
     hypotheses: Sequence[Hypothesis],
     *,
-    variants: Mapping[tuple[str, str], Variant],
     curves: Sequence[Curve],
     observed: Observed,
     respond: Responder,
@@ -42,7 +41,6 @@ def refine(
 
     Args:
         hypotheses: of the first weighing, with whitened curves.
-        variants: of the grid, by effect and name.
         curves: of the grid, whitened.
         observed: what is weighed, whitened.
         respond: asks the forward model.
@@ -50,7 +48,7 @@ def refine(
         blocks: of series that share local nuisances; the search asks those that tell most. None: it asks all.
     """
     whole = Seen(observed=observed, respond=respond, whitener=whitener, blocks=blocks)
-    refinement = _Refinement(whole, variants, curves)
+    refinement = _Refinement(whole, curves)
     for task in tasks_of(hypotheses):
         refinement.run(task)
     return refinement.found
@@ -59,65 +57,56 @@ def refine(
 class _Refinement:
     """Variants found so far; what stands beside an effect is taken as it was found last."""
 
-    def __init__(self, whole: Seen, variants: Mapping[tuple[str, str], Variant], curves: Sequence[Curve]) -> None:
+    def __init__(self, whole: Seen, curves: Sequence[Curve]) -> None:
         self._whole = whole
-        self._variants = variants
         self._curves = curves
-        self._closer: dict[str, _Closer] = {}
+        self._closer: dict[str, CurveFit] = {}
         self.found: list[tuple[Variant, NDArray[np.float64]]] = []
 
     def run(self, task: Task) -> None:
         """Refine an effect; one that is not clearly seen, or beside which the other one of its pair is not, is left as it is."""
         seen = self._standing(task)
         if task.beside is not None:
-            if task.moves_more and not self._clear(task.beside[0].effect, seen.beside(self._last(task.own).point)):
+            if task.moves_more and not self._clear(task.beside.curve.effect, seen.beside(self._last(task.own))):
                 return
-            seen = seen.beside(self._last(task.beside).point)
+            seen = seen.beside(self._last(task.beside))
         # brought nearer alone already; the lesser of two is sought anew beside the other, which it may have stood for
         known = self._closer.get(task.effect) if task.moves_more else None
         if known is not None:
-            starts = [(known.variant, seen.fit(known.curve))]
+            starts = [seen.fit(known.curve)]
         else:
             clear = self._clear(task.effect, seen)
-            starts = [
-                (self._variants[task.effect, fit.curve.variant], fit)
-                for fit in _starts_of(clear, task.leads or task.beside is None)
-            ]
+            starts = _starts_of(clear, task.leads or task.beside is None)
             placement = EFFECTS[task.effect].placement
             if placement is not None:
-                starts += _displaced_and_distorted(clear, self._variants, placement)
+                starts += _displaced_and_distorted(clear, placement)
             if task.beside is not None and not task.moves_more:
                 stronger = self._last(task.beside)
-                if not stronger.variant.series:  # what acts in some series only is not there in all
-                    there = stronger.variant.applied(stronger.strength)
-                    starts = [(replace(variant, beside=there), fit) for variant, fit in starts]
-        best: _Closer | None = None
-        for variant, fit in starts:
-            found = searched(variant, fit, seen)
+                if not stronger.curve.variant.series:  # what acts in some series only is not there in all
+                    there = stronger.curve.variant.applied(stronger.strength)
+                    starts = [_with(fit, beside=there) for fit in starts]
+        best: CurveFit | None = None
+        for start in starts:
+            found = searched(start, seen)
             if found is None:
                 continue
             self.found.append(found)
-            name = fit.curve.variant if known is None else known.variant.name
-            like = next(item for item in self._curves if (item.effect, item.variant) == (variant.effect, name))
-            curve = curve_of(found[0], self._whole.own(found[1]), like)
-            at = seen.fit(curve)
-            if best is None or at.log_evidence > best.log_evidence:
-                start = replace(variant, name=name, parameters=found[0].parameters)
-                best = _Closer(start, curve, at.best, at.log_evidence)
+            fit = seen.fit(replace(start.curve, variant=found[0], responses=self._whole.own(found[1])))
+            if best is None or fit.log_evidence > best.log_evidence:
+                best = fit
         # what it is beside another says nothing of it beside a third
-        if best is not None and best.variant.beside is None:
+        if best is not None and best.curve.variant.beside is None:
             self._closer[task.effect] = best
 
     def _standing(self, task: Task) -> Seen:
         """What a task's effects are fitted to: the twin has its effects but these."""
-        effects = [task.effect] if task.beside is None else [task.effect, task.beside[0].effect]
+        effects = [task.effect] if task.beside is None else [task.effect, task.beside.curve.effect]
         return replace(self._whole, observed=self._whole.observed.standing(*effects))
 
-    def _last(self, grid: tuple[Curve, float]) -> "_Closer":
+    def _last(self, grid: Point) -> Point:
         """An effect as it was found last; as the grid has it before."""
-        curve, strength = grid
-        known = self._closer.get(curve.effect)
-        return known or _Closer(self._variants[curve.effect, curve.variant], curve, strength, -math.inf)
+        known = self._closer.get(grid.curve.effect)
+        return grid if known is None else known.point
 
     def _clear(self, effect: str, seen: Seen) -> list[CurveFit]:
         """Fits of an effect's curves of the grid that show it clearly."""
@@ -125,47 +114,34 @@ class _Refinement:
         return [fit for fit in fits if _separation(fit, seen) >= SEEN_FROM]
 
 
-@dataclass(frozen=True, slots=True)
-class _Closer:
-    """An effect as refinement found it: the variant of the grid with other inner parameters, its whitened curve, and its strength."""
-
-    variant: Variant
-    curve: Curve
-    strength: float
-    log_evidence: float
-
-    @property
-    def point(self) -> Point:
-        """What stands there, its law off as usual."""
-        return Point(curve=self.curve, strength=self.strength, level=USUAL_LEVEL)
+def _with(fit: CurveFit, **changed: Any) -> CurveFit:
+    """A fit as the start of its variant with some fields changed."""
+    return replace(fit, curve=replace(fit.curve, variant=replace(fit.curve.variant, **changed)))
 
 
-def _separation(fit: CurveFit, seen: "Seen") -> float:
+def _separation(fit: CurveFit, seen: Seen) -> float:
     """Of a fit from none, its law taken as exact."""
-    response = fit.curve.response(fit.best)
+    response = fit.curve.response(fit.best) / seen.observed.units
     return math.sqrt(max(float(response @ seen.observed.nuisances.solve(response)), 0.0))
 
 
-def _displaced_and_distorted(
-    fits: Sequence[CurveFit], variants: Mapping[tuple[str, str], Variant], placement: Placement
-) -> list[tuple[Variant, CurveFit]]:
+def _displaced_and_distorted(fits: Sequence[CurveFit], placement: Placement) -> list[CurveFit]:
     """A displacement that shifts as the best mere shift does, and enlarges or turns as the best that does so.
 
     From either alone no small step of the angles leads to the other. Empty: one of them is not seen.
     """
     best: dict[bool, tuple[CurveFit, dict[str, float]]] = {}
     for fit in sorted(fits, key=lambda item: item.log_evidence):
-        known = variants[fit.curve.effect, fit.curve.variant].parameters
-        parameters = {**known, "strength": fit.best}
+        parameters = {**fit.curve.variant.parameters, "strength": fit.best}
         best[abs(placement.parts(parameters).shift_px) > 0.5 * fit.best] = fit, parameters
     if len(best) < 2:
         return []
     shift, shifted = best[True]
-    variant = variants[shift.curve.effect, shift.curve.variant]
+    variant = shift.curve.variant
     parameters = placement.combined(shifted, best[False][1])
     strength = min(max(parameters.pop("strength"), variant.low), variant.high)
-    found = replace(shift, strengths=np.array([strength]), log_likelihood=np.zeros(1))
-    return [(replace(variant, parameters=parameters, name=f"{variant.name}, distorted"), found)]
+    found = _with(shift, parameters=parameters, name=f"{variant.name}, distorted")
+    return [replace(found, strengths=np.array([strength]), log_likelihood=np.zeros(1))]
 
 
 def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
@@ -181,6 +157,7 @@ def _starts_of(fits: Sequence[CurveFit], several: bool) -> list[CurveFit]:
     others = [
         item
         for item in ranked
-        if item.curve.since != first.curve.since and item.log_evidence > _OTHER_ONSET * first.log_evidence
+        if item.curve.variant.since != first.curve.variant.since
+        and item.log_evidence > _OTHER_ONSET * first.log_evidence
     ]
     return [first, *(others or ranked[1 : _STARTS if several else 1])[: _STARTS - 1]]

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..model.curves import Curve
+from .discrepancy import USUAL_LEVEL
 from .inference import UNKNOWN, Hypothesis
+from .observed import Point
 
 _MOST_EFFECTS = 4
 # of the best on the grid over none: refinement adds some fifth to it, and far more is needed to be named
@@ -18,16 +19,20 @@ _REACH_OF_PAIRS = 3.0  # log evidence that a pair may lie below its first effect
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """An effect to be refined; of a pair, what stands beside it (curve, strength), and its own curve and strength there.
+    """An effect to be refined: where it is on the grid; of a pair, what stands beside it, and where it is beside that.
 
     moves_more: of a pair, that it moves the probes more than the other one; leads: of the first hypothesis.
     """
 
-    effect: str
-    own: tuple[Curve, float]
-    beside: tuple[Curve, float] | None = None
+    own: Point
+    beside: Point | None = None
     moves_more: bool = False
     leads: bool = False
+
+    @property
+    def effect(self) -> str:
+        """Id of the effect."""
+        return self.own.curve.effect
 
 
 def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
@@ -39,11 +44,14 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
     """
     result: list[Task] = []
     for number, hypothesis in enumerate(_within_reach(hypotheses)):
-        at = {effect: (hypothesis.variants[effect], hypothesis.strengths[effect][0]) for effect in hypothesis.effects}
-        moves = {effect: float(np.sum(curve.response(strength) ** 2)) for effect, (curve, strength) in at.items()}
+        at = {
+            effect: Point(curve=curve, strength=hypothesis.strengths[effect][0], level=USUAL_LEVEL)
+            for effect, curve in hypothesis.variants.items()
+        }
+        moves = {effect: float(np.sum(one.curve.response(one.strength) ** 2)) for effect, one in at.items()}
         more = max(moves, key=lambda effect: moves[effect])
         if number == 0 and len(at) > 1:
-            result.append(Task(more, at[more], leads=True))
+            result.append(Task(at[more], leads=True))
         if len(at) == 1:
             # beside another it went where the two together want it
             known = {task.effect for task in result if task.beside is None}
@@ -52,9 +60,8 @@ def tasks_of(hypotheses: Sequence[Hypothesis]) -> list[Task]:
         for effect in hypothesis.effects:
             if effect not in known and len({task.effect for task in result} | {effect}) <= _MOST_EFFECTS:
                 beside = next((one for name, one in at.items() if name != effect), None)
-                result.append(
-                    Task(effect, at[effect], beside, beside is not None and effect == more, leads=number == 0)
-                )
+                moves_more = beside is not None and effect == more
+                result.append(Task(at[effect], beside, moves_more=moves_more, leads=number == 0))
     # of a pair the one that moves more is first brought to where it is wanted beside the other
     return sorted(result, key=lambda task: (not task.leads, task.beside is not None, not task.moves_more))
 

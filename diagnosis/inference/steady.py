@@ -25,7 +25,7 @@ class Steady:
             whitening: of the curves that are asked for.
         """
         self._whitening = whitening
-        steady = [curve.responses[-1] for curve in curves if curve.course == "steady"]
+        steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
         self._groups = [(members, _directions(np.stack(steady), members)) for members in _of_one_size(alike) if steady]
 
     def of(self, curve: Curve) -> Curve:

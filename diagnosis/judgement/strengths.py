@@ -47,8 +47,7 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
 
 
 def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
-    variant = problem.variant_of(hypothesis.variants[effect])
-    return with_conditions(variant.applied(strength), problem.conditions)
+    return with_conditions(hypothesis.variants[effect].variant.applied(strength), problem.conditions)
 
 
 def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
@@ -65,7 +64,7 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
     value, low, high = hypothesis.strengths[effect] if found is None else found
     sd = reading.law_sd if found is None or reading.sd is None else reading.sd
     below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
-    return value, value * math.exp(-below), max(min(value * math.exp(above), curve.most), value)
+    return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
 
 
 def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
@@ -100,7 +99,7 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
     series went into the twin, so the mean over the session says nothing of the output.
     """
     others = [effect for effect in hypothesis.effects if effect != output]
-    since = hypothesis.variants[output].since == "calibration"
+    since = hypothesis.variants[output].variant.since == "calibration"
     signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
     noises = [_noise_of_a_frame(view) for view in problem.views]
     fields = [_open_field(view) for view in problem.views]

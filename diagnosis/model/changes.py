@@ -17,7 +17,6 @@ from ...generator.effects import EFFECTS, AppliedEffect, Effect
 from ...generator.effects.effect import Parameter
 from ...generator.line.twin import Estimate, SpectralPosterior, Twin
 from ..session.coarse import in_squares
-from .curves import Curve
 
 _MOST_VARIANTS = 4
 
@@ -76,65 +75,40 @@ class Variant:
     """An effect with its inner parameters fixed.
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
-    the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior, most: as of a `Curve`;
-    beside: another effect that is there: its response is what it adds to that one's.
+    the strength; strengths > 0, ascending, at which the response is computed; fitted: its inner parameters with their ranges here;
+    refined_from: name of the variant that was refined to be this one, None: not refined; series: names of those in which it acts
+    (empty: all); log_prior: log probability of that, against one that acts in all; most: strength beyond which there is nothing (a
+    share of 100 %); beside: another effect that is there: its response is what it adds to that one's; course: what the effect is
+    from frame to frame, as `Effect` says (empty: not known).
     """
 
     effect: str
-    name: str
-    parameters: Mapping[str, float]
-    sign: float
-    since: str
+    name: str = ""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    sign: float = 1.0
+    since: str = "always"
     low: float
     high: float
     strengths: tuple[float, ...]
     fitted: tuple[Parameter, ...] = ()
     refined_from: str | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
     most: float = math.inf
     beside: AppliedEffect | None = None
-
-    def curve(
-        self,
-        responses: NDArray[np.float64],
-        *,
-        spread: NDArray[np.float64] | None = None,
-        jitter: NDArray[np.float64] | None = None,
-        exact: NDArray[np.bool_] | None = None,
-    ) -> Curve:
-        """The curve through responses (strength, probe) at this variant's strengths; spread, jitter, exact as in `Curve`."""
-        return Curve(
-            effect=self.effect,
-            variant=self.name,
-            parameters=dict(self.parameters),
-            low=self.low,
-            high=self.high,
-            strengths=np.array(self.strengths),
-            responses=responses,
-            since=self.since,
-            spread=spread,
-            jitter=jitter,
-            exact=exact,
-            series=self.series,
-            log_prior=self.log_prior,
-            most=self.most,
-            beside="" if self.beside is None else self.beside.id,
-            course=EFFECTS[self.effect].course,
-        )
+    course: str = ""
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
         """The same with other inner parameters, asked at other strengths; its name says where it came from."""
         label = ", ".join(f"{name} {value:.3g}" for name, value in parameters.items())
+        first = self.name if self.refined_from is None else self.refined_from
         beside = "" if self.beside is None else f", beside {self.beside.id}"
         return replace(
             self,
             parameters=dict(parameters),
-            name=f"{label}, refined from {self.name}{beside}".strip(", "),
+            name=f"{label}, refined from {first}{beside}".strip(", "),
             strengths=tuple(strengths),
-            refined_from=self.name,
+            refined_from=first,
         )
 
     def applied(self, strength: float) -> AppliedEffect:
@@ -143,7 +117,6 @@ class Variant:
             id=self.effect,
             parameters={**self.parameters, "strength": self.sign * strength},
             since=self.since,
-            options=dict(self.options),
         )
 
 
@@ -208,6 +181,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
                 strengths=nodes,
                 fitted=(*inner, *later),
                 most=strength.most,
+                course=effect.course,
             )
         )
     return result

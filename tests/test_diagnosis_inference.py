@@ -7,7 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
+from raytwin.diagnosis.inference.curve_fits import (
+    CurveFit,
+    fit_curve,
+    fit_effects,
+    interval_of,
+    interval_under,
+    log_integral,
+)
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
@@ -352,6 +359,25 @@ def test_an_interval_covers_the_variants_that_are_as_likely():
     assert one[1] < 4.0 < one[2] < 5.0
     assert both[1] < 4.0
     assert both[2] > 7.5
+
+
+def test_a_variant_counts_in_an_interval_as_much_as_its_evidence_says():
+    rng = np.random.default_rng(4)
+    response = rng.standard_normal(PROBES) * 0.3
+    observed = seen(4.0 * response + rng.standard_normal(PROBES))
+    whole = fit_curve(observed, one_node("a", response), exact=True)
+    one = interval_of([whole])
+    # the same picture at half the size, twice the strength: e^-8 as probable beforehand, or of laws that are off so seldom
+    unlikely = fit_curve(observed, one_node("a", 0.5 * response, log_prior=-8.0), exact=True)
+    seldom = fit_curve(observed, one_node("a", 0.5 * response), exact=True)
+    for other in (unlikely, replace(seldom, log_evidence=seldom.log_evidence - 8.0)):
+        assert interval_of([whole, other]) == pytest.approx(one, rel=0.01)
+    # half as probable as the other one: a third of the posterior
+    half = replace(seldom, log_evidence=seldom.log_evidence - np.log(2.0))
+    nodes = np.geomspace(0.5, 50.0, 20_001)
+    own, twice = (np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood) for fit in (whole, seldom))
+    wanted = interval_under(nodes, np.logaddexp(own, twice - np.log(2.0)))
+    assert interval_of([whole, half]) == pytest.approx(wanted, rel=0.02)
 
 
 @pytest.mark.parametrize("sharpness", [0.3, 3.0, 30.0, 200.0])

@@ -226,14 +226,19 @@ def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.floa
 
 
 def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
-    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence."""
+    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence.
+
+    Each has the shape of its likelihood at the level by which its law is likeliest to be off.
+    """
     top = max(fit.log_evidence for fit in fits)
     likely = [fit for fit in fits if fit.log_evidence >= top - 12.0]
     nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
     total = np.full(len(nodes), -np.inf)
     for fit in likely:
         value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood, left=-np.inf, right=-np.inf)
-        total = np.logaddexp(total, value)
+        variant = fit.curve.variant
+        at_level = log_integral(fit.strengths, fit.log_likelihood, variant.low, variant.high)
+        total = np.logaddexp(total, value + fit.log_evidence - at_level)
     return interval_under(nodes, total)
 
 

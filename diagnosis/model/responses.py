@@ -21,9 +21,9 @@ from ..session.session import SessionSeries
 from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries, counted_copies
 from .calibrated_maps import LEAST_GAIN, CalibratedMaps, exposure_of
-from .changes import DUST_LIMIT
+from .changes import DUST_LIMIT, Change
 from .defects import counting_series
-from .forward_model import Change, ForwardModel
+from .forward_model import ForwardModel
 from .placing import PlacedSeries
 
 Lines = dict[str, Pattern]  # what lines of one frame have in common, DN^2, of each calibrating series

@@ -20,6 +20,7 @@ from ..inference.observed import Point
 from ..inference.unknown import Families
 from ..model.calibrated_maps import LEAST_GAIN, calibrated_maps, exposure_of
 from ..model.changes import (
+    Change,
     Variant,
     always_a_little,
     catalogue_variants,
@@ -30,7 +31,7 @@ from ..model.changes import (
 )
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
-from ..model.forward_model import Change, ForwardModel, draft_cache, own_maps, strength_rows
+from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_rows
 from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
@@ -127,7 +128,7 @@ def build_problem(
 def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:
     """Changes of nuisances that lie in the twin; spectral_steps: as in `twin_changes`."""
     had = {item.id for item in model.base.effects}
-    fitted = [Change.of_twin(step) for step in twin_changes(model.base, spectral_steps=spectral_steps)]
+    fitted = twin_changes(model.base, spectral_steps=spectral_steps)
     little = [item for item in always_a_little(side=side) if item.effect not in had]
     return *fitted, *(replace(model.change(item, item.strengths[0]), label=item.name) for item in little)
 

@@ -30,11 +30,11 @@ from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
 from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
-from raytwin.diagnosis.judgement.strengths import _outright
+from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
-from raytwin.generator.effects import AppliedEffect, Parameter
+from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)
@@ -343,6 +343,21 @@ def test_a_refined_curve_is_not_believed_far_from_the_strengths_that_were_asked(
     value, low, high = _outright(Bare(residual=np.array([30.0 * (6.0 - 36.0 / 26.0), 0.2])), named, "a")
     assert value == pytest.approx(6.0, rel=0.01)
     assert 5.5 < low < high < 6.5
+
+
+def test_how_well_a_strength_is_known_is_what_its_interval_says():
+    curve = one_node("veiling_glare", np.ones(PROBES), low=0.5, high=5.0)
+    exact = Hypothesis(
+        effects=("veiling_glare",),
+        probability=1.0,
+        log_evidence=0.0,
+        strengths={"veiling_glare": (2.0, 2.0, 2.0)},
+        variants={"veiling_glare": curve},
+        levels={"veiling_glare": 0.0},
+    )
+    # nothing but real laws widens it
+    found = applied_at_best(Bare(conditions={}), exact, "veiling_glare")
+    assert found.strength_sd == pytest.approx(EFFECTS["veiling_glare"].reading.law_sd, rel=1e-9)
 
 
 def test_an_interval_covers_the_variants_that_are_as_likely():

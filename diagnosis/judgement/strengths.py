@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
+from ...generator.line.twin import Z95
 from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
@@ -41,7 +42,7 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
         strength = value
     return replace(
         _applied(problem, hypothesis, effect, strength),
-        strength_sd=math.log(high / low) / (2.0 * 1.959964),
+        strength_sd=math.log(high / low) / (2.0 * Z95),
         law_sd=hypothesis.levels[effect],
     )
 
@@ -63,7 +64,7 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
     sd = reading.law_sd if found is None or reading.sd is None else reading.sd
-    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
+    below, above = (math.hypot(math.log(one / value), Z95 * sd) for one in (low, high))
     return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
 
 
@@ -86,7 +87,7 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     responses = curve.weights(strengths) @ curve.responses[:, exact]
     distance = np.sum((left - responses) ** 2, axis=1)
     at = int(np.argmin(distance))
-    near = distance < distance[at] + 1.96**2
+    near = distance < distance[at] + Z95**2
     if at in (0, len(strengths) - 1):
         return None
     return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())

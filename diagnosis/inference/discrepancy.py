@@ -61,16 +61,7 @@ def at_most_off(level: float) -> float:
 def _learnt() -> Levels:
     """As `validation/learn_discrepancy.py` left them."""
     table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
-    levels, kind, another = (tuple(map(float, table[key])) for key in ("levels", "of_kind", "of_another"))
-    return Levels(
-        levels=levels,
-        of_kind=kind,
-        of_another=another,
-        rest_of_kind=float(table["rest_of_kind"]),
-        rest_of_another=float(table["rest_of_another"]),
-        rest_sd_of_kind=float(table["rest_sd_of_kind"]),
-        rest_of_another_log=(float(table["rest_of_another_log"][0]), float(table["rest_of_another_log"][1])),
-    )
+    return Levels(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
 
 
 LEVELS = _learnt()

@@ -69,18 +69,18 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 
     Args:
         observed: what is weighed.
-        curve: in its units.
+        curve: in the units of the first probes.
         levels: of discrepancy.
         exact: the law is taken as exact: a first look, at a fraction of the cost.
     """
-    own, coarse = curve.variant, curve.log_strengths()
-    sharp = _Terms(observed, curve)
+    own, coarse, scaled = curve.variant, curve.log_strengths(), observed.scaled(curve)
+    sharp = _Terms(observed, scaled)
     strengths, value = sharp.closed_in(coarse)
     first = log_integral(strengths, value, own.low, own.high)
     found = [(first, strengths, value)]
     if not exact:
         start = float(strengths[int(np.argmax(value))])
-        found = [_at_level(observed, curve, start, level, sharp) or found[0] for level in levels.levels]
+        found = [_at_level(observed, scaled, start, level, sharp) or found[0] for level in levels.levels]
     by_level = np.array([item[0] for item in found])
     frequencies = (1.0,) if exact else levels.of_kind
     with np.errstate(divide="ignore"):
@@ -99,11 +99,10 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
     """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
     alone = observed.standing(curve.effect)
-    fit = fit_curve(alone, alone.scaled(curve), exact=exact)
+    fit = fit_curve(alone, curve, exact=exact)
     more = observed.over_none(curve.effect)
     return replace(
         fit,
-        curve=curve,
         by_level=fit.by_level + more,
         at_any_strength=fit.at_any_strength + more,
         log_evidence=fit.log_evidence + more,

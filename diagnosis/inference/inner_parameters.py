@@ -50,7 +50,7 @@ def with_inner_open(
             if other != effect:
                 strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
                 beside = beside.beside(Point(curve=its, strength=strength, level=level))
-        fit = fit_curve(beside, beside.scaled(curve), levels=only(hypothesis.levels[effect]))
+        fit = fit_curve(beside, curve, levels=only(hypothesis.levels[effect]))
         # the straight line says how much stays open; the strength itself is known from the law as it bends
         value, low, high = hypothesis.strengths[effect]
         _, low_open, high_open = interval_of([fit])

@@ -85,7 +85,7 @@ def weigh_pairs(
                 continue
             start, left = _beside_first(observed, point, second) if observed.has(second) else alone
             own = curves(second, first)
-            gain = max(fit_curve(left, left.scaled(curve), exact=True).log_evidence for curve in own)
+            gain = max(fit_curve(left, curve, exact=True).log_evidence for curve in own)
             a, b = sorted((first, second))
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
@@ -106,10 +106,9 @@ def _settled(
     at = replace(first, level=point.level)
     start, beside = _beside_first(observed, point, other)
     for turn in range(_TURNS):
-        fit = _beside(beside, curves[other])
-        second = replace(fit, curve=_own(curves[other], fit))
+        second = _beside(beside, curves[other])
         start_second, beside_second = _beside_first(observed, second.point, point.curve.effect)
-        evidence, before = start + log_prior(beside_second, point) + fit.log_evidence, best
+        evidence, before = start + log_prior(beside_second, point) + second.log_evidence, best
         if evidence > best:
             best, fits = evidence, {point.curve.effect: at, other: second}
         if turn and evidence < before + _SETTLED:
@@ -127,19 +126,11 @@ def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, 
     return observed.over_none(*both) + beside.log_likelihood - alone.log_likelihood, beside
 
 
-def _own(curves: Sequence[Curve], fit: CurveFit) -> Curve:
-    """The curve of a fit, in the units before any effect is taken off."""
-    return next(curve for curve in curves if curve.variant == fit.curve.variant)
-
-
 def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     """The best of an effect's variants beside another, its evidence that of all variants."""
-    first = [
-        (fit_curve(beside, beside.scaled(curve), exact=True).log_evidence, number)
-        for number, curve in enumerate(curves)
-    ]
+    first = [(fit_curve(beside, curve, exact=True).log_evidence, number) for number, curve in enumerate(curves)]
     likely = sorted(first, reverse=True)[:_VARIANTS]
-    fits = [fit_curve(beside, beside.scaled(curves[number]), levels=_CARRIED) for _, number in likely]
+    fits = [fit_curve(beside, curves[number], levels=_CARRIED) for _, number in likely]
     best = max(fits, key=lambda fit: fit.log_evidence)
     total = float(np.logaddexp.reduce([fit.log_evidence for fit in fits])) - math.log(len(curves))
     return replace(best, log_evidence=total, share=total - best.log_evidence)
@@ -160,7 +151,7 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     if courses[0] == "steady" != courses[1] and observed.steady is not None:
         _, beside = _beside_first(observed, first.point, weak)
         second, left = (
-            replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
+            fit_curve(beside, curve, levels=only(second.level))
             for curve in (second.curve, observed.steady.of(second.curve))
         )
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level

@@ -110,7 +110,7 @@ class Seen:
 
     def fit(self, curve: Curve) -> CurveFit:
         """A curve of these probes, fitted with its law off by the level."""
-        return replace(fit_curve(self.observed, self.observed.scaled(curve), levels=only(self.level)), curve=curve)
+        return fit_curve(self.observed, curve, levels=only(self.level))
 
     def more_exact(self) -> "Seen | None":
         """The same with laws off by the level two below, or exact; None: they are exact."""
@@ -119,4 +119,4 @@ class Seen:
 
     def evidence(self, curve: Curve) -> float:
         """Log evidence of a curve of these probes, its law off by any level."""
-        return fit_curve(self.observed, self.observed.scaled(curve)).log_evidence
+        return fit_curve(self.observed, curve).log_evidence

@@ -183,6 +183,6 @@ def strengths_on(
                 continue  # the strength is that of all probes
             others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
             rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
-            own = rest.scaled(replace(curve.of_probes(fit), spread=None))
+            own = replace(curve.of_probes(fit), spread=None)
             strengths[effect] = fit_curve(rest, own, levels=only(USUAL_LEVEL)).best
     return strengths

@@ -19,16 +19,14 @@ from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from raytwin.diagnosis.inference.inner_parameters import with_inner_open
-from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
-from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whitening, local_columns
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
-from raytwin.diagnosis.inference.refine_tasks import tasks_of
+from raytwin.diagnosis.inference.refine import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
-from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
 from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
@@ -150,11 +148,10 @@ def test_nuisances_of_single_blocks_are_solved_as_all_others(setup):
     assert len(shared) == factors.shape[1]
     assert sorted(len(columns) for columns in of_block.values()) == [2, 2, 2, 2, 2, 3]
     found, covariance = LocalNuisances(shuffled, blocks), np.eye(PROBES) + shuffled @ shuffled.T
-    vectors = rng.standard_normal((3, PROBES))
-    solved = np.linalg.solve(covariance, vectors.T).T
-    assert found.solve_all(vectors) == pytest.approx(solved, rel=1e-8, abs=1e-9)
-    assert found.solve(vectors[0]) == pytest.approx(solved[0], rel=1e-8, abs=1e-9)
-    assert found.fitted(vectors[0]) == pytest.approx(shuffled.T @ solved[0], rel=1e-8, abs=1e-9)
+    vector = rng.standard_normal(PROBES)
+    solved = np.linalg.solve(covariance, vector)
+    assert found.solve(vector) == pytest.approx(solved, rel=1e-8, abs=1e-9)
+    assert found.fitted(vector) == pytest.approx(shuffled.T @ solved, rel=1e-8, abs=1e-9)
     inverse = np.linalg.inv(covariance)
     assert found.precision == pytest.approx(np.diag(inverse), rel=1e-8)
     more = rng.standard_normal((4, shuffled.shape[1]))

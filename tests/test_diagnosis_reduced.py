@@ -12,10 +12,9 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.checks.plausibility import check_plausibility
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.nuisances import Nuisances, Whitening
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
-from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, POSITION_SD_PX, catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem
 from raytwin.diagnosis.session.origin import made_of

@@ -26,8 +26,7 @@ from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import LineModel
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
-from ..inference.nuisances import Nuisances
-from ..inference.whitening import Whitening
+from ..inference.nuisances import Nuisances, Whitening
 from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.assemble import build_problem

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ..inference.nuisances import Nuisances
-from ..inference.whitening import Whitening
+from ..inference.nuisances import Nuisances, Whitening
 from ..model.curves import Curve
 from ..problem.problem import Problem
 

@@ -10,6 +10,7 @@ import math
 import tomllib
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,8 @@ def at_most_off(level: float) -> float:
 def _learnt() -> Levels:
     """As `validation/learn_discrepancy.py` left them."""
     table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
-    return Levels(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+    return Levels(**values)
 
 
 LEVELS = _learnt()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.curves import Curve
-from .whitening import Whitening
+from .nuisances import Whitening
 
 
 class Steady:

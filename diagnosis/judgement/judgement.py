@@ -16,12 +16,10 @@ from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
 from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
 from ..inference.inner_parameters import with_inner_open
-from ..inference.local_nuisances import LocalNuisances
-from ..inference.nuisances import Nuisances
+from ..inference.nuisances import LocalNuisances, Nuisances, Whitening
 from ..inference.observed import Observed
 from ..inference.refine import SEEN_FROM, refine
 from ..inference.steady import Steady
-from ..inference.whitening import Whitening
 from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.known_effects import with_found

@@ -378,7 +378,7 @@ def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[Change]:
     def stepped(label: str, *, step_sd: float = 1.0, **changed: Any) -> Change:
         return Change(label=label, twin=replace(twin, noise=replace(noise, **changed)), step_sd=step_sd, steps="all")
 
-    def with_spread(**changed: float) -> SpreadEstimate:
+    def with_spread(**changed: Any) -> SpreadEstimate:
         return replace(spread, value=replace(spread.value, **changed))
 
     width_sd = max(SPREAD_SD * spread.value.sigma_px, _known_sd(spread, "sigma_px"), 0.01)

@@ -74,13 +74,8 @@ class ForwardModel:
 
     def carried_px(self, change: Change, request: SeriesRequest) -> tuple[float, float]:
         """How much farther than in the base twin a scene lies on average under a change, along rows and columns."""
-        (down, right), (base_down, base_right) = (
-            _mean_shift_px(effects, twin, request)
-            for effects, twin in (
-                ((*change.twin.effects, *change.effects), change.twin),
-                (self.base.effects, self.base),
-            )
-        )
+        down, right = _mean_shift_px((*change.twin.effects, *change.effects), change.twin, request)
+        base_down, base_right = _mean_shift_px(self.base.effects, self.base, request)
         return down - base_down, right - base_right
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:

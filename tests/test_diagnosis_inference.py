@@ -27,7 +27,7 @@ from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, search
 from raytwin.diagnosis.inference.seen import Blocks, Seen
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
-from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
+from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained, _with_curves
 from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
@@ -756,6 +756,17 @@ def test_a_strength_beyond_its_plausible_range_is_told(strength, told):
     )
     notes = _beyond_plausible(named)
     assert [f"veiling_glare is {told} than" in note and "0.5 to 5 %" in note for note in notes] == [True] * bool(told)
+
+
+def test_of_two_variants_with_one_name_each_keeps_its_own_curve():
+    # found twice by refinement, about strengths that lie close together
+    made = [
+        in_nodes("a", np.ones((1, PROBES)), [node], name="refined from b", low=1.0, high=9.0) for node in (3.0, 3.1)
+    ]
+    for curve in made:
+        found = Hypothesis(effects=("a",), probability=1.0, log_evidence=0.0, variants={"a": curve})
+        (again,) = _with_curves([found], made)
+        assert again.variants["a"] is curve
 
 
 @pytest.mark.parametrize("second", [0.2, 3.0, 90.0])

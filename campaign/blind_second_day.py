@@ -51,7 +51,7 @@ def second_day_shrinkage(
     own_curves = [
         Point(curve=curve, strength=float(curve.strengths[0]), level=USUAL_LEVEL)
         for curve in problem.curves
-        if curve.variant == _NAME
+        if curve.variant.name == _NAME
     ]
     return shrinkage(problem, own_curves)
 
@@ -90,5 +90,4 @@ def _variant(item: AppliedEffect) -> Variant:
         low=size,
         high=size,
         strengths=(size,),
-        options=dict(item.options),
     )

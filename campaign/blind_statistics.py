@@ -89,20 +89,21 @@ def session_statistics(problem: "Problem") -> SessionStatistics:
     z_nodes, z_residual = metric.project(nodes), metric.project(residual[None, :])[0]
     keys = []
     position = 0
-    for curve, variant in zip(problem.curves, problem.variants, strict=True):
+    for curve in problem.curves:
+        variant = curve.variant
         keys.append(
             CurveKey(
-                effect=curve.effect,
-                variant=curve.variant,
+                effect=variant.effect,
+                variant=variant.name,
                 sign=float(variant.sign),
-                since=curve.since,
-                low=float(curve.low),
-                high=float(curve.high),
-                strengths=tuple(float(value) for value in curve.strengths),
+                since=variant.since,
+                low=float(variant.low),
+                high=float(variant.high),
+                strengths=tuple(float(value) for value in variant.strengths),
                 first=position,
             )
         )
-        position += len(curve.strengths)
+        position += len(variant.strengths)
     return SessionStatistics(
         curves=tuple(keys),
         gram=nodes @ nodes.T - z_nodes @ z_nodes.T,

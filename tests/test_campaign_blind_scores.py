@@ -48,6 +48,7 @@ from raytwin.campaign.blind_statistics import (
     write_statistics,
 )
 from raytwin.diagnosis.inference.observed import Point
+from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
 from raytwin.generator.effects import EFFECTS
@@ -237,12 +238,7 @@ def problem_of(rng):
     factors[:6, 1] = 0.0
     curves = tuple(
         Curve(
-            effect=name,
-            variant="",
-            parameters={},
-            low=1.0,
-            high=10.0,
-            strengths=np.array([1.0, 5.0, 10.0]),
+            variant=Variant(effect=name, low=1.0, high=10.0, strengths=(1.0, 5.0, 10.0)),
             responses=np.outer([1.0, 5.0, 10.0], rng.standard_normal(probes)),
         )
         for name in "ab"
@@ -251,7 +247,6 @@ def problem_of(rng):
         residual=rng.standard_normal(probes) * 3,
         factors=factors,
         curves=curves,
-        variants=tuple(SimpleNamespace(sign=1.0) for _ in curves),
         blocks=np.repeat([0, 1], 6),
         missing_effects={"heel": "no gradient"},
     )
@@ -559,15 +554,7 @@ def second_day_problem(rng, *, series=24, each=40, factors=3):
 
 def an_effect(response):
     """The effect whose response at strength 1 this is."""
-    curve = Curve(
-        effect="heel",
-        variant="",
-        parameters={},
-        low=0.1,
-        high=1.0,
-        strengths=np.array([1.0]),
-        responses=response[None, :],
-    )
+    curve = Curve(variant=Variant(effect="heel", low=0.1, high=1.0, strengths=(1.0,)), responses=response[None, :])
     return [Point(curve=curve, strength=1.0, level=0.1)]
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis
 from raytwin.diagnosis.judgement.held_out import folds_of, held_out
+from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
 
@@ -81,15 +82,8 @@ def test_a_gap_that_nothing_explains_is_left_and_what_is_planted_and_named_is_go
     gap, _, shares = held_out(flats, nobody, np.random.default_rng(0))
     assert gap.before == gap.after > 10.0
     assert shares == {}
-    curve = Curve(
-        effect="stripes",
-        variant="",
-        parameters={},
-        low=1.0,
-        high=100.0,
-        strengths=np.array([1.0]),
-        responses=pattern[None, :],
-    )
+    variant = Variant(effect="stripes", low=1.0, high=100.0, strengths=(1.0,))
+    curve = Curve(variant=variant, responses=pattern[None, :])
     found = Hypothesis(
         effects=("stripes",),
         probability=1.0,

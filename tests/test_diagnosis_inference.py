@@ -7,27 +7,32 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytwin.diagnosis.inference.curve_fits import CurveFit, fit_curve, fit_effects, interval_of, log_integral
+from raytwin.diagnosis.inference.curve_fits import (
+    CurveFit,
+    fit_curve,
+    fit_effects,
+    interval_of,
+    interval_under,
+    log_integral,
+)
 from raytwin.diagnosis.inference.discrepancy import LEVELS, group_factors
 from raytwin.diagnosis.inference.in_series import in_some_series
 from raytwin.diagnosis.inference.inference import UNKNOWN, Hypothesis, Priors, weigh_hypotheses
 from raytwin.diagnosis.inference.inner_parameters import with_inner_open
-from raytwin.diagnosis.inference.local_nuisances import LocalNuisances, local_columns
-from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.nuisances import LocalNuisances, Nuisances, Whitening, local_columns
 from raytwin.diagnosis.inference.observed import Observed, Point
 from raytwin.diagnosis.inference.pairs import Single, log_prior, weigh_pairs
-from raytwin.diagnosis.inference.refine_tasks import tasks_of
+from raytwin.diagnosis.inference.refine import tasks_of
 from raytwin.diagnosis.inference.search import Slopes, _in_turn, _within, searched
 from raytwin.diagnosis.inference.seen import Blocks, Seen
 from raytwin.diagnosis.inference.steady import Steady
 from raytwin.diagnosis.inference.unknown import Families, beyond
-from raytwin.diagnosis.inference.whitening import Whitening
-from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained
-from raytwin.diagnosis.judgement.strengths import _outright
+from raytwin.diagnosis.judgement.judgement import _beyond_plausible, _strained, _with_curves
+from raytwin.diagnosis.judgement.strengths import _outright, applied_at_best
 from raytwin.diagnosis.model.changes import Variant
 from raytwin.diagnosis.model.curves import Curve
 from raytwin.diagnosis.problem.problem import Problem
-from raytwin.generator.effects import Parameter
+from raytwin.generator.effects import EFFECTS, AppliedEffect, Parameter
 
 PROBES = 600
 GROUPS = np.repeat(np.arange(30), 20)
@@ -42,45 +47,32 @@ def curves(rng, effects=8, variants=2, low=0.5, high=100.0):
             direction = rng.standard_normal(PROBES) * (rng.random(PROBES) < 0.1)
             direction /= np.linalg.norm(direction)
             result.append(
-                Curve(
-                    effect=f"effect{effect}",
-                    variant=f"{variant}",
-                    parameters={},
+                in_nodes(
+                    f"effect{effect}",
+                    [5.0 * direction, 52.0 * direction],
+                    [5.0, 50.0],
+                    name=f"{variant}",
                     low=low,
                     high=high,
-                    strengths=np.array([5.0, 50.0]),
-                    responses=np.array([5.0 * direction, 52.0 * direction]),
                 )
             )
     return tuple(result)
 
 
-def in_nodes(effect, responses, nodes, *, low, high, **more):
-    """An effect known at several strengths; responses: (strength, probe)."""
-    return Curve(
-        effect=effect,
-        variant="",
-        parameters={},
-        low=low,
-        high=high,
-        strengths=np.asarray(nodes, dtype=float),
-        responses=np.asarray(responses),
-        **more,
-    )
+def in_nodes(effect, responses, nodes, *, low, high, spread=None, jitter=None, exact=None, **more):
+    """An effect known at several strengths; responses: (strength, probe); more: of its variant."""
+    variant = Variant(effect=effect, low=low, high=high, strengths=tuple(map(float, nodes)), **more)
+    return Curve(variant=variant, responses=np.asarray(responses), spread=spread, jitter=jitter, exact=exact)
 
 
-def one_node(effect, response, *, variant="", low=0.5, high=50.0, **more):
+def one_node(effect, response, *, low=0.5, high=50.0, **more):
     """An effect known at strength 1 alone."""
-    return Curve(
-        effect=effect,
-        variant=variant,
-        parameters={},
-        low=low,
-        high=high,
-        strengths=np.array([1.0]),
-        responses=np.asarray(response)[None, :],
-        **more,
-    )
+    return in_nodes(effect, np.asarray(response)[None, :], [1.0], low=low, high=high, **more)
+
+
+def varied(curve, **changed):
+    """The curve of a variant with some fields changed."""
+    return replace(curve, variant=replace(curve.variant, **changed))
 
 
 class Bare(SimpleNamespace):
@@ -156,11 +148,10 @@ def test_nuisances_of_single_blocks_are_solved_as_all_others(setup):
     assert len(shared) == factors.shape[1]
     assert sorted(len(columns) for columns in of_block.values()) == [2, 2, 2, 2, 2, 3]
     found, covariance = LocalNuisances(shuffled, blocks), np.eye(PROBES) + shuffled @ shuffled.T
-    vectors = rng.standard_normal((3, PROBES))
-    solved = np.linalg.solve(covariance, vectors.T).T
-    assert found.solve_all(vectors) == pytest.approx(solved, rel=1e-8, abs=1e-9)
-    assert found.solve(vectors[0]) == pytest.approx(solved[0], rel=1e-8, abs=1e-9)
-    assert found.fitted(vectors[0]) == pytest.approx(shuffled.T @ solved[0], rel=1e-8, abs=1e-9)
+    vector = rng.standard_normal(PROBES)
+    solved = np.linalg.solve(covariance, vector)
+    assert found.solve(vector) == pytest.approx(solved, rel=1e-8, abs=1e-9)
+    assert found.fitted(vector) == pytest.approx(shuffled.T @ solved, rel=1e-8, abs=1e-9)
     inverse = np.linalg.inv(covariance)
     assert found.precision == pytest.approx(np.diag(inverse), rel=1e-8)
     more = rng.standard_normal((4, shuffled.shape[1]))
@@ -258,7 +249,7 @@ def test_departure_that_no_effect_makes_is_unknown_and_placed(setup):
 def test_effects_with_the_same_response_share_the_probability(setup):
     rng, factors, chosen = setup
     twin = chosen[0]
-    same = replace(twin, effect="double", variant="0")
+    same = varied(twin, effect="double", name="0")
     only = (chosen[0], same, *chosen[2:])
     found = weigh(noise(rng, factors) + twin.response(15.0), factors, only)
     probability = {item.effects: item.probability for item in found}
@@ -351,13 +342,28 @@ def test_a_refined_curve_is_not_believed_far_from_the_strengths_that_were_asked(
     assert 5.5 < low < high < 6.5
 
 
+def test_how_well_a_strength_is_known_is_what_its_interval_says():
+    curve = one_node("veiling_glare", np.ones(PROBES), low=0.5, high=5.0)
+    exact = Hypothesis(
+        effects=("veiling_glare",),
+        probability=1.0,
+        log_evidence=0.0,
+        strengths={"veiling_glare": (2.0, 2.0, 2.0)},
+        variants={"veiling_glare": curve},
+        levels={"veiling_glare": 0.0},
+    )
+    # nothing but real laws widens it
+    found = applied_at_best(Bare(conditions={}), exact, "veiling_glare")
+    assert found.strength_sd == pytest.approx(EFFECTS["veiling_glare"].reading.law_sd, rel=1e-9)
+
+
 def test_an_interval_covers_the_variants_that_are_as_likely():
     rng = np.random.default_rng(4)
     response = rng.standard_normal(PROBES) * 0.3
     residual = 4.0 * response + rng.standard_normal(PROBES)
 
     def fit(scale):
-        curve = one_node("a", scale * response, variant=str(scale))
+        curve = one_node("a", scale * response, name=str(scale))
         return fit_curve(seen(residual), curve, exact=True)
 
     # the same picture at half the size means twice the strength
@@ -365,6 +371,25 @@ def test_an_interval_covers_the_variants_that_are_as_likely():
     assert one[1] < 4.0 < one[2] < 5.0
     assert both[1] < 4.0
     assert both[2] > 7.5
+
+
+def test_a_variant_counts_in_an_interval_as_much_as_its_evidence_says():
+    rng = np.random.default_rng(4)
+    response = rng.standard_normal(PROBES) * 0.3
+    observed = seen(4.0 * response + rng.standard_normal(PROBES))
+    whole = fit_curve(observed, one_node("a", response), exact=True)
+    one = interval_of([whole])
+    # the same picture at half the size, twice the strength: e^-8 as probable beforehand, or of laws that are off so seldom
+    unlikely = fit_curve(observed, one_node("a", 0.5 * response, log_prior=-8.0), exact=True)
+    seldom = fit_curve(observed, one_node("a", 0.5 * response), exact=True)
+    for other in (unlikely, replace(seldom, log_evidence=seldom.log_evidence - 8.0)):
+        assert interval_of([whole, other]) == pytest.approx(one, rel=0.01)
+    # half as probable as the other one: a third of the posterior
+    half = replace(seldom, log_evidence=seldom.log_evidence - np.log(2.0))
+    nodes = np.geomspace(0.5, 50.0, 20_001)
+    own, twice = (np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood) for fit in (whole, seldom))
+    wanted = interval_under(nodes, np.logaddexp(own, twice - np.log(2.0)))
+    assert interval_of([whole, half]) == pytest.approx(wanted, rel=0.02)
 
 
 @pytest.mark.parametrize("sharpness", [0.3, 3.0, 30.0, 200.0])
@@ -402,16 +427,16 @@ def test_a_pair_has_the_variant_that_is_best_beside_the_other_and_not_the_one_th
     u, w = np.zeros(PROBES), np.zeros(PROBES)
     u[:200], w[200:400] = 1.0, 1.0
     glare = [
-        one_node("glare", u, variant="short", high=500.0),
-        one_node("glare", u + 0.3 * w, variant="long", high=500.0),
+        one_node("glare", u, name="short", high=500.0),
+        one_node("glare", u + 0.3 * w, name="long", high=500.0),
     ]
     map_error = one_node("gain_map", w, high=500.0)
     residual = 20.0 * u + 5.0 * w + np.random.default_rng(2).standard_normal(PROBES)
     found = weigh(residual, np.zeros((PROBES, 1)), [*glare, map_error])
     alone = next(item for item in found if item.effects == ("glare",))
     pair = next(item for item in found if set(item.effects) == {"glare", "gain_map"})
-    assert alone.variants["glare"].variant == "long"
-    assert pair.variants["glare"].variant == "short"
+    assert alone.variants["glare"].variant.name == "long"
+    assert pair.variants["glare"].variant.name == "short"
     assert pair.strengths["glare"][0] == pytest.approx(20.0, rel=0.05)
     assert pair.strengths["gain_map"][0] == pytest.approx(5.0, rel=0.1)
 
@@ -420,15 +445,18 @@ def test_a_pair_of_which_neither_variant_is_the_best_alone_is_found_by_turns():
     u, w, x, y = np.zeros((4, PROBES))
     u[:200], w[200:400], x[400:500], y[500:] = 1.0, 1.0, 1.0, 1.0
     made = [
-        one_node("glare", u, variant="right", high=500.0),
-        one_node("glare", u + 0.3 * w + 0.2 * x, variant="wrong", high=500.0),
-        one_node("gain_map", w, variant="right", high=500.0),
-        one_node("gain_map", w + 0.3 * u + 0.2 * y, variant="wrong", high=500.0),
+        one_node("glare", u, name="right", high=500.0),
+        one_node("glare", u + 0.3 * w + 0.2 * x, name="wrong", high=500.0),
+        one_node("gain_map", w, name="right", high=500.0),
+        one_node("gain_map", w + 0.3 * u + 0.2 * y, name="wrong", high=500.0),
     ]
     residual = 20.0 * u + 15.0 * w + np.random.default_rng(2).standard_normal(PROBES)
     found = weigh(residual, np.zeros((PROBES, 1)), made)
     pair = next(item for item in found if set(item.effects) == {"glare", "gain_map"})
-    assert {effect: curve.variant for effect, curve in pair.variants.items()} == {"glare": "right", "gain_map": "right"}
+    assert {effect: curve.variant.name for effect, curve in pair.variants.items()} == {
+        "glare": "right",
+        "gain_map": "right",
+    }
     assert pair.strengths["glare"][0] == pytest.approx(20.0, rel=0.05)
     assert pair.strengths["gain_map"][0] == pytest.approx(15.0, rel=0.05)
 
@@ -461,13 +489,13 @@ def test_a_law_that_predicts_much_where_nothing_is_seen_loses_to_one_that_does_n
     acts[:100] = rng.standard_normal(100)
     idle[300:400] = 20.0 * rng.standard_normal(100)
     right, wrong = (
-        one_node("lag", response, variant=name, high=500.0)
+        one_node("lag", response, name=name, high=500.0)
         for name, response in (("since the calibration", acts), ("always", acts + idle))
     )
     # the right one's law is off by a tenth from place to place as well
     off = np.repeat(1.0 + 0.1 * rng.standard_normal(30), 20)
     residual = 200.0 * off * acts + rng.standard_normal(PROBES)
-    found = {curve.variant: fit_curve(seen(residual), curve) for curve in (right, wrong)}
+    found = {curve.variant.name: fit_curve(seen(residual), curve) for curve in (right, wrong)}
     assert found["since the calibration"].best == pytest.approx(200.0, rel=0.1)
     explained = 0.5 * float(residual @ residual)
     assert found["since the calibration"].log_evidence > 0.99 * explained
@@ -484,13 +512,13 @@ def test_within_a_group_a_law_is_no_share_of_what_it_predicts_in_places_that_sho
     acts[places % 2 == 1] = 0.0
     idle[places % 2 == 0] = 0.0
     later, always = (
-        one_node("lag", response, variant=name, high=500.0)
+        one_node("lag", response, name=name, high=500.0)
         for name, response in (("since the calibration", acts), ("always", acts + idle))
     )
     off = np.repeat(1.0 + 0.1 * rng.standard_normal(60), 10)
     residual = 200.0 * off * acts + rng.standard_normal(PROBES)
     explained = 0.5 * float(residual @ residual)
-    found = {item.variant: fit_curve(seen(residual, places=places), item) for item in (later, always)}
+    found = {item.variant.name: fit_curve(seen(residual, places=places), item) for item in (later, always)}
     assert found["since the calibration"].log_evidence > 0.99 * explained
     assert found["since the calibration"].best == pytest.approx(200.0, rel=0.1)
     apart = found["since the calibration"].log_evidence - found["always"].log_evidence
@@ -503,24 +531,27 @@ def test_within_a_group_a_law_is_no_share_of_what_it_predicts_in_places_that_sho
 def test_slopes_learn_what_a_step_has_shown_and_nothing_from_none():
     rng = np.random.default_rng(34)
     true, start = rng.standard_normal((2, PROBES)), rng.standard_normal(PROBES)
-    step = {"width": 0.4, "order": -0.2}
+    part = [
+        Parameter(name=name, unit="", low=-1.0, high=1.0, default=0.0, source="test", log=False)
+        for name in ("width", "order")
+    ]
     ahead = start + 0.4 * true[0] - 0.2 * true[1]
 
-    def fit(response, strength):
-        curve = one_node("one", response, low=0.5, high=50.0)
+    def fit(response, strength, width=0.0, order=0.0):
+        curve = one_node("one", response, parameters={"width": width, "order": order})
         at = np.array([strength])
         none = np.zeros(1)
         by_level = {"by_level": none, "at_any_strength": none}
         return CurveFit(curve=curve, **by_level, log_evidence=0.0, level=0.0, strengths=at, log_likelihood=none)
 
     known = Slopes(("width", "order"), true + 0.3 * rng.standard_normal(true.shape), 1.0)
-    learnt = known.learnt(fit(start, 1.0), fit(ahead, 2.0), step)
+    learnt = known.learnt(fit(start, 1.0), fit(ahead, 2.0, 0.4, -0.2), part)
     taken = np.array([0.4, -0.2])
     # of twice the strength twice the change, along the step; across it nothing is learnt
     np.testing.assert_allclose(taken @ learnt.at(2.0), 2.0 * (ahead - start), atol=1e-9)
     across = np.array([0.2, 0.4])
     np.testing.assert_allclose(across @ learnt.at(2.0), 2.0 * across @ known.rows, atol=1e-9)
-    same = known.learnt(fit(start, 1.0), fit(start, 2.0), {"width": 0.0, "order": 0.0})
+    same = known.learnt(fit(start, 1.0), fit(start, 2.0), part)
     np.testing.assert_allclose(same.at(1.0), known.rows)
 
 
@@ -543,7 +574,10 @@ def test_reach_is_sought_before_shape_and_effects_of_a_leading_pair_alone_as_wel
         )
 
     def asked(*hypotheses):
-        return [(task.effect, task.beside and (task.beside[0].effect, task.beside[1])) for task in tasks_of(hypotheses)]
+        return [
+            (task.effect, task.beside and (task.beside.curve.effect, task.beside.strength))
+            for task in tasks_of(hypotheses)
+        ]
 
     pair, alone, other = explanation(weak=1.0, strong=9.0), explanation(strong=8.0), explanation(weak=2.0)
     wins = replace(pair, log_evidence=12.0)
@@ -625,7 +659,7 @@ def test_effects_weaker_and_stronger_than_is_plausible_are_found_and_told():
         _, low, high = interval_of([fit])
         assert low < strength < high
         # 0.1 lies ten standard deviations from none; a strength that is plausible costs less
-        plausible = fit_curve(seen(residual), replace(curve, low=strength / 7.0, high=7.0 * strength), exact=True)
+        plausible = fit_curve(seen(residual), varied(curve, low=strength / 7.0, high=7.0 * strength), exact=True)
         assert 20.0 < fit.log_evidence < plausible.log_evidence < fit.log_evidence + 6.0
     # noise alone is no evidence of a strength that cannot be seen
     fit = fit_curve(seen(rng.standard_normal(PROBES)), grows, exact=True)
@@ -648,17 +682,7 @@ def test_the_prior_beyond_the_plausible_range_takes_a_hundredth_of_the_probabili
 def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
     rng = np.random.default_rng(43)
     response = rng.standard_normal(PROBES)
-    grid = in_nodes("kv_error", np.outer([3.0, 5.0], response), [3.0, 5.0], low=0.5, high=5.0)
-    variant = Variant(
-        effect="kv_error",
-        name="",
-        parameters={},
-        sign=1.0,
-        since="calibration",
-        low=0.5,
-        high=5.0,
-        strengths=(3.0, 5.0),
-    )
+    grid = in_nodes("kv_error", np.outer([3.0, 5.0], response), [3.0, 5.0], low=0.5, high=5.0, since="calibration")
     asked = []
 
     def respond(variants, wanted=None):
@@ -670,11 +694,11 @@ def test_a_refined_curve_goes_as_far_as_the_model_can_be_asked():
     what = Seen(observed=observed, respond=respond, whitener=SimpleNamespace(apply=np.asarray))
     fit = what.fit(grid)
     assert fit.best == pytest.approx(7.5)  # as far as the grid is believed
-    found = searched(variant, fit, what)
+    found = searched(fit, what)
     assert found is not None
     assert max(found[0].strengths) == pytest.approx(9.0, rel=0.03)
     assert any(max(strengths) > 10.0 for strengths in asked)
-    assert searched(variant, fit, replace(what, respond=lambda variants, wanted=None: {})) is None
+    assert searched(fit, replace(what, respond=lambda variants, wanted=None: {})) is None
 
 
 def test_an_interval_holds_what_inner_parameters_leave_open():
@@ -695,19 +719,8 @@ def test_an_interval_holds_what_inner_parameters_leave_open():
         residual = truth * (a + at * b) + rng.standard_normal(PROBES)
         first, second = np.linalg.lstsq(np.stack([a, b], axis=1), residual, rcond=None)[0]
         known = float(np.clip(second / first, -1.0, 1.0))
-        curve = one_node("veiling_glare", a + known * b, low=0.1, high=20.0)
-        variant = Variant(
-            effect="veiling_glare",
-            name="",
-            parameters={"shape": known},
-            sign=1.0,
-            since="always",
-            low=0.1,
-            high=20.0,
-            strengths=(1.0,),
-            fitted=(shape,),
-            refined_from="grid",
-        )
+        law = {"parameters": {"shape": known}, "fitted": (shape,), "refined_from": "grid"}
+        curve = one_node("veiling_glare", a + known * b, low=0.1, high=20.0, **law)
         observed = seen(residual)
         fit = fit_curve(observed, curve, exact=True)
         found = Hypothesis(
@@ -720,7 +733,6 @@ def test_an_interval_holds_what_inner_parameters_leave_open():
         )
         opened = with_inner_open(
             found,
-            variants={("veiling_glare", ""): variant},
             observed=observed,
             respond=respond,
             whitener=SimpleNamespace(apply=np.asarray),
@@ -744,6 +756,17 @@ def test_a_strength_beyond_its_plausible_range_is_told(strength, told):
     )
     notes = _beyond_plausible(named)
     assert [f"veiling_glare is {told} than" in note and "0.5 to 5 %" in note for note in notes] == [True] * bool(told)
+
+
+def test_of_two_variants_with_one_name_each_keeps_its_own_curve():
+    # found twice by refinement, about strengths that lie close together
+    made = [
+        in_nodes("a", np.ones((1, PROBES)), [node], name="refined from b", low=1.0, high=9.0) for node in (3.0, 3.1)
+    ]
+    for curve in made:
+        found = Hypothesis(effects=("a",), probability=1.0, log_evidence=0.0, variants={"a": curve})
+        (again,) = _with_curves([found], made)
+        assert again.variants["a"] is curve
 
 
 @pytest.mark.parametrize("second", [0.2, 3.0, 90.0])
@@ -813,7 +836,7 @@ def test_the_likelihood_beside_an_effect_is_that_of_its_law_and_what_it_may_be_o
 
 @pytest.mark.parametrize("strength", [3.0, 60.0, 0.8 / 30.0])
 def test_the_evidence_of_an_effect_at_its_point_is_the_integral_over_the_strengths_that_are_tried(strength):
-    (curve,) = (replace(one, low=1.0) for one in independent((200, 600.0)))
+    (curve,) = (varied(one, low=1.0) for one in independent((200, 600.0)))
     residual = curve.response(strength) + np.random.default_rng(3).standard_normal(PROBES)
     observed = seen(residual)
     point = fit_curve(observed, curve, exact=True).point
@@ -823,8 +846,10 @@ def test_the_evidence_of_an_effect_at_its_point_is_the_integral_over_the_strengt
     x = np.linspace(np.log(low), np.log(high), 2_000_001)
     row, s = curve.response(1.0), np.exp(x)
     value = s * float(row @ residual) - 0.5 * s**2 * float(row @ row)
-    plausible = np.log(curve.high / curve.low)
-    density = np.where((s >= curve.low) & (s <= curve.high), 0.99 / plausible, 0.01 / (x[-1] - x[0] - plausible))
+    plausible = np.log(curve.variant.high / curve.variant.low)
+    density = np.where(
+        (s >= curve.variant.low) & (s <= curve.variant.high), 0.99 / plausible, 0.01 / (x[-1] - x[0] - plausible)
+    )
     wanted = value.max() + np.log(np.trapezoid(np.exp(value - value.max()) * density, x)) + np.log(LEVELS.of_kind[0])
     assert evidence == pytest.approx(wanted, rel=0.0, abs=0.1)
 
@@ -834,7 +859,7 @@ def test_the_evidence_of_an_effect_at_its_point_is_the_integral_over_the_strengt
 )
 def test_what_is_implausibly_weak_and_unlike_a_law_is_of_another_kind(strength, off, named):
     rng = np.random.default_rng(6)
-    made = [replace(one, low=1.0) for one in independent((400, 500.0), *[(10, 1.0)] * 8)]
+    made = [varied(one, low=1.0) for one in independent((400, 500.0), *[(10, 1.0)] * 8)]
     law = 1.0 + off * rng.standard_normal(30)[GROUPS]
     residual = strength * made[0].response(1.0) * law + rng.standard_normal(PROBES)
     assert weigh(residual, np.zeros((PROBES, 1)), made)[0].effects == (named,)
@@ -848,7 +873,7 @@ def test_a_weak_second_effect_is_what_the_law_of_the_first_leaves_where_that_act
         weak = one_node("effect1", strong.response(1.0) * rng.choice((-1.0, 1.0), PROBES), low=0.01, high=100.0)
     off = 1.0 + 0.2 * rng.standard_normal(PROBES)
     residual = 800.0 * strong.response(1.0) * off + 800.0 * share * weak.response(1.0) + rng.standard_normal(PROBES)
-    wide = [replace(one, high=5000.0) for one in (strong, weak, *others)]
+    wide = [varied(one, high=5000.0) for one in (strong, weak, *others)]
     found = weigh(residual, np.zeros((PROBES, 1)), wide)
     assert found[0].effects == (("effect0", "effect1") if named else ("effect0",))
     # with an exact law the same is a second effect, but for what even such a one may leave: some thousandths of what it does there
@@ -875,7 +900,7 @@ def test_a_law_of_known_course_leaves_nothing_in_the_noise_of_frames_beyond_its_
     off = 1.0 + 0.2 * rng.standard_normal(PROBES)
     residual = 800.0 * strong.response(1.0) * off + 16.0 * weak.response(1.0) + rng.standard_normal(PROBES)
     observed = replace(seen(residual), aspects=2 * GROUPS + of_noise)
-    chosen = [strong, weak, *(replace(one, high=5000.0) for one in made[2:])]
+    chosen = [strong, weak, *(varied(one, high=5000.0) for one in made[2:])]
     found = weigh_hypotheses(
         [(observed, fit_effects(observed, chosen))], families=Families(of=GROUPS, names=NAMES), rests=False
     )
@@ -937,7 +962,7 @@ def test_what_a_law_leaves_is_its_own_beside_a_nuisance_of_series_that_it_does_n
     level = 50.0 * np.ones((PROBES, 1))
     strong = one_node("effect0", np.where(acting, rng.choice((-1.0, 1.0), PROBES), 0.0) / 15.0, high=5000.0)
     weak = one_node("effect1", np.where(acting, 1.0, 0.0) / 15.0, low=0.01, high=100.0)
-    others = [replace(one, high=5000.0) for one in independent(*[(10, 1.0)] * 8)]
+    others = [varied(one, high=5000.0) for one in independent(*[(10, 1.0)] * 8)]
     law = 1.0 + 0.2 * rng.standard_normal(PROBES)
     residual = 600.0 * strong.response(1.0) * law + 60.0 * weak.response(1.0) + noise(rng, level)
     assert weigh(residual, level, [strong, weak, *others])[0].effects == ("effect0",)
@@ -950,7 +975,7 @@ def test_what_a_law_leaves_is_its_own_beside_a_nuisance_of_series_that_it_does_n
 def test_a_law_that_leaves_a_rest_elsewhere_is_named_with_the_place_of_the_rest():
     rng = np.random.default_rng(9)
     (one,) = independent((300, 1.0))
-    one = replace(one, high=5000.0)
+    one = varied(one, high=5000.0)
     residual = 400.0 * one.response(1.0) + rng.standard_normal(PROBES)
     assert weigh(residual, np.zeros((PROBES, 1)), [one])[0].rest == ""
     residual[GROUPS >= 24] += 8.0 * rng.standard_normal(int(np.count_nonzero(GROUPS >= 24)))
@@ -987,10 +1012,14 @@ def test_a_law_leaves_no_rest_in_what_one_effect_alone_can_make(setup):
 
 def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one_and_beside_no_other():
     rng = np.random.default_rng(12)
-    strong, weak, other = (replace(one, high=500.0) for one in independent((300, 1.0), (300, 1.0), (300, 1.0)))
+    strong, weak, other = (varied(one, high=500.0) for one in independent((300, 1.0), (300, 1.0), (300, 1.0)))
+
+    def there(effect):
+        return AppliedEffect(id=effect, parameters={"strength": 1.0}, since="always")
+
     changed = weak.response(1.0) * np.where(np.arange(PROBES) % 2, 1.0, -1.0)
-    beside = one_node("effect1", changed, high=500.0, variant="beside effect0", beside="effect0")
-    elsewhere = replace(beside, variant="beside effect2", beside="effect2")
+    beside = one_node("effect1", changed, high=500.0, name="beside effect0", beside=there("effect0"))
+    elsewhere = varied(beside, name="beside effect2", beside=there("effect2"))
     observed = seen(100.0 * strong.response(1.0) + 60.0 * changed + rng.standard_normal(PROBES))
     fits = fit_effects(observed, [strong, weak, other])
 
@@ -998,11 +1027,11 @@ def test_the_weaker_of_two_effects_is_weighed_as_it_acts_beside_the_stronger_one
         return weigh_hypotheses([(observed, fits)], families=Families(of=GROUPS, names=NAMES), beside=more)
 
     found = next(item for item in leading(beside) if item.effects == ("effect0", "effect1"))
-    assert found.variants["effect1"].variant == "beside effect0"
+    assert found.variants["effect1"].variant.name == "beside effect0"
     assert found.strengths["effect1"][0] == pytest.approx(60.0, rel=0.1)
     assert leading(beside)[0].log_evidence > leading(elsewhere)[0].log_evidence + 50.0
     # what acts so beside another does not act so alone
-    assert all(item.variants["effect1"].variant == "" for item in leading(beside) if item.effects == ("effect1",))
+    assert all(item.variants["effect1"].variant.name == "" for item in leading(beside) if item.effects == ("effect1",))
 
 
 # ---- effects in some series only
@@ -1025,9 +1054,8 @@ def test_the_series_in_which_an_effect_acts_are_found(setup, acting):
     found = in_some_series(observed, fits, series_of)
     assert found.series == acting
     assert found.log_prior == pytest.approx(-math.log(12) - math.log(math.comb(12, len(acting))))
-    part = replace(
-        one_node("motion", np.where(inside, response, 0.0)), series=tuple(map(str, acting)), log_prior=found.log_prior
-    )
+    named = {"series": tuple(map(str, acting)), "log_prior": found.log_prior}
+    part = one_node("motion", np.where(inside, response, 0.0), **named)
     assert fit_curve(observed, part).log_evidence > fits[0].log_evidence + 20.0
 
 
@@ -1041,27 +1069,25 @@ def test_an_effect_in_all_series_or_in_none_is_in_no_part_of_them(setup):
         if found is not None:
             # a part by chance costs more than it brings
             inside = np.isin(series_of, found.series)
-            part = replace(one_node("motion", np.where(inside, response, 0.0)), log_prior=found.log_prior)
+            part = one_node("motion", np.where(inside, response, 0.0), log_prior=found.log_prior)
             assert fit_curve(observed, part).log_evidence < max(fits[0].log_evidence, 0.0) + 3.0
 
 
 def test_a_problem_with_an_effect_in_some_series_keeps_its_names_and_its_prior():
     views = tuple(SimpleNamespace(session=SimpleNamespace(name=name)) for name in ("first", "second", "third"))
-    variant = Variant(
-        effect="motion_blur", name="", parameters={}, sign=1.0, since="always", low=1.0, high=9.0, strengths=(2.0,)
-    )
+    variant = Variant(effect="motion_blur", low=1.0, high=9.0, strengths=(2.0,))
     problem = Problem(
         **{
             **dict.fromkeys(Problem.__dataclass_fields__),
             "residual": np.zeros(6),
-            "curves": (variant.curve(np.ones((1, 6))),),
-            "variants": (variant,),
+            "curves": (Curve(variant=variant, responses=np.ones((1, 6))),),
             "series_of": np.array([0, 0, 1, 1, 2, 2]),
             "views": views,
             "given": (),
         }
     )
-    found = problem.in_series("motion_blur", "", (0, 2), -2.0)
-    assert found.variants[-1].name == "in 2 series"
+    found = problem.in_series(variant, (0, 2), -2.0)
+    own = found.curves[-1].variant
+    assert own.name == "in 2 series"
     np.testing.assert_array_equal(found.curves[-1].responses, [[1, 1, 0, 0, 1, 1]])
-    assert (found.curves[-1].series, found.curves[-1].log_prior) == (("first", "third"), -2.0)
+    assert (own.series, own.log_prior) == (("first", "third"), -2.0)

@@ -1,7 +1,7 @@
 """Effects that a twin has already: what is expected with them, and what a session says of them."""
 
 import json
-from dataclasses import make_dataclass
+from dataclasses import make_dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,17 +47,9 @@ def test_effects_that_act_by_chance_are_sought_again():
     assert [item.id for item in lasting(had)] == ["image_lag"]
 
 
-def curve(name, response, **more):
-    return Curve(
-        effect=name,
-        variant="",
-        parameters={},
-        low=0.5,
-        high=20.0,
-        strengths=np.array([STRENGTH]),
-        responses=np.asarray(response)[None, :],
-        **more,
-    )
+def curve(name, response):
+    variant = Variant(effect=name, low=0.5, high=20.0, strengths=(STRENGTH,))
+    return Curve(variant=variant, responses=np.asarray(response)[None, :])
 
 
 @pytest.fixture
@@ -147,21 +139,15 @@ def test_an_effect_takes_the_place_of_the_same_one_that_the_base_has():
 
     base = make_dataclass("Base", ["effects"], frozen=True)(effects=had)
     model = ForwardModel(base=base, conditions={})
-    variant = Variant(
-        effect="motion_blur", name="", parameters={}, sign=1.0, since="always", low=1.0, high=9.0, strengths=(2.0,)
-    )
+    variant = Variant(effect="motion_blur", low=1.0, high=9.0, strengths=(2.0,))
     change = model.change(variant, 2.0)
     assert [item.id for item in change.twin.effects] == ["image_lag"]
     assert [(item.id, item.parameters["strength"]) for item in change.effects] == [("motion_blur", 2.0)]
-    assert model.change(Variant(**{**_fields(variant), "effect": "mtf_tail"}), 2.0).twin is base
+    assert model.change(replace(variant, effect="mtf_tail"), 2.0).twin is base
     assert model.without("motion_blur").twin.effects == had[1:]
     # it shows wherever the one that is gone did
     flat = SimpleNamespace(kind="flat", beam_on=True, after_calibration=False)
     assert model.without("image_lag").touches(flat)
-
-
-def _fields(variant):
-    return {name: getattr(variant, name) for name in variant.__dataclass_fields__}
 
 
 def test_a_residual_knows_what_the_base_had(line):

@@ -16,7 +16,7 @@ from raytwin.diagnosis.inference.refine import refine
 from raytwin.diagnosis.inference.seen import Blocks
 from raytwin.diagnosis.inference.unknown import Families
 from raytwin.diagnosis.judgement.judgement import _threshold
-from raytwin.diagnosis.model.changes import catalogue_variants
+from raytwin.diagnosis.model.changes import Variant, catalogue_variants
 from raytwin.diagnosis.model.curves import Curve, node_weights
 from raytwin.diagnosis.problem.problem import Problem
 from raytwin.diagnosis.problem.series_block import jitter_of
@@ -30,16 +30,8 @@ PROBES = 60
 
 
 def curve(effect, direction, *, low=1.0, high=100.0, since="always"):
-    return Curve(
-        effect=effect,
-        since=since,
-        variant="",
-        parameters={},
-        low=low,
-        high=high,
-        strengths=np.array([10.0]),
-        responses=10.0 * np.asarray(direction)[None, :],
-    )
+    variant = Variant(effect=effect, since=since, low=low, high=high, strengths=(10.0,))
+    return Curve(variant=variant, responses=10.0 * np.asarray(direction)[None, :])
 
 
 def axis(*places):
@@ -141,7 +133,7 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
             for number, item in enumerate(asked)
         }
 
-    curves = [item.curve(answer([item])[0]) for item in variants]
+    curves = [Curve(variant=item, responses=answer([item])[0]) for item in variants]
     groups = np.zeros(PROBES, dtype=np.intp)
     observed = Observed(
         residual=residual, nuisances=Nuisances(np.zeros((PROBES, 1))), groups=groups, places=groups, series=groups
@@ -151,7 +143,6 @@ def refined(variants, law, residual, blocks=None, asked_of=None):
     )
     return refine(
         hypotheses,
-        variants={(item.effect, item.name): item for item in variants},
         curves=curves,
         observed=observed,
         respond=answer,
@@ -378,15 +369,15 @@ def test_lines_of_light_give_lit_series_chance_the_more_the_more_lines_go_togeth
 def test_a_refined_variant_keeps_what_its_own_onset_does_by_chance():
     """Lost bits that came after the calibration lower later levels; those that were always there do not."""
     always = curve("quantisation", axis(0))
-    later = replace(always, since="calibration", spread=axis(1)[:, None])
+    later = replace(curve("quantisation", axis(0), since="calibration"), spread=axis(1)[:, None])
     of_session = problem([always, later])
     variant = next(
         item for item in catalogue_variants() if item.effect == "quantisation" and item.since == "calibration"
     )
     names = [item.name for item in fields(Problem)]
-    whole = Problem(**{name: getattr(of_session, name, None) for name in names} | {"variants": ()})
+    whole = Problem(**{name: getattr(of_session, name, None) for name in names})
     found = whole.with_variants([(variant, np.stack([axis(0)] * len(variant.strengths)))]).curves[-1]
-    assert found.since == "calibration"
+    assert found.variant.since == "calibration"
     np.testing.assert_array_equal(found.spread, later.spread)
 
 
@@ -394,12 +385,12 @@ def test_a_refined_variant_keeps_what_the_one_it_came_from_does_by_chance():
     """More of a heel on one side hangs on the direction in which it falls."""
     turned = [item for item in catalogue_variants() if item.effect == "heel" and item.since == "always"]
     own = [
-        replace(curve("heel", axis(0)), variant=item.name, since="always", spread=axis(number)[:, None])
+        Curve(variant=item, responses=axis(0)[None, :], spread=axis(number)[:, None])
         for number, item in enumerate(turned)
     ]
     of_session = problem(own)
     names = [item.name for item in fields(Problem)]
-    whole = Problem(**{name: getattr(of_session, name, None) for name in names} | {"variants": ()})
+    whole = Problem(**{name: getattr(of_session, name, None) for name in names})
     for start, like in zip(turned, own, strict=True):
         refined = start.refined({**start.parameters, "curvature": 0.31}, (3.0, 4.0))
         assert refined.name.endswith(f"refined from {start.name}") and refined.strengths == (3.0, 4.0)

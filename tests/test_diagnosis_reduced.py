@@ -12,10 +12,9 @@ from raytwin.acquisition import open_acquisition, write_acquisition
 from raytwin.cli import main
 from raytwin.diagnosis.checks.plausibility import check_plausibility
 from raytwin.diagnosis.checks.preparation import prepare_session
-from raytwin.diagnosis.inference.nuisances import Nuisances
+from raytwin.diagnosis.inference.nuisances import Nuisances, Whitening
 from raytwin.diagnosis.inference.observed import Observed
 from raytwin.diagnosis.inference.unknown import beyond
-from raytwin.diagnosis.inference.whitening import Whitening
 from raytwin.diagnosis.model.changes import LEVEL_OF_SERIES_SD, POSITION_SD_PX, catalogue_variants
 from raytwin.diagnosis.problem.assemble import build_problem, map_changes
 from raytwin.diagnosis.problem.series_probes import mean_frame
@@ -533,8 +532,8 @@ def test_pauses_that_no_session_states_are_sought_with_a_lag_and_those_it_states
         with open_acquisition(path) as acquisition:
             stated = {item.request.pause_stated for item in read_session(acquisition) if item.series.kind == "flat"}
             problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=wanted)
-        assert any(item.effect == "row_noise" for item in problem.variants)
-        return stated, [item for item in problem.variants if item.effect == "image_lag"]
+        assert any(item.effect == "row_noise" for item in problem.curves)
+        return stated, [item.variant for item in problem.curves if item.effect == "image_lag"]
 
     (known, plain), (unknown, asking) = lags(line / "session.h5"), lags(timeless)
     assert (known, unknown) == ({True}, {False})

@@ -15,8 +15,8 @@ from raytwin.calibration.priors import PRIORS
 from raytwin.diagnosis.checks.preparation import _taken_in
 from raytwin.diagnosis.model import changes as scales
 from raytwin.diagnosis.model.calibrated_maps import calibrated_maps
-from raytwin.diagnosis.model.changes import catalogue_variants, departures_found, twin_changes
-from raytwin.diagnosis.model.forward_model import Change, ForwardModel, strength_rows
+from raytwin.diagnosis.model.changes import Change, catalogue_variants, departures_found, twin_changes
+from raytwin.diagnosis.model.forward_model import ForwardModel, strength_rows
 from raytwin.diagnosis.model.placing import inside
 from raytwin.diagnosis.probes.registration import Placement
 from raytwin.diagnosis.problem.nuisance_columns import nuisances_of_series
@@ -74,15 +74,15 @@ def test_another_spread_that_calibration_leaves_open_is_a_nuisance_as_large_as_i
         family="exponential", probability=0.25, value=Spread(sigma_px=0.5, tail_share=0.2, tail_order=1.5)
     )
     known = replace(plain.noise.spread, others=(other,))
-    named = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=known)))}
+    named = {item.label: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=known)))}
     step = named["optical spread as exponential"]
     assert step.twin.noise.spread.value == other.value
     # a whole step costs what the other spread's probability does
     assert 0.5 * step.step_sd**2 == pytest.approx(math.log(4.0))
     likely = replace(known, others=(replace(other, probability=0.9),))
-    again = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=likely)))}
+    again = {item.label: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=likely)))}
     assert again["optical spread as exponential"].step_sd == 1.0
-    assert set(named) - {item.name for item in twin_changes(plain)} == {step.name}
+    assert set(named) - {item.label for item in twin_changes(plain)} == {step.label}
 
 
 def test_a_tail_that_calibration_took_in_is_told_in_pixels_of_the_panel():
@@ -102,7 +102,7 @@ def test_a_tail_that_calibration_took_in_is_told_in_pixels_of_the_panel():
 def test_steps_of_a_tail_that_takes_nearly_all_light_stay_spreads():
     plain = as_twin("virtual_lab")
     spread = replace(plain.noise.spread, value=Spread(sigma_px=0.3, tail_share=0.99, tail_px=0.5))
-    named = {item.name: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=spread)))}
+    named = {item.label: item for item in twin_changes(replace(plain, noise=replace(plain.noise, spread=spread)))}
     step = named["tail_share of the optical spread"].twin.noise.spread.value
     assert step.tail_share == pytest.approx(0.95 * 0.99, abs=1e-3)
 

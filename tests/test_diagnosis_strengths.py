@@ -31,7 +31,7 @@ def found(views, *, effects=("output_drift",), since="always"):
     problem = SimpleNamespace(views=views)
     hypothesis = SimpleNamespace(
         effects=effects,
-        variants={name: SimpleNamespace(since=since) for name in effects},
+        variants={name: SimpleNamespace(variant=SimpleNamespace(since=since)) for name in effects},
         strengths=dict.fromkeys(effects, (1.0, 0.9, 1.1)),
     )
     return strengths._output_rms(problem, hypothesis, "output_drift")

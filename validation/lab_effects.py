@@ -54,7 +54,7 @@ def session_row(path: Path, request: EffectRequest) -> dict:
     leading = verdict_of(weighed.hypotheses).leading
     row |= {"strength": request.strength, "since": request.since}
     if request.id in leading.variants:
-        sign = weighed.problem.variant_of(leading.variants[request.id]).sign
+        sign = leading.variants[request.id].variant.sign
         row["found"] = [sign * value for value in strength_of(weighed.problem, leading, request.id)]
         row["fitted"] = [sign * value for value in leading.strengths[request.id]]
     return row

@@ -56,10 +56,9 @@ def row_of(problem: Problem, planted: str) -> tuple[dict, Weighed]:
     own = [fit for fit in weighed.fits if fit.curve.effect == planted]
     if own:
         row["kind"] = told_by_law(weighed, _likest(own))
-    kept = [number for number, curve in enumerate(problem.curves) if curve.effect != planted]
+    kept = tuple(curve for curve in problem.curves if curve.effect != planted)
     if kept:
-        curves, variants = (tuple(items[number] for number in kept) for items in (problem.curves, problem.variants))
-        others = weigh_problem(replace(problem, curves=curves, variants=variants))
+        others = weigh_problem(replace(problem, curves=kept))
         likest = _likest(others.fits)
         row["another"] = told_by_law(others, likest, another=True)
         row["likest"] = likest.curve.effect

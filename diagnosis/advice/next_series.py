@@ -311,11 +311,10 @@ def best_measurement(
     if line is None or not planned:
         return None
     wanted = {
-        (curve.effect, curve.variant): strength
+        (curve.effect, curve.variant.name): _fixed(problem, curve.variant, strength)
         for explanation in (first, second)
         for curve, strength in explanation.values()
     }
-    asked = [_fixed(problem, key, strength) for key, strength in wanted.items()]
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "planned.h5"
@@ -323,7 +322,11 @@ def best_measurement(
             members = _write(path, line, planned, begin_s, rng)
             with open_acquisition(path) as acquisition:
                 taken = build_problem(
-                    acquisition, problem.base, variants=asked, calibrated_elsewhere=True, side=problem.side
+                    acquisition,
+                    problem.base,
+                    variants=list(wanted.values()),
+                    calibrated_elsewhere=True,
+                    side=problem.side,
                 ).released()
     except RaytwinError:
         return None  # the twin cannot draw them: a repeat or the table of what isolates effects is named instead
@@ -340,9 +343,8 @@ def best_measurement(
     return max(proposals, key=lambda item: item.separation_then)
 
 
-def _fixed(problem: Problem, key: tuple[str, str], strength: float) -> Variant:
-    """A variant of the problem at one strength, with what the session says of its other parameters."""
-    variant = next(item for item in problem.variants if (item.effect, item.name) == key)
+def _fixed(problem: Problem, variant: Variant, strength: float) -> Variant:
+    """A variant at one strength, with what the session says of its other parameters."""
     applied = with_conditions(variant.applied(strength), problem.conditions)
     parameters = {name: value for name, value in applied.parameters.items() if name != "strength"}
     return replace(variant, parameters=parameters, strengths=(strength,))
@@ -423,9 +425,8 @@ def _separation(
         own = curve.response(strength)
         if taken is None:
             return own
-        there = next(
-            (item for item in taken.curves if (item.effect, item.variant) == (curve.effect, curve.variant)), None
-        )
+        key = curve.effect, curve.variant.name
+        there = next((item for item in taken.curves if (item.effect, item.variant.name) == key), None)
         more = np.zeros(len(rows)) if there is None else there.response(strength)[rows]
         return np.concatenate([own, more])
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS
-from ..inference.nuisances import Nuisances
-from ..inference.whitening import Whitening
+from ..inference.nuisances import Nuisances, Whitening
 from ..model.curves import Curve
 from ..problem.problem import Problem
 
@@ -70,7 +69,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
     for row, (number, strength) in enumerate(zip(taken, strengths, strict=True)):
         own, mine = curves[number], places[number]
         from_none[row] = lengths(number, np.array([strength]))[0]
-        grid = np.geomspace(own.low, own.high, _FINE_GRID)
+        grid = np.geomspace(own.variant.low, own.variant.high, _FINE_GRID)
         clear = np.nonzero(lengths(number, grid) >= CLEAR)[0]
         if clear.size:
             seen_from[row] = grid[clear[0]]
@@ -78,7 +77,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
         nearest = np.full(len(effects), from_none[row] ** 2)
         for curve, place in zip(curves, places, strict=True):
             column = effects.index(curve.effect)
-            others = curve.weights(np.geomspace(curve.low / 3.0, 1.5 * curve.high, _GRID))
+            others = curve.weights(np.geomspace(curve.variant.low / 3.0, 1.5 * curve.variant.high, _GRID))
             distance = (
                 from_none[row] ** 2
                 - 2.0 * others @ (gram[place, mine] @ weights)
@@ -89,7 +88,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
         between[row, row] = 0.0
     return Distinguishability(
         effects=effects,
-        since=tuple(curves[number].since for number in taken),
+        since=tuple(curves[number].variant.since for number in taken),
         strengths=strengths,
         from_none=from_none,
         seen_from=seen_from,
@@ -99,7 +98,7 @@ def distinguishability(problem: Problem) -> Distinguishability:
 
 def _middle(curve: Curve) -> float:
     """Middle of the plausible range."""
-    return math.sqrt(curve.low * curve.high)
+    return math.sqrt(curve.variant.low * curve.variant.high)
 
 
 def _usual(
@@ -111,7 +110,7 @@ def _usual(
     """
     own = [number for number, curve in enumerate(curves) if curve.effect == effect]
     onset = EFFECTS[effect].usual_onset
-    usual = [number for number in own if curves[number].since == onset] or own
+    usual = [number for number in own if curves[number].variant.since == onset] or own
     ranked = sorted(usual, key=lambda number: float(lengths(number, np.array([_middle(curves[number])]))[0]))
     return ranked[(len(ranked) - 1) // 2]
 

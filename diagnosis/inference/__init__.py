@@ -9,11 +9,8 @@ Files:
     steady            what a law that does the same to every frame may leave beside itself
     unknown           what no catalogue entry explains
     discrepancy       how far laws of a kind depart from ours (`discrepancy.toml`)
-    nuisances         factor model of the nuisances, integrated out
-    local_nuisances   the same where most touch one series
-    whitening         nuisances of single series taken out first
-    refine            inner parameters fitted: the loop
-    refine_tasks      which effects are fitted, in which order
+    nuisances         factor models of the nuisances, integrated out: of single series first, then of all
+    refine            inner parameters fitted: which effects, in which order, and the loop
     search            one fit: slopes and steps
     inner_parameters  strengths with reach and shape of laws left open
     seen              which residual and series a fit asks

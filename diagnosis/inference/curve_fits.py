@@ -69,27 +69,27 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 
     Args:
         observed: what is weighed.
-        curve: in its units.
+        curve: in the units of the first probes.
         levels: of discrepancy.
         exact: the law is taken as exact: a first look, at a fraction of the cost.
     """
-    coarse = curve.log_strengths()
-    sharp = _Terms(observed, curve)
+    own, coarse, scaled = curve.variant, curve.log_strengths(), observed.scaled(curve)
+    sharp = _Terms(observed, scaled)
     strengths, value = sharp.closed_in(coarse)
-    first = log_integral(strengths, value, curve.low, curve.high)
+    first = log_integral(strengths, value, own.low, own.high)
     found = [(first, strengths, value)]
     if not exact:
         start = float(strengths[int(np.argmax(value))])
-        found = [_at_level(observed, curve, start, level, sharp) or found[0] for level in levels.levels]
+        found = [_at_level(observed, scaled, start, level, sharp) or found[0] for level in levels.levels]
     by_level = np.array([item[0] for item in found])
     frequencies = (1.0,) if exact else levels.of_kind
     with np.errstate(divide="ignore"):
         likeliest = int(np.argmax(by_level + np.log(np.asarray(frequencies))))
     return CurveFit(
         curve=curve,
-        by_level=by_level + curve.log_prior,
-        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + curve.log_prior,
-        log_evidence=_over_levels(by_level, frequencies) + curve.log_prior,
+        by_level=by_level + own.log_prior,
+        at_any_strength=np.array([log_integral(at, value, *curve.reach) for _, at, value in found]) + own.log_prior,
+        log_evidence=_over_levels(by_level, frequencies) + own.log_prior,
         level=0.0 if exact else levels.levels[likeliest],
         strengths=found[likeliest][1],
         log_likelihood=found[likeliest][2],
@@ -99,11 +99,10 @@ def fit_curve(observed: Observed, curve: Curve, *, levels: Levels = LEVELS, exac
 def fit_effect(observed: Observed, curve: Curve, *, exact: bool = False) -> CurveFit:
     """A curve fitted to what is weighed, where the twin has all its effects but this one; evidence over all that it has."""
     alone = observed.standing(curve.effect)
-    fit = fit_curve(alone, alone.scaled(curve), exact=exact)
+    fit = fit_curve(alone, curve, exact=exact)
     more = observed.over_none(curve.effect)
     return replace(
         fit,
-        curve=curve,
         by_level=fit.by_level + more,
         at_any_strength=fit.at_any_strength + more,
         log_evidence=fit.log_evidence + more,
@@ -186,7 +185,7 @@ def _at_level(
         # weak strengths keep the sharp covariance: there the law's inaccuracy does nothing
         weak = strengths < _WEAK * best
         value = np.where(weak, sharp.at(strengths)[0], value)
-        found = log_integral(strengths, value, curve.low, curve.high), strengths, value
+        found = log_integral(strengths, value, curve.variant.low, curve.variant.high), strengths, value
         before, best = best, float(strengths[int(np.argmax(value))])
         if abs(math.log(best / before)) < _SETTLED:
             break
@@ -226,14 +225,19 @@ def log_integral(strengths: NDArray[np.float64], log_likelihood: NDArray[np.floa
 
 
 def interval_of(fits: Sequence[CurveFit]) -> tuple[float, float, float]:
-    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence."""
+    """Posterior median and 95 % bounds of a strength, its inner parameters' variants weighed by their evidence.
+
+    Each has the shape of its likelihood at the level by which its law is likeliest to be off.
+    """
     top = max(fit.log_evidence for fit in fits)
     likely = [fit for fit in fits if fit.log_evidence >= top - 12.0]
     nodes = np.unique(np.concatenate([fit.strengths for fit in likely]))
     total = np.full(len(nodes), -np.inf)
     for fit in likely:
         value = np.interp(np.log(nodes), np.log(fit.strengths), fit.log_likelihood, left=-np.inf, right=-np.inf)
-        total = np.logaddexp(total, value)
+        variant = fit.curve.variant
+        at_level = log_integral(fit.strengths, fit.log_likelihood, variant.low, variant.high)
+        total = np.logaddexp(total, value + fit.log_evidence - at_level)
     return interval_under(nodes, total)
 
 

@@ -10,6 +10,7 @@ import math
 import tomllib
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,16 +62,8 @@ def at_most_off(level: float) -> float:
 def _learnt() -> Levels:
     """As `validation/learn_discrepancy.py` left them."""
     table = tomllib.loads(files("raytwin.diagnosis.inference").joinpath("discrepancy.toml").read_text(encoding="utf-8"))
-    levels, kind, another = (tuple(map(float, table[key])) for key in ("levels", "of_kind", "of_another"))
-    return Levels(
-        levels=levels,
-        of_kind=kind,
-        of_another=another,
-        rest_of_kind=float(table["rest_of_kind"]),
-        rest_of_another=float(table["rest_of_another"]),
-        rest_sd_of_kind=float(table["rest_sd_of_kind"]),
-        rest_of_another_log=(float(table["rest_of_another_log"][0]), float(table["rest_of_another_log"][1])),
-    )
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+    return Levels(**values)
 
 
 LEVELS = _learnt()

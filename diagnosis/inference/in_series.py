@@ -7,15 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.changes import Variant
 from .curve_fits import CurveFit
 from .observed import Observed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InSome:
-    """A curve that acts in some series alone: its variant, numbers of the series, log probability of these against all."""
+    """A variant that acts in some series alone, numbers of these, and their log probability against all."""
 
-    variant: str
+    variant: Variant
     series: tuple[int, ...]
     log_prior: float
 

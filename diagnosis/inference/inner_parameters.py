@@ -10,13 +10,11 @@ Source: Rasmussen, Williams, Gaussian Processes for Machine Learning (2006), sec
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from ...generator.effects import EFFECTS
-from ..model.changes import Variant
 from ..model.curves import Curve
 from .curve_fits import fit_curve, interval_of
 from .discrepancy import only
@@ -29,26 +27,19 @@ _SD = 1.0 / math.sqrt(3.0)  # of what is even over a range, in halves of it
 
 
 def with_inner_open(
-    hypothesis: Hypothesis,
-    *,
-    variants: Mapping[tuple[str, str], Variant],
-    observed: Observed,
-    respond: Responder,
-    whitener: Whitener,
+    hypothesis: Hypothesis, *, observed: Observed, respond: Responder, whitener: Whitener
 ) -> Hypothesis:
     """A hypothesis whose strengths' intervals hold what its laws' inner parameters leave open.
 
     Args:
         hypothesis: with whitened curves.
-        variants: by effect and name.
         observed: what is weighed, whitened.
         respond: asks the forward model.
         whitener: of its responses.
     """
     seen = Seen(observed=replace(observed, given=()), respond=respond, whitener=whitener)
     opened = {
-        effect: _opened(curve, variants[effect, curve.variant], hypothesis.strengths[effect][0], seen)
-        for effect, curve in hypothesis.variants.items()
+        effect: _opened(curve, hypothesis.strengths[effect][0], seen) for effect, curve in hypothesis.variants.items()
     }
     if all(opened[effect] is curve for effect, curve in hypothesis.variants.items()):
         return hypothesis
@@ -59,7 +50,7 @@ def with_inner_open(
             if other != effect:
                 strength, level = hypothesis.strengths[other][0], hypothesis.levels[other]
                 beside = beside.beside(Point(curve=its, strength=strength, level=level))
-        fit = fit_curve(beside, beside.scaled(curve), levels=only(hypothesis.levels[effect]))
+        fit = fit_curve(beside, curve, levels=only(hypothesis.levels[effect]))
         # the straight line says how much stays open; the strength itself is known from the law as it bends
         value, low, high = hypothesis.strengths[effect]
         _, low_open, high_open = interval_of([fit])
@@ -67,12 +58,13 @@ def with_inner_open(
     return replace(hypothesis, strengths=strengths)
 
 
-def _opened(curve: Curve, variant: Variant, strength: float, seen: Seen) -> Curve:
+def _opened(curve: Curve, strength: float, seen: Seen) -> Curve:
     """A curve with what its inner parameters may change among what the effect does by chance; itself where none is refined."""
+    variant = curve.variant
     inner = [item for item in variant.fitted if item.name in variant.parameters]
     if not (inner and EFFECTS[curve.effect].grid.refined and variant.refined_from is not None):
         return curve
-    slopes = slopes_of(curve, variant, inner, strength, seen)
+    slopes = slopes_of(curve, inner, strength, seen)
     a_unit = slopes.at(1.0)
     by_name = {item.name: item for item in inner}
     away = np.array([from_middle(by_name[name], variant.parameters[name]) for name in slopes.names])

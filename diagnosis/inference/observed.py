@@ -179,12 +179,12 @@ class Observed:
         Of effects that are the same in every frame, or new in each, mean and noise of frames are parts of their own. What is new in
         every frame does nothing to their mean but by chance, which the covariance holds.
         """
-        known = all(point.curve.course for point in points)
+        known = all(point.curve.variant.course for point in points)
         parts = self.aspects if known and self.aspects is not None else self.series
         squares = [
             self.squares_by_part(
                 replace(point.curve, spread=None, jitter=None)
-                if known and point.curve.course == "random"
+                if known and point.curve.variant.course == "random"
                 else point.curve,
                 point.strength,
                 parts,

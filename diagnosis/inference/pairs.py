@@ -68,7 +68,11 @@ def weigh_pairs(
 
     def curves(effect: str, other: str) -> list[Curve]:
         own = [fit.curve for fit in singles[effect].fits]
-        return own + [curve for curve in beside if (curve.effect, curve.beside) == (effect, other)]
+        return own + [
+            curve
+            for curve in beside
+            if curve.effect == effect and curve.variant.beside is not None and curve.variant.beside.id == other
+        ]
 
     ranked = sorted(singles, key=lambda effect: -singles[effect].log_evidence)
     seen: dict[tuple[str, str], tuple[float, Point, str]] = {}
@@ -81,7 +85,7 @@ def weigh_pairs(
                 continue
             start, left = _beside_first(observed, point, second) if observed.has(second) else alone
             own = curves(second, first)
-            gain = max(fit_curve(left, left.scaled(curve), exact=True).log_evidence for curve in own)
+            gain = max(fit_curve(left, curve, exact=True).log_evidence for curve in own)
             a, b = sorted((first, second))
             if (a, b) not in seen or start + gain > seen[a, b][0]:
                 seen[a, b] = start + gain, point, second
@@ -102,10 +106,9 @@ def _settled(
     at = replace(first, level=point.level)
     start, beside = _beside_first(observed, point, other)
     for turn in range(_TURNS):
-        fit = _beside(beside, curves[other])
-        second = replace(fit, curve=_own(curves[other], fit))
+        second = _beside(beside, curves[other])
         start_second, beside_second = _beside_first(observed, second.point, point.curve.effect)
-        evidence, before = start + log_prior(beside_second, point) + fit.log_evidence, best
+        evidence, before = start + log_prior(beside_second, point) + second.log_evidence, best
         if evidence > best:
             best, fits = evidence, {point.curve.effect: at, other: second}
         if turn and evidence < before + _SETTLED:
@@ -123,19 +126,11 @@ def _beside_first(observed: Observed, point: Point, other: str) -> tuple[float, 
     return observed.over_none(*both) + beside.log_likelihood - alone.log_likelihood, beside
 
 
-def _own(curves: Sequence[Curve], fit: CurveFit) -> Curve:
-    """The curve of a fit, in the units before any effect is taken off."""
-    return next(curve for curve in curves if curve.variant == fit.curve.variant)
-
-
 def _beside(beside: Observed, curves: Sequence[Curve]) -> CurveFit:
     """The best of an effect's variants beside another, its evidence that of all variants."""
-    first = [
-        (fit_curve(beside, beside.scaled(curve), exact=True).log_evidence, number)
-        for number, curve in enumerate(curves)
-    ]
+    first = [(fit_curve(beside, curve, exact=True).log_evidence, number) for number, curve in enumerate(curves)]
     likely = sorted(first, reverse=True)[:_VARIANTS]
-    fits = [fit_curve(beside, beside.scaled(curves[number]), levels=_CARRIED) for _, number in likely]
+    fits = [fit_curve(beside, curves[number], levels=_CARRIED) for _, number in likely]
     best = max(fits, key=lambda fit: fit.log_evidence)
     total = float(np.logaddexp.reduce([fit.log_evidence for fit in fits])) - math.log(len(curves))
     return replace(best, log_evidence=total, share=total - best.log_evidence)
@@ -152,10 +147,11 @@ def left_by_the_stronger(observed: Observed, pair: Pair) -> tuple[str, float]:
     )
     first, second = pair.fits[strong], pair.fits[weak]
     left = second
-    if first.curve.course == "steady" and second.curve.course != "steady" and observed.steady is not None:
+    courses = first.curve.variant.course, second.curve.variant.course
+    if courses[0] == "steady" != courses[1] and observed.steady is not None:
         _, beside = _beside_first(observed, first.point, weak)
         second, left = (
-            replace(fit_curve(beside, beside.scaled(curve), levels=only(second.level)), curve=curve)
+            fit_curve(beside, curve, levels=only(second.level))
             for curve in (second.curve, observed.steady.of(second.curve))
         )
     shares = np.log(LEVELS.of_kind[: len(first.by_level)]) + first.by_level
@@ -196,7 +192,7 @@ def left_in_place(
     top = float(shape.log_likelihood.max())
     likelihood = np.exp(shape.log_likelihood - top)
     left = float(np.trapezoid(likelihood * density, np.log(shape.strengths))) + float(likelihood[0]) * low
-    there = log_integral(second.strengths, second.log_likelihood, second.curve.low, second.curve.high)
+    there = log_integral(second.strengths, second.log_likelihood, second.curve.variant.low, second.curve.variant.high)
     return top + math.log(max(left, 1e-300)) - there
 
 
@@ -213,7 +209,7 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
         another: the effect is only like the curve's.
         any_strength: that the curve is tried at, none more plausible than another.
     """
-    curve = point.curve
+    curve, variant = point.curve, point.curve.variant
     slope, curvature = observed.told_of_strength(point)
     width = 1.0 / (curvature + point.strength_sd**-2)
     free = 0.5 * (slope**2 * width + math.log(width / point.strength_sd**2))
@@ -221,6 +217,6 @@ def log_prior(observed: Observed, point: Point, *, another: bool = False, any_st
     x = strengths / point.strength - 1.0  # responses are nearly straight in the strength
     pull = 0.0 if strengths[0] < point.strength < strengths[-1] else slope
     within = log_integral(
-        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if any_strength else (curve.low, curve.high))
+        strengths, pull * x - 0.5 * curvature * x**2, *(curve.reach if any_strength else (variant.low, variant.high))
     )
-    return curve.log_prior + point.share + log_frequency(point.level, another=another) + within - free
+    return variant.log_prior + point.share + log_frequency(point.level, another=another) + within - free

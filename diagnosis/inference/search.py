@@ -24,26 +24,31 @@ _FARTHEST = 0.6  # step in half ranges
 _FURTHER = 3.0  # times a step that explained more, tried as well where displacements and widths are sought
 _NEAR = (0.75, 1.0, 1.33)  # of the strength found: nodes of the refined curve
 _UP_TO = (0.75, 1.0)  # where more cannot be asked: the spectrum ends a tenth above the stated voltage
+_ITSELF = (1.0,)  # where the response grows in proportion
 
 
-def searched(variant: Variant, fit: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
-    """A variant brought to where the probes want it, with its responses (strength, probe) to all; None: it cannot be asked."""
+def searched(start: CurveFit, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
+    """A variant brought to where the probes want it, with its responses (strength, probe) to all; None: it cannot be asked.
+
+    start: from its variant and its best strength; what it does by chance stays.
+    """
+    variant, like = start.curve.variant, start.curve
     refined = EFFECTS[variant.effect].grid.refined
     inner = [item for item in variant.fitted if refined and item.name in variant.parameters]
-    some = seen.where_told(fit)
+    some = seen.where_told(start)
     cut = some is not seen
-    found = _Search(variant, fit.curve, some).run(fit.best, _in_turn(inner))
+    found = _Search(like, some).run(variant, start.best, _in_turn(inner))
     while inner and found is not None and (closer := some.more_exact()) is not None:
         # a law that is more exact than usual is brought nearer than one that is off could tell
-        nearer = _Search(found.variant, fit.curve, closer).run(found.strength, [inner], slopes=found.slopes)
+        nearer = _Search(like, closer).run(found.variant, found.fit.best, [inner], slopes=found.slopes)
         if nearer is None or some.evidence(nearer.fit.curve) < some.evidence(found.fit.curve) + _ENOUGH:
             break
         some, found = closer, nearer
     seen = replace(seen, level=some.level)
     if found is not None and cut:
         # where some series want it others may pull it a little further
-        found = _Search(found.variant, fit.curve, seen).run(found.strength, [inner] if inner else [], rounds=1)
-    return None if found is None else _centred(found, fit.curve, seen)
+        found = _Search(like, seen).run(found.variant, found.fit.best, [inner] if inner else [], rounds=1)
+    return None if found is None else _centred(found, like, seen)
 
 
 def _centred(found: "_Found", like: Curve, seen: Seen) -> tuple[Variant, NDArray[np.float64]] | None:
@@ -51,12 +56,12 @@ def _centred(found: "_Found", like: Curve, seen: Seen) -> tuple[Variant, NDArray
 
     A response that saturates is known near its nodes only: they are laid where the strength turns out to be.
     """
-    strength = found.strength
+    strength = found.fit.best
     final = _answered(found.variant, strength, seen.respond)
     for _ in range(_CENTRINGS):
         if final is None:
             return None
-        wanted = seen.fit_scaled(curve_of(final[0], seen.own(final[1]), like)).best
+        wanted = seen.fit(replace(like, variant=final[0], responses=seen.own(final[1]))).best
         if abs(math.log(wanted / strength)) < _CENTRED:
             break
         strength = wanted
@@ -65,10 +70,14 @@ def _centred(found: "_Found", like: Curve, seen: Seen) -> tuple[Variant, NDArray
 
 
 def _answered(
-    variant: Variant, strength: float, respond: Callable[[Sequence[Variant]], Mapping[int, NDArray[np.float64]]]
+    variant: Variant,
+    strength: float,
+    respond: Callable[[Sequence[Variant]], Mapping[int, NDArray[np.float64]]],
+    *,
+    nodes: Sequence[Sequence[float]] = (_NEAR, _UP_TO),
 ) -> tuple[Variant, NDArray[np.float64]] | None:
-    """A variant at nodes about a strength, with its responses (strength, probe); None: it cannot be asked."""
-    for shares in (_NEAR, _UP_TO):
+    """A variant at nodes about a strength, the first that can be asked, with its responses (strength, probe); None: none can."""
+    for shares in nodes:
         item = variant.refined(variant.parameters, [share * strength for share in shares])
         answer = respond([item])
         if 0 in answer:
@@ -76,32 +85,35 @@ def _answered(
     return None
 
 
-def curve_of(item: Variant, responses: NDArray[np.float64], like: Curve) -> Curve:
-    return item.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact)
-
-
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Where a search ends: the variant, its strength, what the probes say of it, and how its response changes there, if known."""
+    """Where a search ends: what the probes say of the variant, and how its response changes there, if known."""
 
-    variant: Variant
-    strength: float
     fit: CurveFit
     slopes: "Slopes | None" = None
 
+    @property
+    def variant(self) -> Variant:
+        """With the inner parameters that were found."""
+        return self.fit.curve.variant
+
 
 class _Search:
-    """Inner parameters and strength of one variant brought to where the probes want them; like: a curve of the grid."""
+    """Inner parameters and strength of one variant brought to where the probes want them; like: a curve of the effect."""
 
-    def __init__(self, variant: Variant, like: Curve, seen: Seen) -> None:
-        self._start = variant
+    def __init__(self, like: Curve, seen: Seen) -> None:
         self._like = seen.cut(like)
         self._seen = seen
         # one strength tells the others where the response grows in proportion
-        self._in_proportion = len(EFFECTS[variant.effect].grid.shares) == 1
+        in_proportion = len(EFFECTS[like.effect].grid.shares) == 1
+        self._nodes = (_ITSELF,) if in_proportion else (_NEAR, _UP_TO)
+        # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
+        # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
+        self._shares = (1.0, 0.3, 0.1) if in_proportion else (1.0, _FURTHER, 0.3, 0.1)
 
     def run(
         self,
+        start: Variant,
         strength: float,
         parts: Sequence[Sequence[Parameter]],
         *,
@@ -109,69 +121,49 @@ class _Search:
         slopes: "Slopes | None" = None,
     ) -> _Found | None:
         """Parts of the inner parameters, one after the other, from a strength (slopes: for the first); None: it cannot be asked."""
-        fit = self._tried(self._start, strength)
-        if fit is None:
+        here = self._tried(start, strength)
+        if here is None:
             return None
-        here = _Found(self._start, fit.best, fit)
         for number, part in enumerate(parts):
             slopes = None if number else slopes
             for _ in range(rounds):
                 learnt = slopes is not None
-                slopes = slopes or slopes_of(
-                    here.fit.curve, here.variant, part, _plausible(here.fit, here.variant), self._seen
-                )
+                slopes = slopes or slopes_of(here.curve, part, _plausible(here), self._seen)
                 before = here
                 here, hoped = self._stepped(before, part, slopes)
-                gained, evidence = here.fit.log_evidence - before.fit.log_evidence, before.fit.log_evidence
-                if gained >= max(_ENOUGH, _ENOUGH_SHARE * evidence):
-                    as_hoped = gained > _AS_HOPED * hoped
-                    slopes = slopes.learnt(before.fit, here.fit, _step_of(part, before, here)) if as_hoped else None
+                gained = here.log_evidence - before.log_evidence
+                if gained >= max(_ENOUGH, _ENOUGH_SHARE * before.log_evidence):
+                    slopes = slopes.learnt(before, here, part) if gained > _AS_HOPED * hoped else None
                 elif learnt:
                     slopes = None
                 else:
                     break
-        return replace(here, slopes=slopes)
+        return _Found(here, slopes)
 
-    def _stepped(self, start: _Found, part: Sequence[Parameter], slopes: "Slopes") -> tuple[_Found, float]:
+    def _stepped(self, start: CurveFit, part: Sequence[Parameter], slopes: "Slopes") -> tuple[CurveFit, float]:
         """The best along a step towards where the probes want some parameters, the start itself where none is better.
 
         With the log evidence that the whole step would gain were responses straight lines.
         """
-        # laws that may be off hold a fit back along what two parameters explain alike, so a step that helps may go further; but
-        # where the law's shape is what is off it leads away (0.4 % of lag read 0.37 so, 0.39 without; scatter 2 % lower)
-        shares = (1.0, 0.3, 0.1) if self._in_proportion else (1.0, _FURTHER, 0.3, 0.1)
-        steps, hoped = _newton(start.fit, start.variant, slopes, self._seen)
-        here = start
-        for share in shares:
+        steps, hoped = _newton(start, slopes, self._seen)
+        here, variant = start, start.curve.variant
+        for share in self._shares:
             helped = here is not start
             if share != 1.0 and helped == (share < 1.0):
                 continue
-            parameters = dict(start.variant.parameters)
+            parameters = dict(variant.parameters)
             for item in part:
                 parameters[item.name] = _moved(item, parameters[item.name], share * steps.get(item.name, 0.0))
-            if parameters == here.variant.parameters:
+            if parameters == here.curve.variant.parameters:
                 continue  # at the ends of their ranges
-            variant = replace(start.variant, parameters=parameters)
-            fit = self._tried(variant, here.strength)
-            if fit is not None and fit.log_evidence > here.fit.log_evidence:
-                here = _Found(variant, fit.best, fit)
+            fit = self._tried(replace(variant, parameters=parameters), here.best)
+            if fit is not None and fit.log_evidence > here.log_evidence:
+                here = fit
         return here, hoped
 
     def _tried(self, variant: Variant, strength: float) -> CurveFit | None:
-        if not self._in_proportion:
-            found = _answered(variant, strength, self._seen.ask)
-            return None if found is None else self._seen.fit_scaled(curve_of(*found, self._like))
-        item = variant.refined(variant.parameters, [strength])
-        answer = self._seen.ask([item])
-        return self._seen.fit_scaled(curve_of(item, answer[0], self._like)) if 0 in answer else None
-
-
-def _step_of(part: Sequence[Parameter], before: _Found, after: _Found) -> dict[str, float]:
-    """The step between two, in halves of the parameters' ranges."""
-    return {
-        item.name: _way(item, before.variant.parameters[item.name], after.variant.parameters[item.name])
-        for item in part
-    }
+        found = _answered(variant, strength, self._seen.ask, nodes=self._nodes)
+        return None if found is None else self._seen.fit(replace(self._like, variant=found[0], responses=found[1]))
 
 
 def _in_turn(inner: Sequence[Parameter]) -> list[Sequence[Parameter]]:
@@ -196,12 +188,14 @@ class Slopes:
         """The rows at another strength, to which they are taken to be in proportion."""
         return self.rows * (strength / self.strength)
 
-    def learnt(self, before: CurveFit, after: CurveFit, step: Mapping[str, float]) -> "Slopes":
-        """With what a step has shown, along that step.
+    def learnt(self, before: CurveFit, after: CurveFit, part: Sequence[Parameter]) -> "Slopes":
+        """With what a step of some parameters has shown, along that step.
 
         Source: Broyden (1965), doi:10.1090/S0025-5718-1965-0198670-6.
         """
         strength = after.best
+        first, last = before.curve.variant.parameters, after.curve.variant.parameters
+        step = {item.name: _way(item, first[item.name], last[item.name]) for item in part}
         taken = np.array([step[name] for name in self.names])
         rows, length = self.at(strength), float(taken @ taken)
         if length == 0.0:  # at the ends of their ranges: better by its strength alone
@@ -211,8 +205,9 @@ class Slopes:
         return Slopes(self.names, rows, strength)
 
 
-def slopes_of(curve: Curve, variant: Variant, inner: Sequence[Parameter], strength: float, seen: Seen) -> Slopes:
+def slopes_of(curve: Curve, inner: Sequence[Parameter], strength: float, seen: Seen) -> Slopes:
     """What small steps of the inner parameters do to a curve's response; those that cannot be asked are left out."""
+    variant = curve.variant
     at = np.asarray(curve.response(strength))
     steps, asked = [], []
     for item in inner:
@@ -234,27 +229,26 @@ def from_middle(item: Parameter, value: float) -> float:
     return _way(item, math.sqrt(item.low * item.high) if item.log else 0.5 * (item.low + item.high), value)
 
 
-def _plausible(here: CurveFit, variant: Variant) -> float:
+def _plausible(here: CurveFit) -> float:
     """The strength found, within its range: a share of photons beyond it asks for another shape, not for more photons."""
-    return min(max(here.best, variant.low), variant.high)
+    return min(max(here.best, here.curve.variant.low), here.curve.variant.high)
 
 
-def _newton(here: CurveFit, variant: Variant, slopes: Slopes, seen: Seen) -> tuple[dict[str, float], float]:
+def _newton(here: CurveFit, slopes: Slopes, seen: Seen) -> tuple[dict[str, float], float]:
     """Steps of the inner parameters, each in half of its range, towards where the probes want them, and what they should gain.
 
     Least squares in the parameters and the strength together, responses taken as straight lines near here, the law off
     as usual, each parameter within its range: what one would do beyond its end, the others do otherwise.
     """
-    strength = _plausible(here, variant)
-    at = np.asarray(here.curve.response(strength))
-    found, root = seen.widened(here.curve, strength)
-    left, wide = found.residual - at / root, found.nuisances
-    rows = np.concatenate([at[None, :], slopes.at(strength)]) / root
-    normal = wide.inner(rows, rows)
+    strength = _plausible(here)
+    at, wide = here.curve.response(strength), seen.widened(here.curve, strength)
+    rows = np.concatenate([at[None, :], slopes.at(strength)]) / wide.units
+    left = wide.residual - rows[0]
+    normal = wide.nuisances.inner(rows, rows)
     normal[np.arange(1, len(rows)), np.arange(1, len(rows))] += 1.0
     normal[0, 0] += 1e-9 if strength == here.best else 1e12
-    wanted = wide.inner(rows, left[None, :])[:, 0]
-    solved = _within(normal, wanted, _room(variant, slopes.names))
+    wanted = wide.nuisances.inner(rows, left[None, :])[:, 0]
+    solved = _within(normal, wanted, _room(here.curve.variant, slopes.names))
     # shortened as a whole: what parameters explain alike must keep its direction
     farthest = float(np.max(np.abs(solved[1:]), initial=0.0))
     solved *= min(1.0, _FARTHEST / max(farthest, 1e-12))

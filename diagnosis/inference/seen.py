@@ -64,8 +64,9 @@ class Blocks:
 class Seen:
     """What one effect is fitted to, beside others, and how the forward model is asked for more of it.
 
-    Fields: observed; respond: the forward model; whitener of its responses; blocks of series (None: all are asked); wanted: which of
-    all probes these are (None: all); level: by which laws are taken to be off.
+    Its curves are whitened and in the units of the first probes. Fields: observed; respond: the forward model; whitener of its
+    responses; blocks of series (None: all are asked); wanted: which of all probes these are (None: all); level: by which laws are
+    taken to be off.
     """
 
     observed: Observed
@@ -80,42 +81,35 @@ class Seen:
         return replace(self, observed=self.observed.beside(point))
 
     def where_told(self, fit: CurveFit) -> "Seen":
-        """The same of the series that tell most of a fitted curve in these units; itself where nearly all are needed."""
+        """The same of the series that tell most of a fitted curve; itself where nearly all are needed."""
         if self.blocks is None:
             return self
-        wide, root = self.widened(fit.curve, fit.best)
-        response = fit.curve.response(fit.best) / root
+        wide = self.widened(fit.curve, fit.best)
+        response = fit.curve.response(fit.best) / wide.units
         kept = self.blocks.telling(response * wide.nuisances.solve(response))
         if kept is None:
             return self
         return replace(self, observed=self.observed.of_probes(kept), blocks=None, wanted=kept)
 
-    def widened(self, curve: Curve, strength: float) -> tuple[Observed, NDArray[np.float64]]:
-        """What is seen where a curve's law (in these units) is off at a strength, and its units in these (probe,)."""
-        wide = self.observed.widened(curve, strength, self.level) or self.observed
-        return wide, wide.units / self.observed.units
+    def widened(self, curve: Curve, strength: float) -> Observed:
+        """What is seen where a curve's law is off at a strength."""
+        return self.observed.widened(self.observed.scaled(curve), strength, self.level) or self.observed
 
     def ask(self, variants: Sequence[Variant]) -> dict[int, NDArray[np.float64]]:
-        """Responses (strength, probe) of variants by their place, whitened and in these units."""
+        """Responses (strength, probe) of variants by their place, whitened."""
         return {number: self.own(found) for number, found in self.respond(variants, wanted=self.wanted).items()}
 
     def own(self, responses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Responses of all probes as the forward model gives them, whitened and in these units."""
+        """Responses of all probes as the forward model gives them, whitened, of these probes."""
         whitened = self.whitener.apply(responses)
-        if self.wanted is not None:
-            whitened = whitened[:, self.wanted]
-        return np.asarray(whitened / self.observed.units)
+        return whitened if self.wanted is None else whitened[:, self.wanted]
 
     def cut(self, curve: Curve) -> Curve:
         """A curve of all probes, of these."""
         return curve if self.wanted is None else curve.of_probes(self.wanted)
 
     def fit(self, curve: Curve) -> CurveFit:
-        """A whitened curve of all probes, fitted."""
-        return self.fit_scaled(self.observed.scaled(self.cut(curve)))
-
-    def fit_scaled(self, curve: Curve) -> CurveFit:
-        """A curve in these units, fitted with its law off by the level."""
+        """A curve of these probes, fitted with its law off by the level."""
         return fit_curve(self.observed, curve, levels=only(self.level))
 
     def more_exact(self) -> "Seen | None":
@@ -124,5 +118,5 @@ class Seen:
         return replace(self, level=LEVELS.levels[max(below - 2, 0)]) if below else None
 
     def evidence(self, curve: Curve) -> float:
-        """Log evidence of a curve in these units, its law off by any level."""
+        """Log evidence of a curve of these probes, its law off by any level."""
         return fit_curve(self.observed, curve).log_evidence

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model.curves import Curve
-from .whitening import Whitening
+from .nuisances import Whitening
 
 
 class Steady:
@@ -25,7 +25,7 @@ class Steady:
             whitening: of the curves that are asked for.
         """
         self._whitening = whitening
-        steady = [curve.responses[-1] for curve in curves if curve.course == "steady"]
+        steady = [curve.responses[-1] for curve in curves if curve.variant.course == "steady"]
         self._groups = [(members, _directions(np.stack(steady), members)) for members in _of_one_size(alike) if steady]
 
     def of(self, curve: Curve) -> Curve:

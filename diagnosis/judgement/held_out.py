@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..inference.discrepancy import USUAL_LEVEL, law_terms
 from ..inference.inference import UNKNOWN, Hypothesis
-from ..inference.local_nuisances import LocalNuisances
+from ..inference.nuisances import LocalNuisances
 from ..inference.observed import Point
 from ..problem.problem import Problem, SeriesView
 from .strengths import strengths_on

@@ -16,12 +16,11 @@ from ..inference.discrepancy import FARTHEST_LEVEL, LEVELS, law_terms
 from ..inference.in_series import in_some_series
 from ..inference.inference import UNKNOWN, Hypothesis, weigh_hypotheses
 from ..inference.inner_parameters import with_inner_open
-from ..inference.local_nuisances import LocalNuisances
-from ..inference.nuisances import Nuisances
+from ..inference.nuisances import LocalNuisances, Nuisances, Whitening
 from ..inference.observed import Observed
 from ..inference.refine import SEEN_FROM, refine
 from ..inference.steady import Steady
-from ..inference.whitening import Whitening
+from ..model.changes import Variant
 from ..model.curves import Curve
 from ..problem.known_effects import with_found
 from ..problem.problem import Problem
@@ -56,7 +55,7 @@ def judge(
     likeliest = _likeliest_known(problem, verdict, rng)
     marginal = _by_effect(verdict.hypotheses)
     # what acts in some series alone is nothing that the line has
-    lasting = [effect for effect in named if not leading.variants[effect].series]
+    lasting = [effect for effect in named if not leading.variants[effect].variant.series]
     added = tuple(applied_at_best(problem, leading, effect) for effect in lasting)
     ambiguous = verdict.word == "ambiguous"
     beside = replace(problem, residual=_left(problem, leading))
@@ -108,7 +107,7 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         of_effect = [fit for fit in fits if fit.curve.effect == effect]
         part = in_some_series(observed.standing(), of_effect, problem.series_of)
         if part is not None:
-            problem = problem.in_series(effect, part.variant, part.series, part.log_prior)
+            problem = problem.in_series(part.variant, part.series, part.log_prior)
             more = whitening.curves(problem.curves[len(whitened) :])
             whitened, fits = (*whitened, *more), [*fits, *fit_effects(observed, more)]
 
@@ -118,20 +117,19 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
             families=problem.families,
             of_catalogue=len(EFFECTS),
             rests=rests,
-            beside=[curve for curve in whitened if curve.beside],
+            beside=[curve for curve in whitened if curve.variant.beside is not None],
         )
 
     first = weigh([(observed, fits)], rests=False)
     likeliest = _likeliest(first)
     if likeliest is not None:
         tell("nuisances beside the likeliest explanation")
-        problem = problem.with_nuisances_beside(_applied_everywhere(problem, likeliest))
+        problem = problem.with_nuisances_beside(_applied_everywhere(likeliest))
         whitening, observed, whitened = _whitened(problem)
         first = _with_curves(first, whitened)
     tell("refinement")
     closer = refine(
         first,
-        variants={(item.effect, item.name): item for item in problem.variants},
         curves=whitened,
         observed=observed,
         respond=problem.respond,
@@ -140,14 +138,14 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
     )
     problem = problem.with_variants(closer)
     whitened = (*whitened, *whitening.curves(problem.curves[len(whitened) :]))
-    alone = [curve for curve in whitened if not curve.beside]
+    alone = [curve for curve in whitened if curve.variant.beside is None]
     fits = fit_effects(observed, alone)
     nearer = _likeliest(weigh([(observed, fits)], rests=False)) if closer else None
     if nearer is not None:
         tell("nuisances beside it, as refinement found it")
-        problem = problem.with_nuisances_beside(_applied_everywhere(problem, nearer))
+        problem = problem.with_nuisances_beside(_applied_everywhere(nearer))
         whitening, observed, whitened = _whitened(problem)
-        alone = [curve for curve in whitened if not curve.beside]
+        alone = [curve for curve in whitened if curve.variant.beside is None]
         fits = fit_effects(observed, alone)
     tell("all hypotheses")
     seen = [(observed, fits)]
@@ -155,9 +153,8 @@ def weigh_problem(problem: Problem, *, tell: Callable[[str], None] = lambda stag
         levels = [observed.off_by(level) for level in LEVELS.up_to(FARTHEST_LEVEL).levels]
         seen = [(one, fit_effects(one, alone)) for one in levels]
     hypotheses = weigh(seen, rests=True)
-    by_name = {(item.effect, item.name): item for item in problem.variants}
     hypotheses = tuple(
-        with_inner_open(item, variants=by_name, observed=observed, respond=problem.respond, whitener=whitening)
+        with_inner_open(item, observed=observed, respond=problem.respond, whitener=whitening)
         if item.probability > _WORTH_LISTING
         else item
         for item in hypotheses
@@ -198,19 +195,22 @@ def _whitened(problem: Problem) -> tuple[Whitening, Observed, tuple[Curve, ...]]
 
 def _with_curves(hypotheses: Sequence[Hypothesis], curves: Sequence[Curve]) -> tuple[Hypothesis, ...]:
     """Hypotheses with the curves of the same variants."""
-    own = {(curve.effect, curve.variant): curve for curve in curves}
+
+    def own(variant: Variant) -> Curve:
+        return next(curve for curve in curves if curve.variant == variant)
+
     return tuple(
-        replace(item, variants={name: own[curve.effect, curve.variant] for name, curve in item.variants.items()})
+        replace(item, variants={name: own(curve.variant) for name, curve in item.variants.items()})
         for item in hypotheses
     )
 
 
-def _applied_everywhere(problem: Problem, hypothesis: Hypothesis) -> list[AppliedEffect]:
+def _applied_everywhere(hypothesis: Hypothesis) -> list[AppliedEffect]:
     """The effects of a hypothesis as they fit best, less those that act in some series only."""
     return [
-        problem.variant_of(curve).applied(hypothesis.strengths[effect][0])
+        curve.variant.applied(hypothesis.strengths[effect][0])
         for effect, curve in hypothesis.variants.items()
-        if not curve.series
+        if not curve.variant.series
     ]
 
 
@@ -302,15 +302,14 @@ def _causes(
             continue
         # of what is named, as it stands in the explanation that leads
         best = next(item for item in (verdict.leading, *verdict.hypotheses) if effect in item.effects)
-        curve = best.variants[effect]
-        variant = problem.variant_of(curve)
+        variant = best.variants[effect].variant
         causes.append(
             Cause(
                 effect=effect,
                 probability=min(marginal[effect], 1.0),
                 strength=strength_of(problem, best, effect),
                 unit=EFFECTS[effect].strength.unit,
-                parameters=dict(curve.parameters),
+                parameters=dict(variant.parameters),
                 sign=variant.sign,
                 since=variant.since,
                 series=variant.series,
@@ -354,8 +353,8 @@ def _beyond_plausible(leading: Hypothesis) -> tuple[str, ...]:
     notes = []
     for effect, curve in leading.variants.items():
         known, value = EFFECTS[effect].strength, leading.strengths[effect][0]
-        if not curve.low <= value <= curve.high:
-            side = "weaker" if value < curve.low else "stronger"
+        if not curve.variant.low <= value <= curve.variant.high:
+            side = "weaker" if value < curve.variant.low else "stronger"
             notes.append(
                 f"{effect} is {side} than what is plausible as a rule ({known.low:g} to {known.high:g} {known.unit}): such a"
                 " strength was given little weight beforehand"
@@ -379,9 +378,9 @@ def _of_another_strength(problem: Problem, verdict: Verdict) -> tuple[str, ...]:
 def _in_some(leading: Hypothesis) -> tuple[str, ...]:
     """What to say of effects that act in some series only."""
     return tuple(
-        f"{effect} acts in {', '.join(curve.series)} only: the improved twin is left without it"
+        f"{effect} acts in {', '.join(curve.variant.series)} only: the improved twin is left without it"
         for effect, curve in leading.variants.items()
-        if curve.series
+        if curve.variant.series
     )
 
 
@@ -414,9 +413,10 @@ def _out_of_reach(problem: Problem, curves: Sequence[Curve], observed: Observed)
     """Effects that the session could not show at their largest plausible strength, each with the reason."""
     farthest: dict[str, tuple[float, float]] = {}
     for curve in curves:
-        length = observed.length(curve, curve.high)
+        high = curve.variant.high
+        length = observed.length(curve, high)
         if length >= farthest.get(curve.effect, (-1.0, 0.0))[0]:
-            farthest[curve.effect] = (length, curve.high)
+            farthest[curve.effect] = (length, high)
     found = dict(problem.missing_effects)
     for effect, (length, high) in farthest.items():
         if length < SEEN_FROM:
@@ -451,7 +451,8 @@ def _next_measurement(
                 "separation": planned.separation,
                 "separation_then": planned.separation_then,
             }
-        if planned is not None and _all_later(problem, (*first.values(), *second.values())):
+        every = [curve.variant for curve, _ in (*first.values(), *second.values())]
+        if planned is not None and all(variant.since == "calibration" for variant in every):
             other = planned.measurement.text, planned.separation_then
     if found is None:
         return None
@@ -461,12 +462,6 @@ def _next_measurement(
         "separation": found.separation,
         "separation_then": found.separation_then,
     }
-
-
-def _all_later(problem: Problem, curves: Sequence[tuple[Curve, float]]) -> bool:
-    """Whether curves (with strengths) all stand for effects that set in after the calibration."""
-    named = {(curve.effect, curve.variant) for curve, _ in curves}
-    return all(item.since == "calibration" for item in problem.variants if (item.effect, item.name) in named)
 
 
 def _threshold(probes: int) -> float:

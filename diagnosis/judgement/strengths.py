@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...generator.effects import EFFECTS, AppliedEffect
 from ...generator.frames.conditions import with_conditions
+from ...generator.line.twin import Z95
 from ..inference.curve_fits import fit_curve
 from ..inference.discrepancy import USUAL_LEVEL, only
 from ..inference.inference import Hypothesis
@@ -41,14 +42,13 @@ def applied_at_best(problem: Problem, hypothesis: Hypothesis, effect: str) -> Ap
         strength = value
     return replace(
         _applied(problem, hypothesis, effect, strength),
-        strength_sd=math.log(high / low) / (2.0 * 1.959964),
+        strength_sd=math.log(high / low) / (2.0 * Z95),
         law_sd=hypothesis.levels[effect],
     )
 
 
 def _applied(problem: Problem, hypothesis: Hypothesis, effect: str, strength: float) -> AppliedEffect:
-    variant = problem.variant_of(hypothesis.variants[effect])
-    return with_conditions(variant.applied(strength), problem.conditions)
+    return with_conditions(hypothesis.variants[effect].variant.applied(strength), problem.conditions)
 
 
 def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float]:
@@ -64,8 +64,8 @@ def strength_of(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[
         found = _outright(problem, hypothesis, effect)
     value, low, high = hypothesis.strengths[effect] if found is None else found
     sd = reading.law_sd if found is None or reading.sd is None else reading.sd
-    below, above = (math.hypot(math.log(one / value), 1.96 * sd) for one in (low, high))
-    return value, value * math.exp(-below), max(min(value * math.exp(above), curve.most), value)
+    below, above = (math.hypot(math.log(one / value), Z95 * sd) for one in (low, high))
+    return value, value * math.exp(-below), max(min(value * math.exp(above), curve.variant.most), value)
 
 
 def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[float, float, float] | None:
@@ -87,7 +87,7 @@ def _outright(problem: Problem, hypothesis: Hypothesis, effect: str) -> tuple[fl
     responses = curve.weights(strengths) @ curve.responses[:, exact]
     distance = np.sum((left - responses) ** 2, axis=1)
     at = int(np.argmin(distance))
-    near = distance < distance[at] + 1.96**2
+    near = distance < distance[at] + Z95**2
     if at in (0, len(strengths) - 1):
         return None
     return float(strengths[at]), float(strengths[near].min()), float(strengths[near].max())
@@ -100,7 +100,7 @@ def _output_rms(problem: Problem, hypothesis: Hypothesis, output: str) -> tuple[
     series went into the twin, so the mean over the session says nothing of the output.
     """
     others = [effect for effect in hypothesis.effects if effect != output]
-    since = hypothesis.variants[output].since == "calibration"
+    since = hypothesis.variants[output].variant.since == "calibration"
     signals_DN = [mean_over(view.signal_DN, view.mask) for view in problem.views]
     noises = [_noise_of_a_frame(view) for view in problem.views]
     fields = [_open_field(view) for view in problem.views]
@@ -183,6 +183,6 @@ def strengths_on(
                 continue  # the strength is that of all probes
             others = {other: (leading.variants[other], strengths[other]) for other in effects if other != effect}
             rest = replace(part, residual=problem.left_by(others, without=had)[fit]).standing()
-            own = rest.scaled(replace(curve.of_probes(fit), spread=None))
+            own = replace(curve.of_probes(fit), spread=None)
             strengths[effect] = fit_curve(rest, own, levels=only(USUAL_LEVEL)).best
     return strengths

@@ -1,9 +1,9 @@
 """What may differ from the twin, and what each change does to a session, calibration absorbing its part.
 
 Files:
-    changes           effects with their variants and strengths, and nuisances with their prior sizes
+    changes           what may differ: effects with their variants and strengths, nuisances with their prior sizes
     curves            response of the probes to an effect at any strength
-    forward_model     the base twin and its changes, as series ask them
+    forward_model     the base twin under changes, as series ask it
     responses         change of corrected mean frames and scalars
     calibrated_maps   dark and gain map of the calibrating series, and their noise
     placing           where scenes lie against their thickness maps

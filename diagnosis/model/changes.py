@@ -8,18 +8,23 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.priors import ATTENUATION_SCALE, DEPARTURES, PRIORS, UNDECLARED_SCINTILLATOR, spread_of
 from ...generator.effects import EFFECTS, AppliedEffect, Effect
-from ...generator.effects.effect import Parameter
-from ...generator.line.twin import Estimate, SpectralPosterior, Twin
+from ...generator.effects.effect import Displacement, Parameter, Placement
+from ...generator.line.series_request import SeriesRequest
+from ...generator.line.twin import Estimate, SpectralPosterior, SpreadEstimate, Twin
+from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
 from ..session.coarse import in_squares
-from .curves import Curve
 
 _MOST_VARIANTS = 4
+_IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
+_OBJECTS_ALONE = ("object",)
+_ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 # scales of the session that any repeat shows; relative standard deviations unless the name says otherwise
 THICKNESS_SD = 0.01  # of a scene's material: what a wedge or slab is known to
@@ -76,65 +81,40 @@ class Variant:
     """An effect with its inner parameters fixed.
 
     Fields: effect; name; parameters (without the strength); sign (of the strength); since; low, high: plausible range of
-    the strength; strengths at which the response is computed; fitted: its inner parameters with their ranges here;
-    refined_from: name of the variant that was refined to be this one, None: not refined; series, log_prior, most: as of a `Curve`;
-    beside: another effect that is there: its response is what it adds to that one's.
+    the strength; strengths > 0, ascending, at which the response is computed; fitted: its inner parameters with their ranges here;
+    refined_from: name of the variant that was refined to be this one, None: not refined; series: names of those in which it acts
+    (empty: all); log_prior: log probability of that, against one that acts in all; most: strength beyond which there is nothing (a
+    share of 100 %); beside: another effect that is there: its response is what it adds to that one's; course: what the effect is
+    from frame to frame, as `Effect` says (empty: not known).
     """
 
     effect: str
-    name: str
-    parameters: Mapping[str, float]
-    sign: float
-    since: str
+    name: str = ""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    sign: float = 1.0
+    since: str = "always"
     low: float
     high: float
     strengths: tuple[float, ...]
     fitted: tuple[Parameter, ...] = ()
     refined_from: str | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
     series: tuple[str, ...] = ()
     log_prior: float = 0.0
     most: float = math.inf
     beside: AppliedEffect | None = None
-
-    def curve(
-        self,
-        responses: NDArray[np.float64],
-        *,
-        spread: NDArray[np.float64] | None = None,
-        jitter: NDArray[np.float64] | None = None,
-        exact: NDArray[np.bool_] | None = None,
-    ) -> Curve:
-        """The curve through responses (strength, probe) at this variant's strengths; spread, jitter, exact as in `Curve`."""
-        return Curve(
-            effect=self.effect,
-            variant=self.name,
-            parameters=dict(self.parameters),
-            low=self.low,
-            high=self.high,
-            strengths=np.array(self.strengths),
-            responses=responses,
-            since=self.since,
-            spread=spread,
-            jitter=jitter,
-            exact=exact,
-            series=self.series,
-            log_prior=self.log_prior,
-            most=self.most,
-            beside="" if self.beside is None else self.beside.id,
-            course=EFFECTS[self.effect].course,
-        )
+    course: str = ""
 
     def refined(self, parameters: Mapping[str, float], strengths: Sequence[float]) -> "Variant":
         """The same with other inner parameters, asked at other strengths; its name says where it came from."""
         label = ", ".join(f"{name} {value:.3g}" for name, value in parameters.items())
+        first = self.name if self.refined_from is None else self.refined_from
         beside = "" if self.beside is None else f", beside {self.beside.id}"
         return replace(
             self,
             parameters=dict(parameters),
-            name=f"{label}, refined from {self.name}{beside}".strip(", "),
+            name=f"{label}, refined from {first}{beside}".strip(", "),
             strengths=tuple(strengths),
-            refined_from=self.name,
+            refined_from=first,
         )
 
     def applied(self, strength: float) -> AppliedEffect:
@@ -143,8 +123,116 @@ class Variant:
             id=self.effect,
             parameters={**self.parameters, "strength": self.sign * strength},
             since=self.since,
-            options=dict(self.options),
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    """A change asked of the forward model.
+
+    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
+    one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
+    standard deviations; steps: series that a step of the twin moves, "all", "lit" or none.
+    """
+
+    label: str
+    twin: Twin
+    effects: tuple[AppliedEffect, ...] = ()
+    instead_of: tuple[AppliedEffect, ...] = ()
+    parameters: NDArray[np.float64] | None = None
+    step_sd: float = 1.0
+    steps: str = ""
+
+    def touches(self, request: SeriesRequest) -> bool:
+        """Whether the change can show in a series."""
+        if self.steps == "all" or (self.steps == "lit" and request.beam_on):
+            return True
+        if any(effect.since == "always" or request.after_calibration for effect in self.instead_of):
+            return True
+        for effect in self.effects:
+            if effect.since == "calibration" and not request.after_calibration:
+                continue
+            series = EFFECTS[effect.id].shows.series
+            if request.kind in series and not (series == _OBJECTS_ALONE and self.only_displaces):
+                return True
+        return False
+
+    def beside(self, other: "Change") -> "Change | None":
+        """A nuisance's step once effects have been found; None: it is a little of one of these.
+
+        other: the base twin with these effects.
+        """
+        if {item.id for item in self.effects} & {item.id for item in other.effects}:
+            return None
+        return replace(
+            self,
+            twin=replace(self.twin, effects=other.twin.effects),
+            effects=(*self.effects, *other.effects),
+            instead_of=other.instead_of,
+        )
+
+    @property
+    def only_displaces(self) -> bool:
+        """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
+        return len(self.effects) == 1 and self._misplaced is not None and self._misplaced.only_shifts
+
+    @property
+    def displacement(self) -> dict[str, float]:
+        """Displacement (px) that the change brings to a scene's picture, by probe; empty: none."""
+        if self._misplaced is None:
+            return {}
+        lies = self._misplaced.lies
+        angle = math.radians(lies.direction_deg)
+        return {ALONG_ROWS: lies.shift_px * math.cos(angle), ALONG_COLUMNS: lies.shift_px * math.sin(angle)}
+
+    def found_in_place(self) -> "Change":
+        """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
+        misplaced = self._misplaced
+        if misplaced is None or self.only_displaces:
+            return self
+        effect = misplaced.effect
+        others = [item for item in self.effects if item is not effect]
+        if misplaced.only_shifts:
+            return replace(self, effects=tuple(others))
+        rest = misplaced.placement.without_shift(effect.parameters)
+        return replace(self, effects=(*others, replace(effect, parameters=rest)))
+
+    @property
+    def _misplaced(self) -> "_Misplaced | None":
+        for effect in self.effects:
+            placement = EFFECTS[effect.id].placement
+            if placement is not None:
+                return _Misplaced(effect, placement, placement.parts(effect.parameters))
+        return None
+
+    def whenever_it_began(self, request: SeriesRequest) -> object | None:
+        """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
+        if (
+            self.instead_of
+            or self.steps
+            or len(self.effects) != 1
+            or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS
+            or not self.touches(request)
+        ):
+            return None
+        effect = self.effects[0]
+        long_ago = request.long_ago if EFFECTS[effect.id].remembers_all else ()
+        if effect.since == "always" and any(not item.after_calibration for item in (*long_ago, *request.previous)):
+            return None  # what was exposed before calibration ended remembers when it began
+        return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Misplaced:
+    """An effect that displaces scenes, and how they lie with it."""
+
+    effect: AppliedEffect
+    placement: Placement
+    lies: Displacement
+
+    @property
+    def only_shifts(self) -> bool:
+        return math.hypot(self.lies.radial_px, self.lies.turn_px) <= _ALL_SHIFT * self.lies.size_px
 
 
 def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
@@ -208,6 +296,7 @@ def variants_of(effect: Effect, *, side: int = 1) -> list[Variant]:
                 strengths=nodes,
                 fitted=(*inner, *later),
                 most=strength.most,
+                course=effect.course,
             )
         )
     return result
@@ -241,16 +330,6 @@ def catalogue_variants(*, without: Sequence[str] = (), side: int = 1) -> list[Va
     """The variants of the whole catalogue, less the effects in `without`; side as in `variants_of`."""
     kept = (effect for name, effect in EFFECTS.items() if name not in without)
     return [variant for effect in kept for variant in variants_of(effect, side=side)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TwinChange:
-    """A nuisance that lies in the twin: its name, the changed twin or parameters, and how many prior sds the step is."""
-
-    name: str
-    twin: Twin
-    parameters: NDArray[np.float64] | None
-    step_sd: float
 
 
 def spectral_sds(posterior: SpectralPosterior) -> NDArray[np.float64]:
@@ -287,105 +366,80 @@ def departures_found(posterior: SpectralPosterior | None) -> float:
     return max([1.0, *found])
 
 
-def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[TwinChange]:
+def twin_changes(twin: Twin, *, spectral_steps: float = 1.0) -> list[Change]:
     """Steps in what calibration has fitted, each with the step's size in prior standard deviations (`spectral_sds`).
 
     Args:
         twin: as asked.
         spectral_steps: size of a step over the posterior's standard deviation.
     """
-    result: list[TwinChange] = []
-    posterior = twin.spectral
-    if posterior is not None:
-        best = np.asarray(posterior.best, dtype=np.float64)
-        draws = posterior.samples.std(axis=0)
-        for index, (name, sd) in enumerate(zip(posterior.names, spectral_sds(posterior), strict=True)):
-            step = min(max(spectral_steps * float(draws[index]), 0.05 * sd), sd)
-            if name == "inherent_filtration_mm_Al" and best[index] - step < 0:
-                step = abs(step)
-            changed = best.copy()
-            changed[index] += step
-            result.append(TwinChange(name=name, twin=twin, parameters=changed, step_sd=step / sd))
-    spread = twin.noise.spread
-    sigma_px = spread.value.sigma_px
-    known = spread.intervals.get("sigma_px")
-    sd = max(SPREAD_SD * sigma_px, 0.0 if known is None else (known.high - known.low) / (2 * 1.959964), 0.01)
-    step = 0.5 * sd
-    wider = replace(spread, value=replace(spread.value, sigma_px=sigma_px + step))
-    result.append(
-        TwinChange(
-            name="optical spread",
-            twin=replace(twin, noise=replace(twin.noise, spread=wider)),
-            parameters=None,
-            step_sd=step / sd,
-        )
-    )
-    result += _tail_changes(twin)
-    result += [
-        TwinChange(
-            name=f"optical spread as {other.family}",
-            twin=replace(twin, noise=replace(twin.noise, spread=replace(spread, value=other.value))),
-            parameters=None,
+    noise, spread, read = twin.noise, twin.noise.spread, twin.noise.read_noise_DN
+
+    def stepped(label: str, *, step_sd: float = 1.0, **changed: Any) -> Change:
+        return Change(label=label, twin=replace(twin, noise=replace(noise, **changed)), step_sd=step_sd, steps="all")
+
+    def with_spread(**changed: Any) -> SpreadEstimate:
+        return replace(spread, value=replace(spread.value, **changed))
+
+    width_sd = max(SPREAD_SD * spread.value.sigma_px, _known_sd(spread, "sigma_px"), 0.01)
+    read_sd = max(READ_NOISE_SD * read.value, read.sd, 1e-3)
+    noisier = Estimate(value=read.value + read_sd, low=read.low, high=max(read.high, read.value + read_sd))
+    more_read_noise = stepped("read noise", read_noise_DN=noisier)
+    variance_DN2 = twin.maps.read_variance_DN2 * np.float32((noisier.value / max(read.value, 1e-9)) ** 2)
+    maps = replace(twin.maps, read_variance_DN2=variance_DN2)
+    return [
+        *_spectral_changes(twin, spectral_steps),
+        stepped("optical spread", step_sd=0.5, spread=with_spread(sigma_px=spread.value.sigma_px + 0.5 * width_sd)),
+        *(
+            stepped(f"{name} of the optical spread", spread=with_spread(**{name: value}))
+            for name, value in _stepped_tail(spread).items()
+        ),
+        *(
             # taken whole it costs ln(1 / p), as in a mixture; a standard deviation is no more than the whole
-            step_sd=math.sqrt(max(-2.0 * math.log(other.probability), 1.0)),
-        )
-        for other in spread.others
+            stepped(
+                f"optical spread as {other.family}",
+                step_sd=math.sqrt(max(-2.0 * math.log(other.probability), 1.0)),
+                spread=replace(spread, value=other.value),
+            )
+            for other in spread.others
+        ),
+        replace(more_read_noise, twin=replace(more_read_noise.twin, maps=maps)),
+        stepped("secondary quanta", white_fraction=noise.white_fraction + 0.01),
     ]
-    read = twin.noise.read_noise_DN
-    sd = max(READ_NOISE_SD * read.value, (read.high - read.low) / (2 * 1.959964), 1e-3)
-    noisier = Estimate(value=read.value + sd, low=read.low, high=max(read.high, read.value + sd))
-    scale = np.float32((noisier.value / max(read.value, 1e-9)) ** 2)
-    result.append(
-        TwinChange(
-            name="read noise",
-            twin=replace(
-                twin,
-                noise=replace(twin.noise, read_noise_DN=noisier),
-                maps=replace(twin.maps, read_variance_DN2=twin.maps.read_variance_DN2 * scale),
-            ),
-            parameters=None,
-            step_sd=1.0,
-        )
-    )
-    white = twin.noise.white_fraction
-    result.append(
-        TwinChange(
-            name="secondary quanta",
-            twin=replace(twin, noise=replace(twin.noise, white_fraction=white + 0.01)),
-            parameters=None,
-            step_sd=1.0,
-        )
-    )
+
+
+def _spectral_changes(twin: Twin, steps: float) -> list[Change]:
+    """Steps of the spectral parameters up; steps: see `twin_changes`."""
+    posterior = twin.spectral
+    if posterior is None:
+        return []
+    result = []
+    draws = posterior.samples.std(axis=0)
+    for index, (name, sd) in enumerate(zip(posterior.names, spectral_sds(posterior), strict=True)):
+        step = min(max(steps * float(draws[index]), 0.05 * sd), sd)
+        parameters = np.array(posterior.best, dtype=np.float64)
+        parameters[index] += step
+        result.append(Change(label=name, twin=twin, parameters=parameters, step_sd=step / sd, steps="lit"))
     return result
 
 
-def _tail_changes(twin: Twin) -> list[TwinChange]:
-    """Steps of what calibration left open of the tail of the spread: its share and its reach."""
-    spread = twin.noise.spread
+def _known_sd(spread: SpreadEstimate, name: str) -> float:
+    """Standard deviation to which calibration knows a parameter of the spread, 0 where it was not asked."""
+    known = spread.intervals.get(name)
+    return 0.0 if known is None else known.sd
+
+
+def _stepped_tail(spread: SpreadEstimate) -> dict[str, float]:
+    """What calibration left open of the tail of the spread, its share and its reach, each a standard deviation further."""
     value = spread.value
     if value.tail_share == 0.0:
-        return []
-    steps = {}
-    for name in ("tail_share", "tail_px"):
-        known = spread.intervals.get(name)
-        found = 0.0 if known is None else (known.high - known.low) / (2 * 1.959964)
-        steps[name] = max(found, SPREAD_SD * getattr(value, name))
-    if value.tail_share + steps["tail_share"] > 1.0:  # a step down is as large where nearly all light is in the tail
-        steps["tail_share"] = -min(steps["tail_share"], value.tail_share)
-    return [
-        TwinChange(
-            name=f"{name} of the optical spread",
-            twin=replace(
-                twin,
-                noise=replace(
-                    twin.noise, spread=replace(spread, value=replace(value, **{name: getattr(value, name) + step}))
-                ),
-            ),
-            parameters=None,
-            step_sd=1.0,
-        )
-        for name, step in steps.items()
-    ]
+        return {}
+    share, reach = (
+        max(_known_sd(spread, name), SPREAD_SD * getattr(value, name)) for name in ("tail_share", "tail_px")
+    )
+    if value.tail_share + share > 1.0:  # a step down is as large where nearly all light is in the tail
+        share = -min(share, value.tail_share)
+    return {"tail_share": value.tail_share + share, "tail_px": value.tail_px + reach}
 
 
 def always_a_little(*, side: int = 1) -> list[Variant]:

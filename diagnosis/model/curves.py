@@ -1,13 +1,12 @@
 """What an effect would do to the probes at any strength: its responses at a few, and how they are joined."""
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import _node_loops
+from .changes import Variant
 
 LEAST_RESPONSE = 1e-3  # standard deviations of a probe, below which nothing responds
 STRENGTH_NODES = 37
@@ -18,48 +17,43 @@ _BEYOND_NODES = 1.5  # times above the last strength that was asked, elsewhere
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curve:
-    """Response of the probes to one effect with its inner parameters fixed.
+    """Response of the probes to one variant of an effect.
 
-    Fields: effect (id); variant (name of the inner parameters' choice); parameters (inner parameters, without the
-    strength); low, high: plausible range of the strength; strengths (node,) > 0 ascending; responses (node, probe): m_e at
-    the nodes, standardised as the probes are; 0 at strength 0; spread (probe, factor): random responses a unit of strength
-    that come with the effect (a drifting output shifts each series' level by chance); jitter (probe,): variance a unit of
-    strength squared that it gives each probe by itself (a gain map that changed pixel by pixel); exact (probe,): probes that
-    the strength is defined by, in which no law can be far off; series: names of those in which it acts (empty: all); log_prior: log
-    probability of that, against one that acts in all; most: strength beyond which there is nothing (a share of 100 %); beside: id of
-    another effect beside which it responds so (empty: none need be there); course: what the effect is from frame to
-    frame, as `Effect` says.
-    Between nodes and zero the response is interpolated (Lagrange through
-    the four nearest points, 0 one of them).
+    Fields: variant; responses (node, probe): m_e at the variant's strengths, standardised as the probes are; 0 at strength 0; spread
+    (probe, factor): random responses a unit of strength that come with the effect (a drifting output shifts each series' level by
+    chance); jitter (probe,): variance a unit of strength squared that it gives each probe by itself (a gain map that changed pixel
+    by pixel); exact (probe,): probes that the strength is defined by, in which no law can be far off.
+    Between nodes and zero the response is interpolated (Lagrange through the four nearest points, 0 one of them).
     """
 
-    effect: str
-    variant: str
-    parameters: Mapping[str, float]
-    low: float
-    high: float
-    strengths: NDArray[np.float64]
+    variant: Variant
     responses: NDArray[np.float64]
-    since: str = "always"
     spread: NDArray[np.float64] | None = None
     jitter: NDArray[np.float64] | None = None
     exact: NDArray[np.bool_] | None = None
-    series: tuple[str, ...] = ()
-    log_prior: float = 0.0
-    most: float = math.inf
-    beside: str = ""
-    course: str = ""
+
+    @property
+    def effect(self) -> str:
+        """Id of the effect."""
+        return self.variant.effect
+
+    @property
+    def strengths(self) -> NDArray[np.float64]:
+        """Strengths (node,) of the responses."""
+        return np.array(self.variant.strengths)
 
     @property
     def reach(self) -> tuple[float, float]:
         """Strengths between which the curve is tried: beyond the plausible range on both sides."""
-        if len(self.strengths) == 1:
-            return self.low / _WEAKER, min(_STRONGER * self.high, self.most)
-        return self.low / _WEAKER, min(_BEYOND_NODES * max(self.high, float(self.strengths[-1])), self.most)
+        own = self.variant
+        highest = _STRONGER * own.high
+        if len(own.strengths) > 1:
+            highest = _BEYOND_NODES * max(own.high, own.strengths[-1])
+        return own.low / _WEAKER, min(highest, own.most)
 
     def log_strengths(self) -> NDArray[np.float64]:
         """Strengths at which integrals are taken: evenly in the logarithm over the reach, and the ends of the plausible range."""
-        ends = np.array([self.low, self.high])
+        ends = np.array([self.variant.low, self.variant.high])
         return np.unique(np.concatenate([np.geomspace(*self.reach, STRENGTH_NODES), ends]))
 
     @property

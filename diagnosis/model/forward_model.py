@@ -1,6 +1,5 @@
-"""The base twin as series ask it, and the changes of it that a diagnosis tries: what each can move at all."""
+"""The base twin as series ask it, and what it expects of them under changes."""
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,147 +8,22 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...generator.effects import EFFECTS, AppliedEffect
-from ...generator.effects.effect import Displacement, Placement
 from ...generator.frames.conditions import with_conditions
 from ...generator.frames.line_model import ExpectedSeries, LineModel
 from ...generator.frames.model_cache import ModelCache
 from ...generator.line.series_request import SeriesRequest
 from ...generator.line.twin import Twin
-from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS
 from ..probes.registration import SHARP_PX
 from ..session.session import SessionSeries
-from .changes import OF_BEAMS_GROWS, TwinChange, Variant, departures_found
+from .changes import OF_BEAMS_GROWS, Change, Variant, departures_found
 
 _CACHE_BYTES = 400_000_000
-_IN_MAPS = ("maps", "maps of beams")  # effects that look otherwise where calibration has seen them
 _IN_MAPS_OF_BEAMS = "maps of beams"  # the twin's own maps hold what was always there of these
-_OBJECTS_ALONE = ("object",)
-_ALL_SHIFT = 0.017  # share of a misregistration that may be anything else
 
 
 def draft_cache() -> ModelCache:
     """A cache for responses: single pixels stand for maps that are the same everywhere."""
     return ModelCache(draft=True, budget_bytes=_CACHE_BYTES)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Change:
-    """A change asked of the forward model.
-
-    Fields: label: effect or nuisance; twin; effects, besides those that the twin has; instead_of: effects of the base twin that this
-    one has not; parameters (parameter,) of the spectrum in place of the best ones; step_sd: size of a nuisance's step in prior
-    standard deviations; steps: series that a step of the twin moves, "all", "lit" or none.
-    """
-
-    label: str
-    twin: Twin
-    effects: tuple[AppliedEffect, ...] = ()
-    instead_of: tuple[AppliedEffect, ...] = ()
-    parameters: NDArray[np.float64] | None = None
-    step_sd: float = 1.0
-    steps: str = ""
-
-    @classmethod
-    def of_twin(cls, step: TwinChange) -> "Change":
-        """A step in what calibration has fitted."""
-        return cls(
-            label=step.name,
-            twin=step.twin,
-            parameters=step.parameters,
-            step_sd=step.step_sd,
-            steps="all" if step.parameters is None else "lit",
-        )
-
-    def touches(self, request: SeriesRequest) -> bool:
-        """Whether the change can show in a series."""
-        if self.steps == "all" or (self.steps == "lit" and request.beam_on):
-            return True
-        if any(effect.since == "always" or request.after_calibration for effect in self.instead_of):
-            return True
-        for effect in self.effects:
-            if effect.since == "calibration" and not request.after_calibration:
-                continue
-            series = EFFECTS[effect.id].shows.series
-            if request.kind in series and not (series == _OBJECTS_ALONE and self.only_displaces):
-                return True
-        return False
-
-    def beside(self, other: "Change") -> "Change | None":
-        """A nuisance's step once effects have been found; None: it is a little of one of these.
-
-        other: the base twin with these effects.
-        """
-        if {item.id for item in self.effects} & {item.id for item in other.effects}:
-            return None
-        return replace(
-            self,
-            twin=replace(self.twin, effects=other.twin.effects),
-            effects=(*self.effects, *other.effects),
-            instead_of=other.instead_of,
-        )
-
-    @property
-    def only_displaces(self) -> bool:
-        """Whether the change is a mere shift of the scene, which registration takes out of the pictures."""
-        return len(self.effects) == 1 and self._misplaced is not None and self._misplaced.only_shifts
-
-    @property
-    def displacement(self) -> dict[str, float]:
-        """Displacement (px) that the change brings to a scene's picture, by probe; empty: none."""
-        if self._misplaced is None:
-            return {}
-        lies = self._misplaced.lies
-        angle = math.radians(lies.direction_deg)
-        return {ALONG_ROWS: lies.shift_px * math.cos(angle), ALONG_COLUMNS: lies.shift_px * math.sin(angle)}
-
-    def found_in_place(self) -> "Change":
-        """The change as it shows once registration has found the scene: of a misregistration, what is no shift."""
-        misplaced = self._misplaced
-        if misplaced is None or self.only_displaces:
-            return self
-        effect = misplaced.effect
-        others = [item for item in self.effects if item is not effect]
-        if misplaced.only_shifts:
-            return replace(self, effects=tuple(others))
-        rest = misplaced.placement.without_shift(effect.parameters)
-        return replace(self, effects=(*others, replace(effect, parameters=rest)))
-
-    @property
-    def _misplaced(self) -> "_Misplaced | None":
-        for effect in self.effects:
-            placement = EFFECTS[effect.id].placement
-            if placement is not None:
-                return _Misplaced(effect, placement, placement.parts(effect.parameters))
-        return None
-
-    def whenever_it_began(self, request: SeriesRequest) -> object | None:
-        """What stands for a change of a series that the same effect, begun at another time, makes as well; None: only itself."""
-        if (
-            self.instead_of
-            or self.steps
-            or len(self.effects) != 1
-            or EFFECTS[self.effects[0].id].absorbed in _IN_MAPS
-            or not self.touches(request)
-        ):
-            return None
-        effect = self.effects[0]
-        long_ago = request.long_ago if EFFECTS[effect.id].remembers_all else ()
-        if effect.since == "always" and any(not item.after_calibration for item in (*long_ago, *request.previous)):
-            return None  # what was exposed before calibration ended remembers when it began
-        return (effect.id, tuple(effect.parameters.items()), tuple(effect.options.items()))
-
-
-@dataclass(frozen=True, slots=True)
-class _Misplaced:
-    """An effect that displaces scenes, and how they lie with it."""
-
-    effect: AppliedEffect
-    placement: Placement
-    lies: Displacement
-
-    @property
-    def only_shifts(self) -> bool:
-        return math.hypot(self.lies.radial_px, self.lies.turn_px) <= _ALL_SHIFT * self.lies.size_px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,13 +74,8 @@ class ForwardModel:
 
     def carried_px(self, change: Change, request: SeriesRequest) -> tuple[float, float]:
         """How much farther than in the base twin a scene lies on average under a change, along rows and columns."""
-        (down, right), (base_down, base_right) = (
-            _mean_shift_px(effects, twin, request)
-            for effects, twin in (
-                ((*change.twin.effects, *change.effects), change.twin),
-                (self.base.effects, self.base),
-            )
-        )
+        down, right = _mean_shift_px((*change.twin.effects, *change.effects), change.twin, request)
+        base_down, base_right = _mean_shift_px(self.base.effects, self.base, request)
         return down - base_down, right - base_right
 
     def expect(self, request: SeriesRequest) -> ExpectedSeries:

@@ -21,9 +21,9 @@ from ..session.session import SessionSeries
 from ..session.summaries import CODES_FRAMES, LEAST_NOISE_DN2, SeriesSummary
 from ..session.usable import SeenSeries, counted_copies
 from .calibrated_maps import LEAST_GAIN, CalibratedMaps, exposure_of
-from .changes import DUST_LIMIT
+from .changes import DUST_LIMIT, Change
 from .defects import counting_series
-from .forward_model import Change, ForwardModel
+from .forward_model import ForwardModel
 from .placing import PlacedSeries
 
 Lines = dict[str, Pattern]  # what lines of one frame have in common, DN^2, of each calibrating series
@@ -193,18 +193,32 @@ class SessionModel:
             signal = np.asarray(one.expected.signal_DN, dtype=np.float32)
             moved = np.asarray((moved - signal * absorbed.gain) / absorbed.divides, dtype=np.float32)
         if not item.calibrates:
-            values = _with_patterns(
-                values,
-                absorbed.lines,
-                moved,
-                item=item,
-                context=one.context,
-                maps=self.maps,
-                signals_DN=self.signals_DN,
-            )
+            values = self.with_patterns(one, values, absorbed.lines, moved)
         if one.tells_displacement:
             values = {**values, **self._displacement(change, item.request)}
         return np.asarray(moved, dtype=np.float32), values
+
+    def with_patterns(
+        self, one: SeriesModel, values: Mapping[str, float], lines: Lines, moved: Map
+    ) -> Mapping[str, float]:
+        """Scalars with what line noise leaves in dark and gain map, and what a moved picture shows of pixels, blocks and lines.
+
+        Args:
+            one: the series.
+            values: its scalar probes without that, by name.
+            lines: of the calibrating series.
+            moved: change of the corrected mean frame (row, column or 1, 1), DN.
+        """
+        if FIXED not in values:
+            return values
+        weights = self.maps.darks.weights_under(one.session)
+        standing = pattern_of(moved)
+        for name, weight in weights.items():
+            standing += weight**2 / self.maps.darks.frames[name] * lines[name]
+        for name, share in self.maps.shares.items():
+            there = share * self.signals_DN[one.name] / max(self.signals_DN[name], 1e-9)
+            standing += there**2 / self.maps.frames[name] * lines[name]
+        return with_pattern(values, standing, one.context.pattern_noise)
 
     def _found(self, one: SeriesModel, change: Change) -> tuple[Change, SeriesRequest]:
         """A change as a series shows it, and the series as it is asked, once registration has found where the scene lies."""
@@ -283,6 +297,7 @@ def session_model(
         lines_DN2: variance of rows and columns from exposure to exposure that the panel has all the time, DN^2.
     """
     signals_DN = {item.name: mean_over(placed.expected[item.name].signal_DN, clean) for item in placed.kept}
+    session = SessionModel(model=model, maps=maps, series=(), signals_DN=signals_DN, lines_DN2=lines_DN2)
     lines = {item.name: _lines_of_noise(placed.expected[item.name]) for item in placed.kept if item.calibrates}
     counting, copies = counting_series(placed.kept), counted_copies(placed.kept, seen.looks)
     darks = [item for item in placed.kept if item.series.kind == "dark" and not item.calibrates]
@@ -309,24 +324,20 @@ def session_model(
             else (),
         )
         alone = expected_scalars(expected, context)
-        place = placed.telling.get(item.name)
-        series.append(
-            SeriesModel(
-                session=item,
-                expected=expected,
-                context=context,
-                scalars_alone=alone,
-                scalars=_with_patterns(
-                    alone, lines, NOWHERE, item=item, context=context, maps=maps, signals_DN=signals_DN
-                )
-                | (_NO_DISPLACEMENT if place is item.request else {}),
-                placement=placed.placements.get(item.name),
-                place=place,
-            )
+        one = SeriesModel(
+            session=item,
+            expected=expected,
+            context=context,
+            scalars_alone=alone,
+            scalars=alone,
+            placement=placed.placements.get(item.name),
+            place=placed.telling.get(item.name),
         )
+        displaced = _NO_DISPLACEMENT if one.tells_displacement else {}
+        series.append(replace(one, scalars={**session.with_patterns(one, alone, lines, NOWHERE), **displaced}))
         if item.request.beam_on:
             before = signals_DN[item.name]
-    return SessionModel(model=model, maps=maps, series=tuple(series), signals_DN=signals_DN, lines_DN2=lines_DN2)
+    return replace(session, series=tuple(series))
 
 
 def _context(
@@ -381,36 +392,3 @@ def _context(
 def _lines_of_noise(model: ExpectedSeries) -> Pattern:
     """What lines of one frame have in common, DN^2."""
     return line_pattern(model, float(np.mean(model.signal_DN)) ** 2)
-
-
-def _with_patterns(
-    values: Mapping[str, float],
-    lines: Lines,
-    moved: Map,
-    *,
-    item: SessionSeries,
-    context: ScalarContext,
-    maps: CalibratedMaps,
-    signals_DN: Mapping[str, float],
-) -> dict[str, float]:
-    """Scalars with what line noise leaves in dark and gain map, and what the picture that moved shows of pixels, blocks and lines.
-
-    Args:
-        values: scalar probes without that, by name.
-        lines: of the calibrating series.
-        moved: change of the corrected mean frame (row, column or 1, 1), DN.
-        item: the series.
-        context: what its scalar probes refer to.
-        maps: dark and gain map.
-        signals_DN: mean signals by name of series.
-    """
-    if FIXED not in values:
-        return dict(values)
-    weights = {} if "offset" in item.series.corrected else maps.darks.weights[exposure_of(item)]
-    standing = pattern_of(moved)
-    for name, weight in weights.items():
-        standing += weight**2 / maps.darks.frames[name] * lines[name]
-    for name, share in maps.shares.items():
-        there = share * signals_DN[item.name] / max(signals_DN[name], 1e-9)
-        standing += there**2 / maps.frames[name] * lines[name]
-    return with_pattern(values, standing, context.pattern_noise)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...generator.effects import AppliedEffect
-from ..model.changes import Variant
-from ..model.forward_model import Change, strength_rows
+from ..model.changes import Change, Variant
+from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
 from .nuisance_columns import Columns, light_from_beyond, nuisances_of_series

@@ -18,6 +18,7 @@ from ..inference.observed import Point
 from ..inference.unknown import Families
 from ..model.calibrated_maps import calibrated_maps
 from ..model.changes import (
+    Change,
     Variant,
     always_a_little,
     catalogue_variants,
@@ -28,7 +29,7 @@ from ..model.changes import (
 )
 from ..model.curves import LEAST_RESPONSE, Curve
 from ..model.defects import lasting_anywhere, memory_of, new_outliers
-from ..model.forward_model import Change, ForwardModel, draft_cache, own_maps, strength_rows
+from ..model.forward_model import ForwardModel, draft_cache, own_maps, strength_rows
 from ..model.placing import MeasuredScenes, place_scenes
 from ..model.responses import Asked, SeriesModel, SessionModel, session_model
 from ..probes.probes import ALONG_COLUMNS, ALONG_ROWS, ProbeName
@@ -125,7 +126,7 @@ def build_problem(
 def _steps_in_twin(model: ForwardModel, *, spectral_steps: float, side: int) -> tuple[Change, ...]:
     """Changes of nuisances that lie in the twin; spectral_steps: as in `twin_changes`."""
     had = {item.id for item in model.base.effects}
-    fitted = [Change.of_twin(step) for step in twin_changes(model.base, spectral_steps=spectral_steps)]
+    fitted = twin_changes(model.base, spectral_steps=spectral_steps)
     little = [item for item in always_a_little(side=side) if item.effect not in had]
     return *fitted, *(replace(model.change(item, item.strengths[0]), label=item.name) for item in little)
 
@@ -344,7 +345,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     factors = _factors(blocks, responses, compared)
     first_less = len(responses) - len(compared.had)
     done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
-    curves, chosen, missing = _curves(blocks, responses, names, compared, done)
+    curves, missing = _curves(blocks, responses, names, compared, done)
     of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
     groups, _ = _numbered(
         [
@@ -361,7 +362,6 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
         factors=np.stack(list(factors.values()), axis=1) if factors else np.zeros((len(names), 0)),
         factor_names=tuple(factors),
         curves=tuple(curves),
-        variants=tuple(chosen),
         names=names,
         series_of=series_of,
         sd=np.concatenate([block.sd for block in blocks]),
@@ -390,16 +390,16 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
     """An effect that the twin has, as it has it; done (probe,): what it does there."""
     inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
     strength = abs(effect.parameters["strength"])
-    curve = Curve(
+    variant = Variant(
         effect=effect.id,
-        variant="as the twin has it",
+        name="as the twin has it",
         parameters=inner,
+        since=effect.since,
         low=strength,
         high=strength,
-        strengths=np.array([strength]),
-        responses=done[None, :],
-        since=effect.since,
+        strengths=(strength,),
     )
+    curve = Curve(variant=variant, responses=done[None, :])
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
     sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
@@ -461,10 +461,9 @@ def _curves(
     names: Sequence[ProbeName],
     compared: _Compared,
     done: Mapping[str, NDArray[np.float64]],
-) -> tuple[list[Curve], list[Variant], dict[str, str]]:
-    """Curves with their variants, and why each effect without a curve cannot be judged; done (probe,): by the base's own effects."""
+) -> tuple[list[Curve], dict[str, str]]:
+    """Curves, and why each effect without one cannot be judged; done (probe,): by the base's own effects."""
     curves: list[Curve] = []
-    chosen: list[Variant] = []
     missing: dict[str, str] = {}
     base = compared.measured.expected.model.base
     readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
@@ -485,11 +484,10 @@ def _curves(
         if effect.reading.probes:
             exact = np.array([name.statistic in effect.reading.probes for name in names])
         jitter = jitter_of(variant, blocks, read_noise_DN)
-        curves.append(variant.curve(own, spread=spread, jitter=jitter, exact=exact))
-        chosen.append(variant)
+        curves.append(Curve(variant=variant, responses=own, spread=spread, jitter=jitter, exact=exact))
     for curve in curves:
         missing.pop(curve.effect, None)
-    return curves, chosen, missing
+    return curves, missing
 
 
 def map_changes(problem: Problem, effects: Sequence[AppliedEffect]) -> list[Map]:

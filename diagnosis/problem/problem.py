@@ -44,7 +44,7 @@ class SeriesView:
 class Problem:
     """Everything that inference needs; probes are standardised.
 
-    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves, variants; names (one ProbeName a probe);
+    Fields: residual (probe,); factors (probe, nuisance) and factor_names; curves; names (one ProbeName a probe);
     series_of (probe,) index into views; sd (probe,) of scalar probes in their unit, 1 for map probes; noise (probe,): counting
     noise's share of each probe's standard deviation; blocks (probe,):
     series that share local nuisances; groups (probe,): within which an effect's law is off by one factor; families: in which an
@@ -58,7 +58,6 @@ class Problem:
     factors: NDArray[np.float64]
     factor_names: tuple[str, ...]
     curves: tuple[Curve, ...]
-    variants: tuple[Variant, ...]
     names: tuple[ProbeName, ...]
     series_of: NDArray[np.intp]
     sd: NDArray[np.float64]
@@ -84,26 +83,16 @@ class Problem:
         """Conditions of the session that effects know."""
         return self.session.model.conditions
 
-    def in_series(self, effect: str, variant: str, series: Sequence[int], log_prior: float) -> "Problem":
-        """With an effect's variant as it acts in some series (numbers of views) alone, as one more variant."""
+    def in_series(self, variant: Variant, series: Sequence[int], log_prior: float) -> "Problem":
+        """With a variant as it acts in some series (numbers of views) alone, as one more variant."""
         names = tuple(self.views[number].session.name for number in series)
-        both = next(
-            (item, curve)
-            for item, curve in zip(self.variants, self.curves, strict=True)
-            if (item.effect, item.name) == (effect, variant)
+        name = f"{variant.name}, in {len(names)} series".strip(", ")
+        curve = next(item for item in self.curves if item.variant == variant)
+        own = Curve(
+            variant=replace(variant, name=name, series=names, log_prior=log_prior),
+            responses=np.where(np.isin(self.series_of, series), curve.responses, 0.0),
         )
-        own = replace(
-            both[0],
-            name=f"{variant}, in {len(names)} series".strip(", "),
-            series=names,
-            log_prior=log_prior,
-        )
-        responses = np.where(np.isin(self.series_of, series), both[1].responses, 0.0)
-        return replace(self, curves=(*self.curves, own.curve(responses)), variants=(*self.variants, own))
-
-    def variant_of(self, curve: Curve) -> Variant:
-        """The variant whose curve it is."""
-        return next(item for item in self.variants if (item.effect, item.name) == (curve.effect, curve.variant))
+        return replace(self, curves=(*self.curves, own))
 
     def residual_without(self, effects: Sequence[str]) -> NDArray[np.float64]:
         """The residual (probe,) of the base less those of its own effects that are among these."""
@@ -210,12 +199,11 @@ class Problem:
         curves = []
         for variant, responses in more:
             # what an effect does by chance depends on its onset (lost bits lower later levels only), and on the direction of a heel
-            alike = [item for item in self.curves if (item.effect, item.since) == (variant.effect, variant.since)]
-            like = next((item for item in alike if item.variant == variant.refined_from), alike[0])
-            curves.append(variant.curve(responses, spread=like.spread, jitter=like.jitter, exact=like.exact))
-        return replace(
-            self, curves=(*self.curves, *curves), variants=(*self.variants, *(variant for variant, _ in more))
-        )
+            onset = variant.effect, variant.since
+            alike = [item for item in self.curves if (item.effect, item.variant.since) == onset]
+            like = next((item for item in alike if item.variant.name == variant.refined_from), alike[0])
+            curves.append(replace(like, variant=variant, responses=responses))
+        return replace(self, curves=(*self.curves, *curves))
 
 
 def _difference(before: ExpectedSeries, after: ExpectedSeries, *, shape: tuple[int, ...]) -> Explained:

@@ -203,7 +203,7 @@ def gap_chart(parts: Sequence[tuple[str, float, float, float]], *, added: bool) 
 
 def places_chart(diagnosis: Diagnosis) -> Chart:
     """Every probe's z over the series in time order, by axis, with the threshold of chance."""
-    from ..inference.local_nuisances import LocalNuisances
+    from ..inference.nuisances import LocalNuisances
 
     problem = diagnosis.compared
     z = LocalNuisances(problem.factors, problem.blocks).given_others(problem.residual)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # name of the map of pixels that calibration found bad, in twin files, answers and options; an effect that bears the same name
 # adds pixels that this map has not
 BAD_PIXEL_MAP = "bad_pixels"
+Z95 = 1.959964  # standard deviations of a Gaussian on either side that hold 95 %
 LEAST_PIXELS = 16  # that are not bad: with fewer, medians and spreads over a frame say nothing
 # reason codes of bad pixels; a pixel carries the first that applies
 BAD_PIXEL_CODES = {"good": 0, "dead": 1, "hot": 2, "noisy": 3, "nonlinear": 4, "declared": 5, "clustered": 6}
@@ -46,13 +47,18 @@ class Estimate:
                 expected="low <= value <= high, finite",
             )
 
+    @property
+    def sd(self) -> float:
+        """Standard deviation of a Gaussian whose 95 % interval is as wide."""
+        return (self.high - self.low) / (2.0 * Z95)
+
     def times(self, factor: float) -> "Estimate":
         """Value and interval times a known factor of 0 or more."""
         return Estimate(value=factor * self.value, low=factor * self.low, high=factor * self.high)
 
     def widened(self, relative_sd: float) -> "Estimate":
         """The same with an independent relative standard deviation more; the low end stays at 0 or above where it was."""
-        half = 1.959964 * relative_sd * abs(self.value)
+        half = Z95 * relative_sd * abs(self.value)
         low = self.value - math.hypot(self.value - self.low, half)
         return Estimate(
             value=self.value,
@@ -67,7 +73,7 @@ class Estimate:
 
 def estimate_from_sd(value: float, sd: float, *, lowest: float = -math.inf) -> Estimate:
     """Gaussian 95 % interval about `value`, cut at `lowest`."""
-    half = 1.959964 * sd
+    half = Z95 * sd
     return Estimate(value=value, low=min(max(value - half, lowest), value), high=value + half)
 
 
@@ -75,8 +81,8 @@ def estimate_from_log_draws(logarithm: NDArray[np.float64], relative_sd: float) 
     """Median and 95 % interval of exp(logarithm) (draw,) times a lognormal of `relative_sd`, in the draws' unit."""
     middle = float(np.median(logarithm))
     low, high = np.quantile(logarithm, [0.025, 0.975])
-    below = math.hypot(middle - min(low, middle), 1.959964 * relative_sd)
-    above = math.hypot(max(high, middle) - middle, 1.959964 * relative_sd)
+    below = math.hypot(middle - min(low, middle), Z95 * relative_sd)
+    above = math.hypot(max(high, middle) - middle, Z95 * relative_sd)
     return Estimate(value=math.exp(middle), low=math.exp(middle - below), high=math.exp(middle + above))
 
 

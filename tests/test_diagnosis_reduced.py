@@ -68,10 +68,10 @@ def test_lines_move_later_means_by_chance_and_places_of_scenes_follow_no_law(lin
         if curve.effect == "misregistration":
             assert {names[number].statistic for number in np.flatnonzero(curve.exact)} == displaced
         if curve.effect == "row_noise":
-            share = curve.parameters["column_share"]
-            seen.add((share, curve.since))
+            share = curve.variant.parameters["column_share"]
+            seen.add((share, curve.variant.since))
             assert np.all(curve.jitter[level & ~calibrates] > 0.0)
-            assert np.any(curve.jitter[calibrates]) == (curve.since == "always")
+            assert np.any(curve.jitter[calibrates]) == (curve.variant.since == "always")
             # noise of rows is even along each of them
             steps = curve.jitter[along_columns & ~calibrates]
             assert np.median(steps) < 1e-3 * np.median(curve.jitter[level & ~calibrates]) or share == 1.0
@@ -809,9 +809,9 @@ def test_an_output_that_wanders_since_the_calibration_leaves_the_calibrating_ser
     with open_acquisition(line / "session.h5") as acquisition:
         problem = build_problem(acquisition, read_twin(line / "twin.h5"), variants=variants)
     calibrates = np.array([problem.views[number].session.calibrates for number in problem.series_of])
-    assert {curve.since for curve in problem.curves} == {"always", "calibration"}
+    assert {curve.variant.since for curve in problem.curves} == {"always", "calibration"}
     for curve in problem.curves:
-        assert np.any(curve.spread[calibrates]) == (curve.since == "always")
+        assert np.any(curve.spread[calibrates]) == (curve.variant.since == "always")
         assert np.any(curve.spread[~calibrates])
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import difflib
+import io
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FileFormatError, InputError
+from ..files import CSV_UTF8, read_utf8
 from ._image_files import RawLayout, natural_key
 from .instrument import BOOLEAN_FIELDS, LAYER_FIELDS, TEXT_FIELDS, WHOLE_FIELDS, Instrument
 from .setting import filters_from_text
@@ -39,8 +41,8 @@ def read_sidecar(source: Path, sidecar: Path | None, *, known: Iterable[str], mi
             remedy=f"write one, at least: {minimal}",
         )
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        tables = tomllib.loads(read_utf8(path))
+    except tomllib.TOMLDecodeError as error:
         raise FileFormatError(str(path), received=f"text that is not TOML ({error})", expected="a TOML file") from None
     check_words(tables, known, where=path.name)
     return tables
@@ -137,12 +139,12 @@ def rows_of(folder: Path, table: Mapping[str, Any], key: str, *, where: str) -> 
     path = folder / name
     if not path.is_file():
         raise InputError(f"{where}, rows", received=name, expected="a csv file in the folder")
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True)
-        if key not in (reader.fieldnames or []):
-            there = ", ".join(reader.fieldnames or []) or "none"
-            raise FileFormatError(str(path), received=f"columns {there}", expected=f"a column {key} among them")
-        return {row[key]: {word: value for word, value in row.items() if value} for row in reader}
+    text = read_utf8(path, save_as=CSV_UTF8)
+    reader = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
+    if key not in (reader.fieldnames or []):
+        there = ", ".join(reader.fieldnames or []) or "none"
+        raise FileFormatError(str(path), received=f"columns {there}", expected=f"a column {key} among them")
+    return {row[key]: {word: value for word, value in row.items() if value} for row in reader}
 
 
 def files_matching(folder: Path, patterns: str | list[str], *, where: str) -> list[Path]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
-from ..results import Table
+from ..results import Table, counted
 from ._hdf5 import (
     check_format,
     check_open,
@@ -41,6 +41,7 @@ SCENE_KINDS = ("wedge", "slab", "edge", "disc", "product")
 CORRECTIONS = ("offset", "gain", "defects", "log")
 ROLES = ("calibration", "evaluation")
 PANEL_LAYERS = ("front", "back")
+ERROR = "error"  # attribute of a series without frames: why an importer went on without it
 PIECE_BYTES = 64 * 2**20
 
 _Made = TypeVar("_Made")
@@ -265,7 +266,7 @@ class AcquisitionFile:
         )
         closed = "" if self._file else ", closed"
         return Table(
-            title=f"Acquisition {self.path}: {len(self.series)} series, {len(self.scenes)} scenes{closed}",
+            title=f"Acquisition {self.path}: {len(self.series)} series, {counted(len(self.scenes), 'scene')}{closed}",
             header=("series", "kind", "frames", "setting", "scene"),
             rows=rows,
         )
@@ -376,6 +377,9 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     node = child(group, name)
     frames = child(node, "frames") if isinstance(node, h5py.Group) else None
     if not isinstance(frames, h5py.Dataset):
+        if isinstance(node, h5py.Group) and ERROR in node.attrs:
+            argument, received, expected, remedy = (str(text) for text in node.attrs[ERROR])
+            raise FileFormatError(f"{where}, {argument}", received=received, expected=expected, remedy=remedy)
         raise FileFormatError(where, received="no dataset `frames`", expected="frames (n, row, column)")
     if frames.ndim != 3 or 0 in frames.shape:
         raise FileFormatError(
@@ -673,12 +677,25 @@ class AcquisitionWriter:
         self._series = file.create_group("series")
         self._scenes = file.require_group("scenes")
         self._writers: list[SeriesWriter] = []
+        self._left_out: dict[str, FileFormatError] = {}
         self._next_index = 0
 
     @property
     def scene_names(self) -> tuple[str, ...]:
         """The scenes that have been added."""
         return tuple(self._scenes)
+
+    def leave_out(self, name: str, error: FileFormatError) -> None:
+        """Put a series' error in its place, where an importer goes on without what it cannot read; readers raise it."""
+        if name in self._series:
+            del self._series[name]
+        self._writers = [writer for writer in self._writers if writer.name != name]
+        self._left_out[name] = error
+
+    def _mark_left_out(self) -> None:
+        for name, error in self._left_out.items():
+            group = self._series.require_group(name)
+            group.attrs[ERROR] = [error.argument, str(error.received), error.expected, error.remedy]
 
     def add_series(
         self,
@@ -889,7 +906,9 @@ def write_acquisition(
         yield writer
         writer._finish()
         # The reader's own checks, so that nothing is written that could not be read.
-        _acquisition(file, path=str(path))
+        if writer._writers or not writer._left_out:
+            _acquisition(file, path=str(path))
+        writer._mark_left_out()
 
 
 def _write_instrument(group: Any, instrument: Instrument) -> None:

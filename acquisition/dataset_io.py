@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
 from ..files import whole_file
-from ..results import Table
+from ..results import Table, counted
 from ._hdf5 import (
     check_format,
     check_open,
@@ -114,7 +114,7 @@ class Dataset:
         )
         closed = "" if self._file else ", closed"
         return Table(
-            title=f"Dataset {self.path}: {len(self)} image pairs of {self.shape[0]} x {self.shape[1]} pixels{closed}",
+            title=f"Dataset {self.path}: {counted(len(self), 'image pair')} of {self.shape[0]} x {self.shape[1]} pixels{closed}",
             header=("split", "setting", "pairs", "with a foreign object"),
             rows=rows,
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FileFormatError, InputError
+from ..files import read_utf8
 from ._image_files import frame_dtype, iter_images
 from .acquisition_io import write_acquisition
 from .import_report import ImportReport, Skipped
@@ -129,12 +130,7 @@ def _data_file(source: Path) -> Path:
 
 
 def _levels(data_file: Path) -> tuple[list[_Level], list[Skipped]]:
-    try:
-        lines = data_file.read_text(encoding="utf-8", errors="strict").splitlines()
-    except UnicodeDecodeError:
-        raise FileFormatError(
-            str(data_file), received="a file that is not text", expected="the list of an EMVA 1288 set"
-        ) from None
+    lines = read_utf8(data_file).splitlines()
     levels: list[_Level] = []
     skipped: list[Skipped] = []
     bits: int | None = None

@@ -55,6 +55,7 @@ ImageJ files; where both state it, the sidecar counts and the difference is told
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,7 @@ def import_images(
     out: str | os.PathLike[str],
     *,
     sidecar: str | os.PathLike[str] | None = None,
+    without_damaged: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Turn a folder of images into an acquisition file, as its sidecar says (see the module's text for its words).
@@ -138,6 +140,7 @@ def import_images(
         source: the folder.
         out: acquisition file to write.
         sidecar: TOML file; None = `raytwin.toml` in the folder.
+        without_damaged: go on without a series that has an image at fault; the file holds its error in its place.
         progress: called with (images used, images in the folder).
 
     Raises:
@@ -153,10 +156,10 @@ def import_images(
     images = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_ENDINGS and path.is_file()]
     used = _Used(len(images), progress)
     stated = instrument_of(tables, where=NAME)
-    plans = _plans(folder, tables)
+    plans = _plans(folder, tables, without_damaged=without_damaged)
     instrument, notes = _instrument(stated, plans)
     with write_acquisition(out, instrument) as writer:
-        read, more = _write(writer, folder, tables, plans, used)
+        read, more = _write(writer, folder, tables, plans, used, without_damaged=without_damaged)
     skipped = [
         Skipped(what=path.relative_to(folder).as_posix(), reason="no series or scene of the sidecar names it")
         for path in images
@@ -186,7 +189,7 @@ class _Plan:
     headers: list[ImageHeader]
 
 
-def _plans(folder: Path, tables: Mapping[str, Any]) -> list[_Plan]:
+def _plans(folder: Path, tables: Mapping[str, Any], *, without_damaged: bool) -> list[_Plan]:
     series = tables_of(tables, "series", where=NAME)
     if not series:
         raise InputError(NAME, received="no [[series]]", expected="at least one series", remedy=f"at least: {MINIMAL}")
@@ -203,7 +206,11 @@ def _plans(folder: Path, tables: Mapping[str, Any]) -> list[_Plan]:
             files = files_matching(place, patterns, where=f"{where}, files")
             # a TIFF says its pixel size alone: that of the first stands for the series
             told = [path for path in files if path.suffix.lower() not in TIFF_ENDINGS] or files[:1]
-            headers = [read_image_header(path) for path in told]
+            headers = []
+            for path in told:
+                # a damaged file stops its series later
+                with suppress(FileFormatError) if without_damaged else nullcontext():
+                    headers.append(read_image_header(path))
             plans.append(_Plan(table=table, where=where, scene=scene, name=name, files=files, headers=headers))
     return plans
 
@@ -285,13 +292,24 @@ class _Used:
 
 
 def _write(
-    writer: AcquisitionWriter, folder: Path, tables: Mapping[str, Any], plans: list[_Plan], used: _Used
+    writer: AcquisitionWriter,
+    folder: Path,
+    tables: Mapping[str, Any],
+    plans: list[_Plan],
+    used: _Used,
+    *,
+    without_damaged: bool,
 ) -> tuple[list[dict[str, Any]], list[str]]:
     raw = raw_layout_of(tables, where=NAME)
     read: list[dict[str, Any]] = []
     notes: list[str] = []
     for plan in plans:
-        read.append(_write_series(writer, plan, raw, used, notes))
+        try:
+            read.append(_write_series(writer, plan, raw, used, notes))
+        except FileFormatError as error:
+            if not without_damaged:
+                raise
+            writer.leave_out(plan.name, error)
     for number, table in enumerate(tables_of(tables, "scene", where=NAME), start=1):
         where = f"{NAME}, scene {table.get('name', number)}"
         check_words(table, _SCENE_WORDS, where=where)
@@ -320,6 +338,18 @@ def _places(folder: Path, table: Mapping[str, Any], number: int, *, where: str) 
         yield place, place.name, f"{place.name}_{suffix}"
 
 
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Errors in the block name the sidecar and the series."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except InputError as error:
+        argument = error.argument if error.argument.startswith(where) else f"{where}, {error.argument}"
+        raise InputError(argument, received=error.received, expected=error.expected, remedy=error.remedy) from None
+
+
 def _write_series(
     writer: AcquisitionWriter, plan: _Plan, raw: RawLayout | None, used: _Used, notes: list[str]
 ) -> dict[str, Any]:
@@ -332,7 +362,8 @@ def _write_series(
     filter_text = text_of(table, "filter", where=where)
     if filter_text is not None:
         attributes["filters"] = filters_from_text(filter_text)
-    setting = None if setting_text is None else setting_from_text(setting_text)
+    with _named(where):
+        setting = None if setting_text is None else setting_from_text(setting_text)
     corrected = [word for word in (text_of(table, "corrected", where=where) or "").split("+") if word]
     if "corrected" not in table:
         corrected = sorted(agreement(plan.headers).values.get("corrected", ()))
@@ -344,17 +375,18 @@ def _write_series(
         for image in iter_images(path, raw=raw):
             if series is None:
                 shape = (image.shape[0], image.shape[1])
-                series = writer.add_series(
-                    plan.name,
-                    kind=text_of(table, "kind", where=where) or "",
-                    shape=shape,
-                    dtype=text_of(table, "dtype", where=where) or frame_dtype(image),
-                    setting=setting,
-                    scene=plan.scene,
-                    role=text_of(table, "role", where=where),
-                    corrected=corrected,
-                    **attributes,
-                )
+                with _named(where):
+                    series = writer.add_series(
+                        plan.name,
+                        kind=text_of(table, "kind", where=where) or "",
+                        shape=shape,
+                        dtype=text_of(table, "dtype", where=where) or frame_dtype(image),
+                        setting=setting,
+                        scene=plan.scene,
+                        role=text_of(table, "role", where=where),
+                        corrected=corrected,
+                        **attributes,
+                    )
             if image.shape != shape:
                 raise FileFormatError(
                     str(path),

@@ -113,6 +113,8 @@ class Setting:
                 raise InputError(
                     name, received=f"{value} {unit}", expected=f"a finite value above 0 {unit}, at most {LARGEST:g}"
                 )
+        for name in ("averaged", "binning"):
+            check_number(name, getattr(self, name))
         if not 1 <= self.averaged <= LARGEST or self.averaged != int(self.averaged):
             raise InputError("averaged", received=self.averaged, expected="a whole number of frames, 1 or more")
         if not 1 <= self.binning <= LARGEST_BINNING or self.binning != int(self.binning):
@@ -171,11 +173,11 @@ class Setting:
         if self.filters:
             words.append(f"filter={text_from_filters(self.filters)}")
         if self.averaged != 1:
-            words.append(f"averaged={self.averaged}")
+            words.append(f"averaged={int(self.averaged)}")
         if self.source_detector_mm is not None:
             words.append(f"source_detector_mm={_number(self.source_detector_mm)}")
         if self.binning != 1:
-            words.append(f"binning={self.binning}")
+            words.append(f"binning={int(self.binning)}")
         for name in ("frame_interval_ms", "belt_speed_mm_s"):
             value = getattr(self, name)
             if value is not None:
@@ -207,10 +209,12 @@ def setting_from_text(text: str) -> Setting:
         if name == "filters":
             values[name] = filters_from_text(value)
             continue
+        whole = name in ("averaged", "binning")
         try:
-            values[name] = int(value) if name in ("averaged", "binning") else float(value)
+            values[name] = int(value) if whole else float(value)
         except ValueError:
-            raise InputError(f"setting, {word}", received=repr(value), expected="a number") from None
+            expected = "a whole number" if whole else "a number"
+            raise InputError(f"setting, {word}", received=repr(value), expected=expected) from None
     for name in ("kV", "exposure_ms"):
         if name not in values:
             raise InputError("setting", received=repr(text), expected=f"{name.lower()}=... among its words")

@@ -9,6 +9,7 @@ Three layouts are told apart by what lies in the folder, `<setting>` being `40kV
 """
 
 import csv
+import io
 import math
 import os
 import re
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
+from ..files import CSV_UTF8, read_utf8
 from ._image_files import TIFF_ENDINGS, frame_dtype, iter_images, natural_key, number_or_nan, read_image, read_mask
 from .acquisition_io import AcquisitionWriter, write_acquisition
 from .contrast import delta_r
@@ -276,15 +278,19 @@ def _table(path: Path, skipped: list[Skipped]) -> dict[str, dict[str, str]]:
     if not path.is_file():
         skipped.append(Skipped(what=path.name, reason="no such table: products and sizes stay unknown"))
         return {}
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True)
-        if "ID" not in (reader.fieldnames or []):
-            raise FileFormatError(
-                str(path),
-                received=f"columns {', '.join(reader.fieldnames or []) or 'none'}",
-                expected="a column ID among them",
-            )
-        return {_plain_number(row["ID"]): row for row in reader if row["ID"]}
+    reader = _reader(path)
+    if "ID" not in (reader.fieldnames or []):
+        raise FileFormatError(
+            str(path),
+            received=f"columns {', '.join(reader.fieldnames or []) or 'none'}",
+            expected="a column ID among them",
+        )
+    return {_plain_number(row["ID"]): row for row in reader if row["ID"]}
+
+
+def _reader(path: Path) -> "csv.DictReader[str]":
+    text = read_utf8(path, save_as=CSV_UTF8)
+    return csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
 
 
 def _plain_number(text: str) -> str:
@@ -450,31 +456,28 @@ def _sample(
 
 
 def _samples(path: Path) -> dict[str, dict[str, str]]:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.DictReader(stream, skipinitialspace=True)
-        names = [name.strip() for name in reader.fieldnames or []]
-        missing = {"Sample", "Chicken", "Bone_Class", "Bone"} - set(names)
-        if missing:
-            raise FileFormatError(
-                str(path),
-                received=f"columns {', '.join(names) or 'none'}",
-                expected="Sample, Chicken, Bone_Class, Bone",
-            )
-        return {_plain_number(row["Sample"]): row for row in reader if row["Sample"]}
+    reader = _reader(path)
+    names = [name.strip() for name in reader.fieldnames or []]
+    missing = {"Sample", "Chicken", "Bone_Class", "Bone"} - set(names)
+    if missing:
+        raise FileFormatError(
+            str(path),
+            received=f"columns {', '.join(names) or 'none'}",
+            expected="Sample, Chicken, Bone_Class, Bone",
+        )
+    return {_plain_number(row["Sample"]): row for row in reader if row["Sample"]}
 
 
 def _sizes(session: Path) -> dict[tuple[str, str], float]:
     for folder in (session, session.parent):
         path = folder / "bone_size.csv"
         if path.is_file():
-            with path.open(newline="", encoding="utf-8-sig") as stream:
-                rows = csv.DictReader(stream, skipinitialspace=True)
-                return {
-                    ((row.get("Bone_Class") or "").strip(), _plain_number(row.get("Bone") or "")): number_or_nan(
-                        row.get("Size_mm")
-                    )
-                    for row in rows
-                }
+            return {
+                ((row.get("Bone_Class") or "").strip(), _plain_number(row.get("Bone") or "")): number_or_nan(
+                    row.get("Size_mm")
+                )
+                for row in _reader(path)
+            }
     return {}
 
 

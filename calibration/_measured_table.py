@@ -4,11 +4,13 @@ import csv
 import difflib
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ..acquisition.setting import Filter, filters_from_text
 from ..errors import InputError
+from ..files import CSV_UTF8, read_utf8, with_decimal_points
 from ..materials import material_from_name
 from ..spectra import checked_kV
 
@@ -16,6 +18,8 @@ MOST_ROWS = 20_000
 # Readings that scatter by 0.1 % or more agree to this resolution by chance in three cases of a hundred at most,
 # 1e-4 / (2 root(pi) 1e-3): two rows so alike are one row, copied.
 _COPY_RESOLUTION = 1e-4
+_DECIMAL_COMMA = re.compile(r"(:\s*\d+),(\d)")  # of a thickness: Cu:0,1
+_REMEDY = "write decimals with a point, or separate columns by semicolons"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +62,10 @@ class TableRow:
             value = float(text)
         except ValueError:
             raise InputError(
-                f"{self.place}: {column}", received=repr(text) if text else "nothing", expected=f"a number in {unit}"
+                f"{self.place}: {column}",
+                received=repr(text) if text else "nothing",
+                expected=f"a number in {unit}",
+                remedy=_REMEDY if "," in text else "",
             ) from None
         if not (math.isfinite(value) and 0.0 < value < below):
             upper = "" if below == math.inf else f" and below {below:g}"
@@ -79,7 +86,7 @@ class TableRow:
     def filters(self) -> tuple[Filter, ...]:
         """The layers of the column `filter`, every material known."""
         try:
-            layers = filters_from_text(self.text("filter"))
+            layers = filters_from_text(_DECIMAL_COMMA.sub(r"\1.\2", self.text("filter")))
             for layer in layers:
                 material_from_name(layer.material)
         except InputError as error:
@@ -100,7 +107,8 @@ def read_rows(
     """Rows of a CSV file with a header; lines that start with # and empty ones are passed over.
 
     Args:
-        path: the file, UTF-8, columns separated by commas, semicolons or tabs.
+        path: the file, UTF-8, columns separated by commas, semicolons or tabs; decimals with a point, or with a comma where
+            no comma separates columns.
         option: the option that it was given by, for messages.
         required: columns that must be there.
         known: all columns that have a meaning; capital letters do not matter.
@@ -110,11 +118,11 @@ def read_rows(
     """
     name = os.path.basename(os.fspath(path))
     try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            text = file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = "a file that is not text" if isinstance(error, UnicodeDecodeError) else "no file that can be read"
-        raise InputError(f"{option} {name}", received=reason, expected="a CSV file with a header") from None
+        text = read_utf8(path, argument=f"{option} {name}", save_as=CSV_UTF8)
+    except OSError:
+        raise InputError(
+            f"{option} {name}", received="no file that can be read", expected="a CSV file with a header"
+        ) from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
     expected = "a header with the columns " + ", ".join(required)
@@ -131,14 +139,18 @@ def read_rows(
         raise InputError(f"{option} {name}", received="a header without rows", expected="a measurement a row")
     if len(cells) > MOST_ROWS:
         raise InputError(f"{option} {name}", received=f"{len(cells) - 1} rows", expected=f"at most {MOST_ROWS}")
+    body = cells[1:]
+    if delimiter != ",":
+        numbers = [line for line, _ in lines[1 : len(cells)]]
+        body = with_decimal_points(cells[0], body, lines=numbers, argument=f"{option} {name}")
     rows = []
-    for (line, _), row in zip(lines[1:], cells[1:], strict=False):
+    for (line, _), row in zip(lines[1:], body, strict=False):
         if len(row) > len(header):
             raise InputError(
                 f"{option} {name}, line {line}",
                 received=f"{len(row)} cells",
                 expected=f"{len(header)}, as in the header",
-                remedy="join filters by + and write decimals with a point",
+                remedy=f"join filters by +; {_REMEDY}",
             )
         values = {column: cell.strip() for column, cell in zip(header, row, strict=False)}
         rows.append(TableRow(place=f"{option} {name}, line {line}", line=line, cells=values))

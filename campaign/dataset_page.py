@@ -9,6 +9,7 @@ import numpy as np
 from ..acquisition.dataset_io import SPLITS, Dataset
 from ..reports import AFTER, Chart, KeyFigure, Picture, ResultPage, Section, SortedTable, Step
 from ..reports.chart import Bars
+from ..results import counted
 
 _EXAMPLES = 3  # pairs: of the least, the middling and the largest contrast
 _GROUPS = 12
@@ -21,7 +22,9 @@ def dataset_page(dataset: Dataset, *, warnings: Sequence[str] = ()) -> ResultPag
     splits = Counter(row.split for row in rows)
     rows_px, columns_px = dataset.shape
     settings = list(dict.fromkeys(row.setting for row in rows if row.setting))
-    lines = [f"{len(rows)} pairs of {rows_px} x {columns_px} pixels, {len(with_object)} with a foreign object."]
+    lines = [
+        f"{counted(len(rows), 'pair')} of {rows_px} x {columns_px} pixels, {len(with_object)} with a foreign object."
+    ]
     lines.append("Split: " + ", ".join(f"{splits[name]} {name}" for name in SPLITS if splits[name]) + ".")
     key = [
         KeyFigure(value=str(len(rows)), text="image pairs"),

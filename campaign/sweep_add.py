@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..acquisition.setting import Filter, Setting
 from ..errors import InputError
-from ..files import whole_file
+from ..files import read_utf8, whole_file
 from .sweep_file import read_campaign, text_of_pair
 
 # networks learn first from images so much less noisy than those of the settings that are compared
@@ -66,7 +66,7 @@ def add_setting(
         campaign = read_campaign(file)
         if text_of_pair(pair) in map(text_of_pair, campaign.settings):
             return AddedSetting(path=file, settings=len(campaign.settings), new=False, description=None)
-        text = file.read_text(encoding="utf-8").rstrip("\n") + "\n\n" + _setting_text(pair)
+        text = read_utf8(file).rstrip("\n") + "\n\n" + _setting_text(pair)
         _write(file, text)
         return AddedSetting(path=file, settings=len(campaign.settings) + 1, new=True, description=None)
     description = None

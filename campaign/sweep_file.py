@@ -16,6 +16,7 @@ from typing import Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, filters_from_text, setting_from_text
 from ..errors import InputError
+from ..files import read_utf8
 from ..segmentation.recipe import RECIPES, STARTER
 
 SIZES = ("contrast", "size_mm")
@@ -227,14 +228,14 @@ def read_campaign(path: str | os.PathLike[str]) -> Campaign:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_utf8(file)
         content = tomllib.loads(text)
     except FileNotFoundError:
         raise InputError(str(path), received="no such file", expected="a campaign file (TOML)") from None
     except OSError as error:
         what = "a folder" if file.is_dir() else f"a file that cannot be read ({error.strerror})"
         raise InputError(str(path), received=what, expected="a campaign file (TOML)") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), received=f"text that is not TOML ({error})", expected="a campaign file") from None
     if not text.strip():
         raise InputError(

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import FileFormatError, InputError
+from ..files import read_utf8
 from .material import Material, atomic_number_from_symbol, mass_fractions_from_formula, mixture_by_mass
 
 ENVIRONMENT_VARIABLE = "RAYTWIN_LIBRARY"
@@ -58,12 +59,12 @@ def read_library(path: str | os.PathLike[str], *, base: Library | None = None) -
     """
     where = Path(path)
     try:
-        document = tomllib.loads(where.read_text(encoding="utf-8"))
+        document = tomllib.loads(read_utf8(where))
     except OSError as error:
         raise FileFormatError(
             "material library", received=where, expected=f"a readable file ({error.strerror})"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except tomllib.TOMLDecodeError as error:
         raise FileFormatError("material library", received=f"{where}: {error}", expected="a TOML file") from None
     materials = dict(base.materials) if base else {}
     aliases = dict(base.aliases) if base else {}

@@ -119,11 +119,11 @@ def compare_pod(
         shared_images, shared_networks: whether the same images and networks stand in both (the comparison is paired).
 
     Raises:
-        InputError: a margin that is no positive number.
+        InputError: a margin that is no share above 0 and below 1.
     """
     check_number("margin", margin)
-    if not (math.isfinite(margin) and margin > 0):
-        raise InputError("margin", received=margin, expected="a positive share of a90, for example 0.1")
+    if not 0 < margin < 1:
+        raise InputError("margin", received=margin, expected="a share of a90 above 0 and below 1: 0.1 is 10 %")
     if size_margin is not None:
         check_number("size margin", size_margin)
     if size_margin is not None and not (math.isfinite(size_margin) and size_margin > 0):

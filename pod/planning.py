@@ -24,6 +24,8 @@ from .mixed import averaged_eta, averaged_pod
 
 Array = NDArray[np.float64]
 
+FEW_TRIALS = 40  # informative ones; below, expect longer intervals than planned
+
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 

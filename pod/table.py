@@ -1,7 +1,7 @@
 """Read hit/miss and response tables: HITS.csv of `raytwin detect`, mh1823 files, spreadsheets' exports.
 
 Comma, semicolon or tab; decimal comma where the separator is not a comma; lines that begin with # are comments. One
-trial a row, counts of trials a row, or one column of hits per inspection (as mh1823 writes them). An empty size is a
+trial a row, counts of trials a row, or one column of hits per inspection (as mh1823 writes them). An empty size (or NaN, NA) is a
 product without foreign object: it is left out of the curve, and its false alarm is counted.
 """
 
@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileFormatError, InputError
-from ..results import ByValue
+from ..files import CSV_UTF8, read_utf8, with_decimal_points
+from ..results import ByValue, counted
 
 if TYPE_CHECKING:
     import pandas
@@ -29,6 +30,7 @@ Array = NDArray[np.float64]
 SIZE_NAMES = ("contrast", "size", "size_mm", "a", "flaw_size", "flawsize", "depth", "length", "diameter")
 HIT_NAMES = ("hit", "hits", "hit_miss", "hitmiss", "hit/miss", "detected", "detection")
 SITE_NAMES = ("site", "target", "target_id", "id")
+_MISSING = ("NaN", "nan", "NA", "NaT", "<NA>")  # an empty cell, as pandas and R write it
 _HIT_WORDS = {
     "0": 0.0,
     "1": 1.0,
@@ -39,6 +41,10 @@ _HIT_WORDS = {
     "no": 0.0,
     "yes": 1.0,
 }
+
+
+class HitError(InputError):
+    """A cell in the column of hits is neither a hit nor a miss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +156,7 @@ def read_pod_table(
         else:
             without.append(number)
     if unknown:
-        notes.append(f"{unknown} rows with a foreign object but no {size_name} are left out")
+        notes.append(f"left out: {counted(unknown, 'row')} with a foreign object but no {size_name}")
     if not with_object:
         raise InputError(size_name, received="no row with a size", expected="sizes of foreign objects in this column")
 
@@ -179,7 +185,9 @@ def read_pod_table(
                 [_hit(t, source, f"line {lines[i]}") for t, i in zip(texts, without, strict=True) if t != ""]
             )
             if len(alarms) < len(without):
-                notes.append(f"{len(without) - len(alarms)} rows without foreign object say nothing of a false alarm")
+                notes.append(
+                    f"no word of a false alarm in {counted(len(without) - len(alarms), 'row')} without foreign object"
+                )
                 without = [i for t, i in zip(texts, without, strict=True) if t != ""]
     noise = np.zeros(0)
     if response_name and without:
@@ -214,10 +222,12 @@ def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
     columns = [[_cell_text(value) for value in source[name]] for name in names]
     if not columns:
         raise InputError("table", received="a table without columns", expected="columns of sizes and hits")
-    if len({len(column) for column in columns}) != 1 or not columns[0]:
+    if len({len(column) for column in columns}) != 1:
         raise InputError(
             "table", received=f"columns of {[len(column) for column in columns]} rows", expected="columns of one length"
         )
+    if not columns[0]:
+        raise InputError("table", received="an empty table", expected="a row for each trial")
     header = [str(name).strip() for name in names]
     if len(set(header)) != len(header) or "" in header:
         raise InputError("table", received=", ".join(header), expected="distinct, non-empty column names")
@@ -226,17 +236,15 @@ def _rows_of(source: Any) -> tuple[list[str], list[list[str]], list[int]]:
 
 def _cell_text(value: Any) -> str:
     """A value as the cell of a file would have it; what is missing is empty."""
-    if value is None or str(value) in ("nan", "NaT", "<NA>"):
-        return ""
-    return str(value)
+    return "" if value is None or str(value) in _MISSING else str(value)
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_utf8(path, argument=f"table {path}", save_as=CSV_UTF8)
     except FileNotFoundError:
         raise FileFormatError("table", received=path, expected="a file that exists") from None
-    except (UnicodeDecodeError, IsADirectoryError, PermissionError):
+    except (IsADirectoryError, PermissionError):
         raise FileFormatError(
             "table", received=path, expected="a readable text file of comma-separated values"
         ) from None
@@ -270,13 +278,8 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
             )
     body = cells[1:]
     if separator != ",":
-        body = [[_decimal_point(cell) for cell in row] for row in body]
-    return header, body, numbers
-
-
-def _decimal_point(cell: str) -> str:
-    changed = cell.replace(",", ".")
-    return changed if cell.count(",") == 1 and _is_number(changed) else cell
+        body = with_decimal_points(header, body, lines=numbers, argument=f"table {path}")
+    return header, [["" if cell.strip() in _MISSING else cell for cell in row] for row in body], numbers
 
 
 def _is_number(text: str) -> bool:
@@ -388,7 +391,7 @@ def _hit(text: str, name: str, place: str) -> float:
     except ValueError:
         value = math.nan
     if value not in (0.0, 1.0):
-        raise InputError(
+        raise HitError(
             f"column {name}, {place}",
             received=repr(text),
             expected="0 (miss) or 1 (hit)",

@@ -84,7 +84,7 @@ def _columns(where: Path) -> tuple[dict[str, str], NDArray[np.float64], NDArray[
     header: dict[str, str] = {}
     rows: list[tuple[float, float]] = []
     try:
-        lines = where.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = where.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise FileFormatError("spectrum file", received=where, expected=f"a readable file ({error.strerror})") from None
     for number, line in enumerate(lines, start=1):

@@ -1,6 +1,7 @@
 """Settings, filters and the instrument: text round trips, and one clear line for what cannot be."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -58,6 +59,7 @@ def test_the_text_of_a_setting_is_the_grammar_of_the_command_line():
         source_detector_mm=1059,
     )
     assert str(setting) == "kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05+Al:1,averaged=10,source_detector_mm=1059"
+    assert str(replace(setting, averaged=10.0)) == str(setting)
 
 
 def test_words_of_a_setting_may_come_in_any_order_and_case():
@@ -85,7 +87,7 @@ def test_load_is_power_over_voltage_times_time():
         ("kv=40,exposure_ms=20,filter=Cu", "filter: got 'Cu'; expected MATERIAL:mm"),
         ("kv=40,exposure_ms=20,filter=Cu:-1", "thickness of filter Cu: got -1.0 mm"),
         ("kv=40,exposure_ms=20,averaged=0", "averaged: got 0; expected a whole number of frames"),
-        ("kv=40,exposure_ms=20,averaged=1.5", "expected a number"),
+        ("kv=40,exposure_ms=20,averaged=1.5", "expected a whole number"),
         ("kv=40,exposure_ms=20,power_w=40,current_ma=2", "expected power = kV x mA = 80 W within 1 %"),
         ("", "setting: got"),
     ],

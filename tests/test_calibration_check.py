@@ -2,7 +2,9 @@
 
 import json
 import math
+import re
 import sys
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -140,7 +142,8 @@ def test_what_is_no_measurement_is_one_finding_or_one_line(tmp_path, capsys):
 
 def test_bare_images_get_a_draft_of_a_sidecar(tmp_path, capsys):
     rng = np.random.default_rng(0)
-    for name, level in (("di0001", 300), ("io0001", 9000), ("io0002", 9000), ("scan_0001", 6000)):
+    product = np.where(np.arange(9) < 4, 0.6, 1.0)
+    for name, level in (("di0001", 300), ("io0001", 9000), ("io0002", 9000), ("scan_0001", 9000 * product)):
         tifffile.imwrite(tmp_path / f"{name}.tif", rng.poisson(level, (8, 9)).astype(np.uint16))
     assert main(["check", str(tmp_path)]) == 0
     told = capsys.readouterr().out
@@ -148,6 +151,74 @@ def test_bare_images_get_a_draft_of_a_sidecar(tmp_path, capsys):
         assert line in told
     result = check_acquisition(tmp_path)
     assert [item.code for item in result.findings] == [FindingCode.NO_SIDECAR]
+
+
+def test_a_draft_reads_settings_in_names_and_tells_even_light_from_a_product(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[-1:1:64j, -1:1:64j]
+    field = 1.0 - 0.15 * row - 0.2 * row**2 - 0.2 * column**2  # heel and distance
+    bone = np.where(row**2 + column**2 < 0.3, 0.5, 1.0)
+    scenes = {
+        "40kV_10W_20ms": 3000.0 * field,
+        "90kV_12mA_20ms": 9000.0 * field,
+        "90kV_12mA_20ms/fillet": 9000.0 * field * bone,
+        "90kV_12mA_20ms/slab": 5000.0 * field,
+        "off_20ms": np.zeros((64, 64)),
+    }
+    for name, light in scenes.items():
+        (tmp_path / name).mkdir(parents=True)
+        for number in range(2):
+            image = rng.poisson(100.0 + light).astype(np.uint16)
+            tifffile.imwrite(tmp_path / name / f"img_{number}.tif", image)
+    draft = check_acquisition(tmp_path).draft
+    series = {one["files"]: one for one in tomllib.loads(draft)["series"]}
+    assert {name.removesuffix("/img_*.tif"): one["kind"] for name, one in series.items()} == {
+        "40kV_10W_20ms": "flat",
+        "90kV_12mA_20ms": "flat",
+        "90kV_12mA_20ms/fillet": "object",
+        "90kV_12mA_20ms/slab": "?",
+        "off_20ms": "dark",
+    }
+    assert series["40kV_10W_20ms/img_*.tif"]["setting"] == "kv=40,power_w=10,exposure_ms=20"
+    assert series["90kV_12mA_20ms/fillet/img_*.tif"]["setting"] == "kv=90,current_ma=12,exposure_ms=20"
+    assert series["off_20ms/img_*.tif"]["exposure_ms"] == 20
+    # a draft that is used as it is names what is left to do
+    (tmp_path / "raytwin.toml").write_text(draft)
+    assert main(["import", "images", str(tmp_path), "-o", str(tmp_path / "out.h5")]) == 2
+    assert re.search(
+        r"raytwin.toml, series 4, kind of .* got '\?'; expected one of dark, flat", capsys.readouterr().err
+    )
+    (tmp_path / "raytwin.toml").write_text(draft.replace('"?"', '"object"').replace("kv=90", "kv=0"))
+    assert main(["import", "images", str(tmp_path), "-o", str(tmp_path / "out.h5")]) == 2
+    assert "raytwin.toml, series 2, kV: got 0.0 kV" in capsys.readouterr().err
+    assert not (tmp_path / "out.h5").exists()
+
+
+def test_a_number_with_its_unit_is_no_number_of_a_frame(tmp_path):
+    for ms in (10, 20):
+        for number in range(2):
+            tifffile.imwrite(tmp_path / f"flat_{number}_{ms}ms.tif", np.full((8, 8), 100 * ms, np.uint16))
+    series = tomllib.loads(check_acquisition(tmp_path).draft)["series"]
+    assert [(one["files"], one["setting"]) for one in series] == [
+        (f"flat_*_{ms}ms.tif", f"kv=0,power_w=0,exposure_ms={ms}") for ms in (10, 20)
+    ]
+
+
+@pytest.mark.parametrize("damaged", ["flat_a_0.tif", "flat_a_3.tif"])
+def test_a_damaged_image_is_a_finding_and_the_other_series_are_checked(tmp_path, damaged):
+    rng = np.random.default_rng(0)
+    sidecar = ""
+    for name, kind, level in (("dark", "dark", 100), ("flat_a", "flat", 4000), ("flat_b", "flat", 8000)):
+        for number in range(5):
+            tifffile.imwrite(tmp_path / f"{name}_{number}.tif", rng.poisson(level, (16, 16)).astype(np.uint16))
+        sidecar += f'[[series]]\nname = "{name}"\nkind = "{kind}"\nfiles = "{name}_*.tif"\nexposure_ms = 10\n'
+    (tmp_path / "raytwin.toml").write_text(sidecar)
+    (tmp_path / damaged).write_bytes((tmp_path / damaged).read_bytes()[:200])
+    result = check_acquisition(tmp_path)
+    assert [row.name for row in result.series] == ["dark", "flat_b"]
+    (found,) = (item for item in result.findings if item.code == FindingCode.DAMAGED)
+    assert found.text.startswith("series flat_a, ") and f"{damaged}: got 200 bytes" in found.text
+    assert result.series[1].level_DN == pytest.approx(8000, rel=0.05)
 
 
 def test_a_twin_tells_its_levels(series_line, tmp_path):

@@ -322,6 +322,9 @@ BAD_OUTPUT = {
     "no distance": ("kV,filter,mAs,air_kerma_uGy\n60,,1,5\n", "distance_mm"),
     "kV": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n600,,1,1000,5\n", "line 2: kV: got 600 kV"),
     "copy": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,51.2347\n60,,1,1000,51.2347\n", "as in line 2"),
+    "comma": ('kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,"51,2"\n', "separate columns by semicolons"),
+    "mixed": ("kV;filter;mAs;distance_mm;air_kerma_uGy\n60;;1;1000;51,2\n60;;1;1000;1.566\n", "not both"),
+    "latin": ("# \udce4\nkV,filter\n", "another encoding than UTF-8 (line 1, byte 0xe4)"),
     "cells": ("kV,filter,mAs,distance_mm,air_kerma_uGy\n60,,1,1000,51,2\n", "6 cells"),
 }
 BAD_TRANSMISSION = {
@@ -333,6 +336,23 @@ BAD_TRANSMISSION = {
 }
 
 
+@pytest.mark.parametrize("option", ["--output-table", "--transmission"])
+def test_a_table_that_is_not_there_is_told_in_one_line(tmp_path, capsys, option):
+    assert main(["calibrate", option, str(tmp_path / "nope.csv"), "-o", str(tmp_path / "twin.h5")]) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 1 and f"{option} nope.csv: got no file that can be read" in told[0]
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_are_read_where_no_comma_separates_columns(tmp_path, separator):
+    rows = [HEADER, "40,,10,500,730.6,1", "40,Al:0.5+Cu:0.1,10,500,23.15,1"]
+    points, commas = tmp_path / "points.csv", tmp_path / "commas.csv"
+    points.write_text("\n".join(rows))
+    commas.write_text("\n".join(row.replace(",", separator).replace(".", ",") for row in rows))
+    assert read_output_table(commas).kermas == read_output_table(points).kermas
+
+
 @pytest.mark.parametrize(
     ("option", "text", "expected"),
     [("--output-table", *case) for case in BAD_OUTPUT.values()]
@@ -341,7 +361,7 @@ BAD_TRANSMISSION = {
 )
 def test_a_bad_table_is_told_in_one_line(tmp_path, capsys, option, text, expected):
     path, twin = tmp_path / "table.csv", tmp_path / "twin.h5"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
     assert main(["calibrate", option, str(path), "-o", str(twin)]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1 and expected in told[0]

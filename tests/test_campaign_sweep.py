@@ -792,6 +792,17 @@ def test_a_bad_campaign_file_is_one_line_that_says_what_to_do(line, old, new, me
     assert "\n" not in str(caught.value)
 
 
+def test_a_byte_order_mark_is_no_part_of_a_campaign_and_utf_16_is_named(line):
+    campaign_of(line)
+    path = line / "other.toml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8-sig")
+    assert read_campaign(path).settings
+    path.write_text(text, encoding="utf-16")
+    with pytest.raises(InputError, match="got text in UTF-16; expected text in UTF-8; save it as UTF-8"):
+        read_campaign(path)
+
+
 def test_no_file_and_no_settings_are_told(line, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_campaign(tmp_path / "absent.toml")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import raytwin as rt
 from raytwin.cli import main
 
 EXAMPLES = Path(__file__).parent / "pod_examples"
@@ -145,7 +146,7 @@ def test_separated_data_say_so(capsys, tmp_path):
     ("text", "options", "words"),
     [
         ("size,hit\n1,1\n2,0\n", ["--size", "siz"], "did you mean size?"),
-        ("size,hit\n1,1\nNaN,0\n", [], "line 3: got 'NaN'"),
+        ("size,hit\n1,1\ninf,0\n", [], "line 3: got 'inf'"),
         ("size,hit\n1,1\n2,0,3,4,5\n", [], "got 5 columns; expected 2"),
         ("size,hit\n1,1\n2,3\n", [], "counts of hits need --trials"),
         ("size,hit\n1,1\n2,0\n", ["--where", "hit"], "expected COLUMN=VALUE"),
@@ -206,6 +207,52 @@ def test_compare_refuses_different_sizes(capsys, tmp_path):
     two.write_text("contrast,hit\n1,1\n2,0\n")
     assert main(["compare", str(one), str(two)]) == 2
     assert "the same size column in both tables" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("margin", ["1", "10", "0", "nan"])
+def test_a_margin_is_a_share_below_1(capsys, tmp_path, margin):
+    path = write_hits(tmp_path / "a.csv", 7)
+    assert main(["compare", str(path), str(path), "--margin", margin]) == 2
+    assert "--margin: got" in (told := capsys.readouterr().err) and "0.1 is 10 %" in told
+
+
+def test_a_size_far_from_all_others_is_named(capsys, tmp_path):
+    told = "the size 1e+12 in row 61 lies far from all others, "
+    rng = np.random.default_rng(0)
+    size = rng.uniform(0.5, 4, 60)
+    hit = (rng.random(60) < 1 / (1 + np.exp(-3 * (size - 2)))).astype(int)
+    path = tmp_path / "far.csv"
+    path.write_text("size,hit\n" + "".join(f"{a},{b}\n" for a, b in zip(size, hit, strict=True)) + "1e12,1\n")
+    assert main(["pod", str(path)]) == 2
+    assert f"error: no curve fits the table: {told}" in capsys.readouterr().err
+    # where a fit ends all the same, it is a warning; on the logarithm a far size is one of many
+    assert any(told in line for line in rt.fit_pod(path, method="firth").warnings)
+    assert not any(told in line for line in rt.fit_pod(path, log_size=True).warnings)
+
+
+def test_what_cannot_be_compared_or_shown_says_what_is_taken(capsys, tmp_path):
+    grouped, hits = tmp_path / "grouped.csv", write_hits(tmp_path / "a.csv", 7)
+    grouped.write_text("contrast,hit,n\n1,2,10\n2,5,10\n3,9,10\n")
+    assert main(["compare", str(hits), str(grouped)]) == 2
+    told = capsys.readouterr().err
+    assert "name the column of trials (trials, --trials)" in told and "--response" not in told
+    assert main(["report", str(grouped), "-o", str(tmp_path / "page.html")]) == 2
+    told = capsys.readouterr().err
+    assert "`raytwin pod TABLE.csv --report PAGE.html`" in told and "--trials" not in told
+    size = np.linspace(1, 4, 30)
+    curve = rt.fit_pod({"size": size, "ahat": size + 0.1 * np.sin(9 * size)}, response="ahat", decision=2)
+    with pytest.raises(rt.InputError, match="second: got a continuous response; expected hits and misses"):
+        rt.compare(rt.fit_pod({"size": size, "hit": (np.sin(9 * size) + size > 2).astype(int)}), curve)
+
+
+def test_a_small_plan_says_that_it_is_for_large_samples(capsys):
+    words = ["plan", "--a50", "1", "--a90", "2", "--images"]
+    assert main([*words, "20"]) == 0
+    captured = capsys.readouterr()
+    assert "with 20 images, fewer than some 40, expect a longer interval" in captured.err
+    assert "1 network, 20 images" in captured.out
+    assert main([*words, "60"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_plan_answers_with_images_sizes_and_limits(capsys, tmp_path):

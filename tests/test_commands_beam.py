@@ -8,6 +8,8 @@ import pytest
 
 from raytwin.cli import main
 
+PAIR = ["--low", "kv=40,power_w=40,exposure_ms=20", "--high", "kv=90,power_w=45,exposure_ms=20"]
+
 
 def _answer(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     assert main([*words, "--json"]) == 0
@@ -102,6 +104,8 @@ def test_own_materials_and_a_measured_spectrum_take_part(capsys: pytest.CaptureF
         (["spectrum", "--kv", "60", "--model", "default"], "model: got 'default'"),
         (["spectrum", "--kv", "sixty"], "argument --kv: invalid float value: 'sixty'"),
         (["spectrum", "--spectrum-file", "missing.txt"], "spectrum file: got missing.txt; expected a readable file"),
+        (["contrast", "--product", "water:9", "--object", "Al", *PAIR], "--object: got 'Al'; expected MATERIAL:mm"),
+        (["contrast", "--product", "musle:9", "--object", "Al:1", *PAIR], "--product: got 'musle'"),
         (["mu", "musle", "--energy-kev", "60"], "nearest: muscle"),
         (["mu", "Al"], "kV, energy_keV: got neither; expected a beam"),
         (["mu", "Al", "--kv", "60", "--energy-kev", "60"], "kV, energy_keV: got both"),

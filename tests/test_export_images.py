@@ -308,6 +308,12 @@ def test_what_a_form_cannot_hold_is_one_line_and_leaves_nothing(request, tmp_pat
     assert [one.name for one in (tmp_path / "full").iterdir()] == ["kept.txt"]
 
 
+def test_a_file_that_is_not_there_is_what_its_form_is_made_of(tmp_path, capsys):
+    for form, kind in (("coco", "dataset"), ("nxtomo", "acquisition"), ("tiff", "dataset or acquisition")):
+        assert main(["export", str(tmp_path / "none.h5"), "--to", form, "-o", str(tmp_path / "out")]) == 2
+        assert f"none.h5; expected an existing {kind} file" in capsys.readouterr().err
+
+
 # Our HDF5 files in viewers
 
 

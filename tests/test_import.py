@@ -196,6 +196,11 @@ def test_eight_bit_grey_and_grey_stored_as_colour_are_grey(tmp_path):
     [
         (lambda root: (root / "raytwin.toml").unlink(), "raytwin.toml: got no such file; expected a sidecar"),
         (lambda root: (root / "raytwin.toml").write_text("[[series]"), "got text that is not TOML"),
+        (
+            lambda root: (root / "raytwin.toml").write_text("[instrument]\n", encoding="utf-16"),
+            "raytwin.toml: got text in UTF-16; expected text in UTF-8; save it as UTF-8",
+        ),
+        (lambda root: (root / "raytwin.toml").write_text("[serie]\n", encoding="utf-8-sig"), "got the word 'serie'"),
         (lambda root: (root / "raytwin.toml").write_text("[serie]\n"), "got the word 'serie'; expected one of"),
         (
             lambda root: (root / "raytwin.toml").write_text("[instrument]\npixel = 1\n[[series]]\n"),
@@ -832,6 +837,12 @@ def test_bad_pixels_of_a_twin_are_replaced_in_every_image(pairs, tmp_path):
         images = np.stack(log_pair(2, bone=True)[:2])
         np.testing.assert_array_equal(dataset.images(1), replace_bad_pixels(images, bad))
         assert (dataset.images(1) != images).any()
+
+
+def test_the_name_of_a_shipped_twin_gives_its_bad_pixels(pairs, tmp_path, capsys):
+    words = ["import", "reference", str(pairs), "-o", str(tmp_path / "d.h5"), "--twin", "virtual_lab"]
+    assert main(words) == 2
+    assert "bad-pixel mask: got shape (64, 64); expected shape (12, 17)" in capsys.readouterr().err
 
 
 def test_the_sidecars_of_the_manual_are_read(folder, pairs, tmp_path):

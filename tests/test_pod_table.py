@@ -30,7 +30,7 @@ def test_hits_of_detect_leave_products_without_object_out_and_count_their_alarms
     assert table.false_alarm.tolist() == [1, 0]
     assert table.false_alarm_network == ("n0", "n1")
     assert table.numbers("size_mm").tolist() == [2, 3]
-    assert any("say nothing of a false alarm" in note for note in table.notes)
+    assert any("no word of a false alarm" in note for note in table.notes)
     assert read_pod_table(path, size="size_mm").size.tolist() == [2, 3]
 
 
@@ -43,7 +43,7 @@ def test_an_object_without_its_size_is_left_out_and_said(tmp_path):
     table = read_pod_table(written(tmp_path, "contrast,hit,foreign_object\n0.1,1,bone\n,1,bone\n0.3,0,bone\n"))
     assert len(table.size) == 2
     assert len(table.false_alarm) == 0
-    assert "1 rows with a foreign object but no contrast" in table.notes[0]
+    assert "left out: 1 row with a foreign object but no contrast" in table.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,12 @@ def test_responses_of_products_without_object_are_noise(tmp_path):
         ("size,hit\n1,1\n2,0\n", {"site": "sitee"}, "site: got 'sitee'"),
         ("weight,hit\n1,1\n2,0\n", {}, "name the column: size=... (--size)"),
         ("size,seen\n1,maybe\n2,0\n", {}, "name the column: hit=... (--hit)"),
-        ("size,hit\n1,1\nnan,0\n", {}, "column size, line 3: got 'nan'; expected a finite number"),
+        ("size,hit\n1,1\ninf,0\n", {}, "column size, line 3: got 'inf'; expected a finite number"),
+        (
+            "size;hit\n0,885;1\n0,9;1\n1.566;0\n",
+            {},
+            "column size: got '0,885' in line 2 and '1.566' in line 4; expected decimal commas or decimal points, not both",
+        ),
         ("size,hit\n1,1\n2mm,0\n", {}, "column size, line 3: got '2mm'"),
         ("size,hit\n1,1\n2,0.5\n", {}, "column hit, line 3: got '0.5'; expected 0 (miss) or 1 (hit)"),
         ("size,hit\n1,1\n2,\n", {}, "column hit, line 3: got ''"),
@@ -132,8 +137,32 @@ def test_files_that_are_no_tables_are_said_to_be_none(tmp_path):
         read_pod_table(tmp_path)
     binary = tmp_path / "binary.csv"
     binary.write_bytes(bytes(range(256)))
-    with pytest.raises(FileFormatError, match="expected a readable text file"):
+    with pytest.raises(FileFormatError, match="got a file that is not text; expected text in UTF-8"):
         read_pod_table(binary)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "received"),
+    [("latin-1", "another encoding than UTF-8 (line 3, byte 0xfc)"), ("utf-16", "text in UTF-16")],
+)
+def test_another_encoding_is_named_with_what_to_save_as(tmp_path, encoding, received):
+    path = tmp_path / "table.csv"
+    path.write_text("size,hit,who\n1,1,Anna\n2,0,Jürgen\n", encoding=encoding)
+    with pytest.raises(FileFormatError) as error:
+        read_pod_table(path)
+    assert f"{path}: got text in" in str(error.value) and received in str(error.value)
+    assert str(error.value).endswith("save it as CSV UTF-8")
+
+
+@pytest.mark.parametrize("missing", ["", "NaN", "nan", "NA", "<NA>"])
+def test_a_missing_size_is_no_object_however_it_is_written(tmp_path, missing):
+    table = read_pod_table(written(tmp_path, f"size,hit\n1,1\n2,0\n{missing},1\n"))
+    assert (table.size.tolist(), table.false_alarm.tolist()) == ([1.0, 2.0], [1.0])
+
+
+def test_a_data_frame_without_rows_is_an_empty_table():
+    with pytest.raises(InputError, match="got an empty table; expected a row for each trial"):
+        read_pod_table({"size": [], "hit": []})
 
 
 def test_a_column_asked_for_as_numbers_must_hold_numbers(tmp_path):

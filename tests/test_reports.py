@@ -188,6 +188,11 @@ def test_results_have_pages_and_other_things_are_refused(tmp_path: Path) -> None
     assert usual.a90 is not None and f"{usual.a90:.3g}" in of_table
     with pytest.raises(InputError, match=r"ends in \.html"):
         rt.report(curve, tmp_path / "pod.png")
+    (tmp_path / "diagnosis").mkdir()
+    (tmp_path / "diagnosis" / "diagnosis.json").write_text("{}")
+    for given in (tmp_path / "diagnosis", tmp_path / "diagnosis" / "diagnosis.json"):
+        with pytest.raises(InputError, match=r"wrote its page already: .*diagnosis/report\.html"):
+            rt.report(given, tmp_path / "x.html")
     with pytest.raises(InputError, match="expected a twin, a validation"):
         rt.report(3, tmp_path / "x.html")  # type: ignore[arg-type]
 

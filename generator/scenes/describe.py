@@ -56,7 +56,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileFormatError, InputError
-from ...files import sha256_of_file
+from ...files import read_utf8, sha256_of_file
 from ...materials import material_from_name
 from .kinds import KINDS
 from .mesh import Mesh, read_mesh
@@ -153,11 +153,11 @@ def read_description(path: str | os.PathLike[str]) -> Description:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_utf8(file)
         tables = tomllib.loads(text)
     except FileNotFoundError:
         raise FileFormatError(str(path), received="no such file", expected="a description (TOML)") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, tomllib.TOMLDecodeError) as error:
         raise FileFormatError(
             str(path), received=f"text that is not TOML ({error})", expected="a description"
         ) from None

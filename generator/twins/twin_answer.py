@@ -7,7 +7,7 @@ import numpy as np
 
 from ...acquisition.setting import text_from_filters
 from ...materials import material_from_name, mu_per_mm
-from ...results import Table, interval_text
+from ...results import Table, counted, interval_text
 from ..line.twin import BAD_PIXEL_MAP, Estimate, SpectralPosterior, SpreadEstimate, Twin
 from ..predictions.tube_twin import TubeTwin
 
@@ -111,7 +111,7 @@ def twin_table(twin: Twin) -> Table:
         rows.append((f"gain, {voltage} {level['filter']}".strip(), *interval_text(gain), "DN"))
     notes = []
     if len(answer["levels"]) > len(shown):
-        notes.append(f"{len(answer['levels']) - len(shown)} more levels")
+        notes.append(f"{counted(len(answer['levels']) - len(shown), 'more level')}")
     if spectral is None:
         notes.append("no spectral part: predictions at the measured kV and filters only")
     if twin.effects:

@@ -1,14 +1,17 @@
-"""Files appear whole or not at all, and are known by their hash."""
+"""Files appear whole or not at all, and are known by their hash; texts of others are UTF-8."""
 
+import codecs
 import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import InputError
+from .errors import FileFormatError, InputError
+
+CSV_UTF8 = "CSV UTF-8"  # as spreadsheets name the encoding
 
 
 def given_path(value: object, *, expected: str, argument: str = "path") -> Path:
@@ -24,7 +27,78 @@ def given_path(value: object, *, expected: str, argument: str = "path") -> Path:
     """
     if not isinstance(value, str | os.PathLike):
         raise InputError(argument, received=f"{value!r} ({type(value).__name__})", expected=f"the path of {expected}")
+    if not os.fspath(value).strip():
+        raise InputError(argument, received="a blank path", expected=f"the path of {expected}")
     return Path(value)
+
+
+def read_utf8(path: str | os.PathLike[str], *, argument: str | None = None, save_as: str = "UTF-8") -> str:
+    """Text of a file in UTF-8, with or without a byte-order mark.
+
+    Args:
+        path: the file.
+        argument: what the file is to the user, for the message; None: its path.
+        save_as: the name of the encoding where people choose it, for the message.
+
+    Raises:
+        FileFormatError: another encoding, or no text.
+        OSError: no such file, or one that cannot be read.
+    """
+    content = Path(path).read_bytes()
+    received = "a file that is not text"
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        received = "text in UTF-16"
+    elif b"\0" not in content:
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            line = content.count(b"\n", 0, error.start) + 1
+            received = f"text in another encoding than UTF-8 (line {line}, byte {error.object[error.start]:#04x})"
+    raise FileFormatError(
+        argument or str(path), received=received, expected="text in UTF-8", remedy=f"save it as {save_as}"
+    )
+
+
+def with_decimal_points(
+    header: Sequence[str], rows: Sequence[Sequence[str]], *, lines: Sequence[int], argument: str
+) -> list[list[str]]:
+    """Cells of a table whose columns are not separated by commas: `0,885` becomes `0.885`.
+
+    Args:
+        header: names of the columns.
+        rows: cells (row, column); a row may be short.
+        lines: (row,), where the rows stand in the file, for the message.
+        argument: what the table is to the user, for the message.
+
+    Raises:
+        FileFormatError: a column with decimal commas and decimal points, one of which may separate thousands.
+    """
+    changed = [[_with_decimal_point(cell) for cell in row] for row in rows]
+    for at, name in enumerate(header):
+        written: dict[str, str] = {}
+        for row, new, line in zip(rows, changed, lines, strict=False):
+            if at < len(row) and "." in new[at] and _is_number(new[at]):
+                written.setdefault("comma" if new[at] != row[at] else "point", f"{row[at].strip()!r} in line {line}")
+        if len(written) > 1:
+            raise FileFormatError(
+                f"{argument}, column {name.strip()}",
+                received=f"{written['comma']} and {written['point']}",
+                expected="decimal commas or decimal points, not both",
+            )
+    return changed
+
+
+def _with_decimal_point(cell: str) -> str:
+    changed = cell.replace(",", ".")
+    return changed if cell.count(",") == 1 and _is_number(changed) else cell
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

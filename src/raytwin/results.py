@@ -134,6 +134,11 @@ def _same_arrays(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other, equal_nan=one.dtype.kind in "fc"))
 
 
+def counted(number: int, name: str) -> str:
+    """A number with its noun: `1 network`, `2 networks`."""
+    return f"{number} {name}{'s' * (number != 1)}"
+
+
 def plain(value: Any) -> Any:
     """The value in JSON's own types: numpy's become Python's, NaN and infinities None (JSON has no word for them)."""
     if isinstance(value, Mapping):

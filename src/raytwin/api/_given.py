@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
+from ..files import given_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,9 +26,9 @@ def twin_path(text: PathLike) -> Path:
     """The file that a name of a twin means; a file of that name goes before a shipped calibration.
 
     Raises:
-        InputError: the name of a shipped description that has no twin, or nearly the name of a shipped calibration.
+        InputError: nothing, the name of a shipped description that has no twin, or nearly the name of a shipped calibration.
     """
-    path = Path(text)
+    path = given_path(text, expected="a twin, or the name of a shipped calibration", argument="twin")
     if path.suffix or len(path.parts) != 1 or path.exists():
         return path
     from ..generator.twins.shipped import shipped_calibration, shipped_calibrations

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import FileFormatError, InputError
 from ..results import Result, Table, plain
 from ._folder import written_folder
-from ._given import PathLike, as_any_twin, as_twin
+from ._given import PathLike, as_any_twin, as_twin, twin_path
 from ._progress import Progress, Telling
 
 if TYPE_CHECKING:
@@ -33,6 +33,15 @@ _EXTRAS = {
     "fabio": ("fabio",),
     "meshes": ("trimesh",),
     "zarr": ("zarr",),
+}
+# forms that no twin is written in, and what is
+_NOT_OF_TWINS = {
+    "coco": "dataset",
+    "yolo": "dataset",
+    "tiff": "dataset or acquisition",
+    "zarr": "dataset or acquisition",
+    "nxtomo": "acquisition",
+    "dicom": "acquisition",
 }
 _LIBRARIES = (
     "numpy",
@@ -217,6 +226,8 @@ def export(
                 opened = stack.enter_context(dataset_io.read_dataset(source))
             elif kind == acquisition_io.FORMAT:
                 opened = stack.enter_context(acquisition_io.open_acquisition(source))
+            elif kind is None and to in _NOT_OF_TWINS and not twin_path(source).exists():
+                raise FileFormatError("source", received=source, expected=f"an existing {_NOT_OF_TWINS[to]} file")
         is_dataset = isinstance(opened, dataset_io.Dataset)
         is_acquisition = isinstance(opened, acquisition_io.AcquisitionFile)
         if (is_dataset or is_acquisition) and settings is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from ..acquisition.setting import Filter, Setting, filter_from_text, text_from_filters
-from ..errors import InputError
+from ..errors import InputError, check_number
 from ..materials import Library, library_from_files, material_from_name, nist_identifier
 from ..results import Result, Table, axes_or_new, frame, interval_text, number_text, plain
 from ._given import PathLike, as_any_twin
@@ -637,6 +637,13 @@ def mu(
     from ..materials import mass_attenuation_cm2_g, mu_per_mm
     from ..spectra import DEFAULT_SCINTILLATOR, detector_response, effective_mu_per_mm
 
+    for word, given, unit in (
+        ("kV", kV, "kV"),
+        ("energy_keV", energy_keV, "keV"),
+        ("thickness_mm", thickness_mm, "mm"),
+    ):
+        if given is not None:
+            check_number(word, given, unit=unit)
     known = library_from_files(library)
     found = material_from_name(material, library=known)
     if twin is not None:
@@ -798,10 +805,13 @@ def contrast(
 
 
 def _one_layer(name: str, value: str | Filter) -> Filter:
-    layer = filter_from_text(value) if isinstance(value, str) else value
-    if not isinstance(layer, Filter):
-        raise InputError(name, received=repr(value), expected="MATERIAL:mm")
-    material_from_name(layer.material)
+    try:
+        layer = filter_from_text(value) if isinstance(value, str) else value
+        if not isinstance(layer, Filter):
+            raise InputError(name, received=repr(value), expected="MATERIAL:mm")
+        material_from_name(layer.material)
+    except InputError as error:
+        raise InputError(name, received=error.received, expected=error.expected, remedy=error.remedy) from None
     return layer
 
 

@@ -1,15 +1,16 @@
 """Probability of detection: a curve from a table, two curves compared, a study planned."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FitError, InputError
 from ..pod.answer import default_repeats, fit_answer, notes_on_table, response_answer, trials_from_table
-from ..pod.table import PodTable, read_pod_table
-from ..results import Result, Table, axes_or_new, frame, interval_text, number_text, plain
+from ..pod.table import HitError, PodTable, read_pod_table
+from ..results import Result, Table, axes_or_new, counted, frame, interval_text, number_text, plain
 from ._given import generator_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     TableLike: TypeAlias = (
         "str | os.PathLike[str] | Mapping[str, Sequence[Any]] | pandas.DataFrame | PodTable | PodCurve | Result"
     )
+
+_FAR = 100.0  # ranges of the others: no study has a size so far away
+_NO_RESPONSES = "curves of a continuous response are not compared"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -467,19 +471,22 @@ def _hit_curve(
     from ..pod import compare_models, fit_as_published
     from ..pod import fit_pod as fit_columns
 
-    fit = fit_columns(
-        table.size,
-        table.hits if table.hits is not None else [],
-        trials=table.trials,
-        link=link,
-        log_size=log_size,
-        method=method,
-        repeats=repeats,
-        network=table.network,
-        image=table.image,
-        site=table.site,
-    )
+    with _naming_far_sizes(table=table):
+        fit = fit_columns(
+            table.size,
+            table.hits if table.hits is not None else [],
+            trials=table.trials,
+            link=link,
+            log_size=log_size,
+            method=method,
+            repeats=repeats,
+            network=table.network,
+            image=table.image,
+            site=table.site,
+        )
     warnings = [*notes_on_table(table, repeats), *fit.warnings]
+    if not log_size and (far := _far_size(table)):
+        warnings.append(far)
     trials = trials_from_table(table, log_size=log_size)
     more: dict[str, Any] = {"alternatives": [asdict(one) for one in compare_models(trials)]}
     asked: dict[str, Callable[[], Any]] = {}
@@ -500,6 +507,31 @@ def _hit_curve(
     if as_published:
         more["as_published"] = asdict(fit_as_published(trials))
     return PodCurve(fit=fit, table=table, more=plain(more), warnings=tuple(warnings))
+
+
+@contextmanager
+def _naming_far_sizes(**tables: PodTable) -> Iterator[None]:
+    """Where a fit fails and one size of a table lies far from all others, the error names its row."""
+    try:
+        yield
+    except FitError:
+        for name, table in tables.items():
+            told = _far_size(table)
+            if told:
+                raise FitError(f"no curve fits the {name.replace('_', ' ')}: {told}") from None
+        raise
+
+
+def _far_size(table: PodTable) -> str:
+    """The size that is farther from the nearest other one than `_FAR` times the range of these, in words; empty: none."""
+    import numpy as np
+
+    size = np.sort(table.size)
+    for far, others in ((size[-1], size[size < size[-1]]), (size[0], size[size > size[0]])):
+        if len(others) > 1 and np.abs(others - far).min() > _FAR * np.ptp(others) > 0:
+            row = int(np.flatnonzero(table.size == far)[0]) + 1
+            return f"the size {far:g} in row {row} lies far from all others, {others[0]:g} to {others[-1]:g}; check it"
+    return ""
 
 
 def _lapse(trials: "Trials", fit: "PodFit", *, ceiling: bool, floor: bool, warnings: list[str]) -> dict[str, Any]:
@@ -729,7 +761,7 @@ def compare(
     from ..pod.pairing import paired_trials
 
     columns = {"size": size, "hit": hit, "trials": trials, "site": site, "where": where}
-    tables = [_read(table, **columns) for table in (first, second)]
+    tables = [_of_hits(name, table, columns) for name, table in (("first", first), ("second", second))]
     if tables[0].size_name != tables[1].size_name:
         raise InputError(
             "size",
@@ -745,18 +777,19 @@ def compare(
         usual = "crossed" if chosen == {"crossed"} else "pooled"
         repeats = _agreed("repeats", None, [fit.repeats for fit in fits], usual)
     coded, shared = paired_trials(tables, log_size=on_log_size)
-    found = compare_pod(
-        coded[0],
-        coded[1],
-        link=link,
-        log_size=on_log_size,
-        method=method or "auto",
-        repeats=repeats,
-        margin=margin,
-        size_margin=size_margin,
-        shared_images=shared["image"] and not unpaired,
-        shared_networks=shared["network"] and not unpaired,
-    )
+    with _naming_far_sizes(first_table=tables[0], second_table=tables[1]):
+        found = compare_pod(
+            coded[0],
+            coded[1],
+            link=link,
+            log_size=on_log_size,
+            method=method or "auto",
+            repeats=repeats,
+            margin=margin,
+            size_margin=size_margin,
+            shared_images=shared["image"] and not unpaired,
+            shared_networks=shared["network"] and not unpaired,
+        )
     return PodComparison(
         comparison=found,
         size_name=tables[0].size_name,
@@ -764,6 +797,22 @@ def compare(
         warnings=(*(note for table in tables for note in table.notes), *found.warnings),
         names=_names(first, second),
     )
+
+
+def _of_hits(name: str, table: "TableLike", columns: Mapping[str, Any]) -> PodTable:
+    """A table that can be compared: of hits and misses, or of counts of them."""
+    try:
+        read = _read(table, **columns)
+    except HitError as error:
+        raise InputError(
+            error.argument,
+            received=error.received,
+            expected=error.expected,
+            remedy=f"name the column of trials (trials, --trials) where these are counts of hits; {_NO_RESPONSES}",
+        ) from None
+    if read.response is not None:
+        raise InputError(name, received="a continuous response", expected="hits and misses", remedy=_NO_RESPONSES)
+    return read
 
 
 def _agreed(name: str, given: Any, of_fits: Sequence[Any], usual: Any) -> Any:
@@ -831,13 +880,20 @@ def plan(
     if images is not None:
         sizes = recommended_sizes(assumed, images, networks=networks)
         expected = expected_precision(assumed, sizes, networks=networks)
-        return PodPlan(assumed=assumed, networks=networks, images=images, expected=expected, sizes=sizes)
+        return PodPlan(
+            assumed=assumed,
+            networks=networks,
+            images=images,
+            expected=expected,
+            sizes=sizes,
+            warnings=_warnings_of_few(images),
+        )
     found: Plan = plan_pod(assumed, wanted_over_a90=wanted, networks=networks)
-    warnings: tuple[str, ...] = ()
+    warnings = _warnings_of_few(found.images)
     if found.images is None:
         warnings = (
-            f"{networks} networks leave a90/95 at {found.limit_over_a90:.3g} a90 whatever the number of images:"
-            f" it takes at least {found.fewest_networks} networks",
+            f"a90/95 stays at {found.limit_over_a90:.3g} a90 with {counted(networks, 'network')}, whatever the number of images:"
+            f" it takes at least {counted(found.fewest_networks, 'network')}",
         )
     return PodPlan(
         assumed=assumed,
@@ -849,6 +905,16 @@ def plan(
         limit_over_a90=found.limit_over_a90,
         fewest_networks=found.fewest_networks,
         warnings=warnings,
+    )
+
+
+def _warnings_of_few(images: int | None) -> tuple[str, ...]:
+    from ..pod.planning import FEW_TRIALS
+
+    if images is None or images >= FEW_TRIALS:
+        return ()
+    return (
+        f"the plan is for large samples: with {images} images, fewer than some {FEW_TRIALS}, expect a longer interval",
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FileFormatError, InputError
-from ..results import Result, Table, axes_or_new, frame, plain
+from ..results import Result, Table, axes_or_new, counted, frame, plain
 from ._given import PathLike, as_twin, dataset_of, twin_sha256, whole_seed
 from ._progress import Progress, Telling
 
@@ -183,7 +183,7 @@ class TrainedNetworks(Result):
         )
         header = ("network", "best epoch", "validation loss", "objects detected", "false alarms")
         notes = tuple(f"note: {text}" for text in self.warnings)
-        return Table(title=f"{len(rows)} networks in {self.path}", header=header, rows=rows, notes=notes)
+        return Table(title=f"{counted(len(rows), 'network')} in {self.path}", header=header, rows=rows, notes=notes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -242,7 +242,7 @@ class Detections(Result):
 
     def _table(self) -> Table:
         rows = tuple((label, *_rate_cells(self.rates[name])) for name, label in _RATES.items())
-        title = f"{len(self.networks)} networks on {len({row.image for row in self.rows})} images"
+        title = f"{counted(len(self.networks), 'network')} on {counted(len({row.image for row in self.rows}), 'image')}"
         notes = tuple(f"note: {text}" for text in self.warnings)
         return Table(title=title, header=("", "value", "95 % interval", "trials"), rows=rows, notes=notes)
 

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import FileFormatError, InputError
 from ._given import PathLike, as_any_twin, dataset_of
 from .curves import PodCurve, fit_pod, is_response
 from .images import GeneratedPairs
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from ..generator.predictions.tube_twin import TubeTwin
 
 _EXPECTED = "a twin, a validation, a POD curve, generated pairs, a dataset, a diagnosis, or the file of a twin, a dataset or hits"
+
+_ANSWER = "diagnosis.json"
 
 
 def report(
@@ -84,8 +86,10 @@ def _page_of(result: Any) -> Any:
     if isinstance(result, GeneratedPairs):
         return _pairs_page(result)
     is_file = isinstance(result, str | os.PathLike)
+    if is_file:
+        _refuse_diagnosis(Path(result))
     if is_file and Path(result).suffix.lower() == ".csv":
-        return _pod_page(fit_pod(result))
+        return _pod_page(_curve_of_hits(result))
     if isinstance(result, dataset_io.Dataset) or (is_file and format_of_file(result) == dataset_io.FORMAT):
         from ..campaign.dataset_page import dataset_page
 
@@ -96,6 +100,32 @@ def _page_of(result: Any) -> Any:
 
         return twin_page(as_any_twin(result))
     raise InputError("result", received=type(result).__name__, expected=_EXPECTED)
+
+
+def _refuse_diagnosis(place: Path) -> None:
+    """A diagnosis on disk has its page beside it; the answer alone does not hold what the page shows."""
+    answer = place / _ANSWER if place.is_dir() else place
+    if answer.name == _ANSWER and answer.is_file():
+        raise InputError(
+            str(place),
+            received="an answer of `raytwin diagnose`",
+            expected=_EXPECTED,
+            remedy=f"`raytwin diagnose` wrote its page already: {answer.with_name('report.html')}",
+        )
+
+
+def _curve_of_hits(path: PathLike) -> PodCurve:
+    try:
+        return fit_pod(path)
+    except FileFormatError:
+        raise
+    except InputError as error:
+        raise InputError(
+            error.argument,
+            received=error.received,
+            expected=error.expected,
+            remedy="a page of another column, of counts of hits or of a response: `raytwin pod TABLE.csv --report PAGE.html`",
+        ) from None
 
 
 def _pod_page(curve: PodCurve) -> Any:

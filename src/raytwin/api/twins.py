@@ -1,6 +1,7 @@
 """The twin of a line: calibrated from measured series, read from a file, asked for flatfields, compared with measured ones."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -110,7 +111,8 @@ def calibrate(
     provenance = {"raytwin_version": __version__, "seed": seed if isinstance(seed, int) else "a generator"}
     for name, path in (("output_table", output_table), ("transmission", transmission)):
         if path is not None:
-            provenance[f"{name}_sha256"] = sha256_of_file(path)
+            with suppress(OSError):  # the table's reader says what is wrong with such a file
+                provenance[f"{name}_sha256"] = sha256_of_file(path)
     if acquisition is None:
         if output_table is None and transmission is None:
             raise InputError(

@@ -14,4 +14,4 @@ def twin_file(text: str) -> Path:
     try:
         return twin_path(text)
     except InputError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+        raise argparse.ArgumentTypeError(str(error).removeprefix("twin: ")) from None

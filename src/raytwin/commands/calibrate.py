@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..results import counted
 from ._answer import answer, say
 
 if TYPE_CHECKING:
@@ -168,7 +169,8 @@ def _table_lines(evidence: dict[str, Any]) -> list[str]:
     output = evidence.get("output_table")
     if output is not None:
         lines.append(
-            f"dose table          {output['rows']} rows, {len(output['settings'])} settings; a reading scatters by"
+            f"dose table          {counted(output['rows'], 'row')}, {counted(len(output['settings']), 'setting')};"
+            f" a reading scatters by"
             f" {output['scatter_percent']:.2g} % ({output['repeats']} repeats)"
         )
     for name, title in (("output_table", "kerma, departure"), ("transmission_table", "transmission, dep.")):

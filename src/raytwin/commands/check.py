@@ -8,7 +8,6 @@ calibration or stop it.
 import argparse
 import shutil
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ._answer import answer, say
@@ -27,7 +26,7 @@ _MARKS = {"error": "ERROR  ", "warning": "warning", "note": "note   "}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `raytwin check`."""
-    parser.add_argument("path", metavar="ACQ|FOLDER|TWIN", type=Path, help="acquisition file, folder or twin")
+    parser.add_argument("path", metavar="ACQ|FOLDER|TWIN", help="acquisition file, folder or twin")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
 

@@ -9,6 +9,7 @@ per network and image: contrast, size_mm, hit, network, image, foreign_object, s
 import argparse
 from typing import TYPE_CHECKING
 
+from ..results import counted
 from ._answer import answer, say
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     answer(
         found.to_dict(),
         as_json=arguments.json,
-        text=f"{arguments.output}: {len(found.rows)} lines, {len(found.networks)} networks\n"
+        text=f"{arguments.output}: {len(found.rows)} lines, {counted(len(found.networks), 'network')}\n"
         f"recall of the objects' pixels  {_text(rates['recall'])}\n"
         f"objects detected               {_text(rates['hit_rate'])}\n"
         f"false alarms                   {_text(rates['false_alarm_rate'])}",

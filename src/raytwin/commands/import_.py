@@ -19,7 +19,9 @@ from dataclasses import asdict
 from typing import Any
 
 from ..errors import InputError
+from ..results import counted
 from ._answer import answer, say
+from ._twin_file import HELP
 
 EXAMPLE = """examples:
   raytwin import emva1288 measured/emva_ccd -o ccd.h5
@@ -77,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
             layout.add_argument("--test", type=float, metavar="SHARE", help="share of products for testing")
             layout.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the split (default 0)")
-            layout.add_argument("--twin", metavar="TWIN", help="replace the bad pixels that this twin knows")
+            layout.add_argument("--twin", metavar="TWIN", help=f"replace the bad pixels that this twin knows: {HELP}")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -162,9 +164,9 @@ def _import(arguments: argparse.Namespace) -> Any:
 
 
 def _bad_pixels(twin: str) -> Any:
-    from ..generator.twins.twin_io import read_twin
+    from ..api._given import as_twin
 
-    return read_twin(twin).maps.bad_pixels > 0
+    return as_twin(twin).maps.bad_pixels > 0
 
 
 def _positive(value: float | None, name: str, unit: str) -> float | None:
@@ -192,7 +194,9 @@ class _Bar:
 
 def _text(result: dict[str, Any]) -> str:
     read = result["read"]
-    lines = [f"{result['written']}: {result['format']} file, {result['frames']} frames from {result['source']}"]
+    lines = [
+        f"{result['written']}: {result['format']} file, {counted(result['frames'], 'frame')} from {result['source']}"
+    ]
     for entry in read[:_SHOWN]:
         words = [f"{key} {value}" for key, value in entry.items() if value not in (None, "", ())]
         lines.append("  " + ", ".join(words))

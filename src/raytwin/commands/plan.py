@@ -9,6 +9,7 @@ import argparse
 from typing import Any
 
 from ..api.curves import plan
+from ..results import counted
 from ._answer import answer, say
 from ._pod_answer import shown
 
@@ -64,7 +65,7 @@ def _text(result: dict[str, Any]) -> str:
     ]
     if result["images"] is None:
         return lines[0]
-    lines.append(f"{result['networks']} networks, {result['images']} images with one foreign object each")
+    lines.append(f"{counted(result['networks'], 'network')}, {result['images']} images with one foreign object each")
     expected = result["expected"]
     if expected is not None:
         a90 = curve["a90"]

@@ -11,6 +11,7 @@ sees the same noise twice.
 import argparse
 from typing import TYPE_CHECKING
 
+from ..results import counted
 from ._answer import answer, say
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     answer(
         found.to_dict(),
         as_json=arguments.json,
-        text=f"{arguments.output}: {len(found.networks)} networks\n" + "\n".join(map(_line, found.networks)),
+        text=f"{arguments.output}: {counted(len(found.networks), 'network')}\n" + "\n".join(map(_line, found.networks)),
     )
     return 0
 

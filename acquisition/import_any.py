@@ -17,7 +17,7 @@ from .import_report import ImportReport
 
 _NEXUS_ENDINGS = (".nxs", ".nx", ".nexus")
 _MOST_GROUPS = 24
-_DARK_WORDS = re.compile(r"dark|^di\d|off|bias|black", re.I)
+_DARK_WORDS = re.compile(r"dark|^di\d|offset|(?<![a-z])off(?![a-z])|bias|black", re.I)
 _STATED = re.compile(r"(?<![A-Za-z0-9.])(\d+(?:\.\d+)?) ?(kV|W|mA|ms)(?![A-Za-z0-9])", re.I)
 _WORD_OF_UNIT = {"kv": "kv", "w": "power_w", "ma": "current_ma", "ms": "exposure_ms"}
 _UNSURE = "?"

@@ -23,7 +23,7 @@ from ..files import given_path
 from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
 from ..generator.twins.twin_io import FORMAT as TWIN_FORMAT
 from ..generator.twins.twin_io import read_any_twin
-from ..results import Result, Table, frame, plain
+from ..results import Result, Table, counted, frame, plain
 from . import frame_signs
 from .findings import Finding, FindingCode, Severity
 from .frame_checks import LEVEL_CHANGE, SceneChange
@@ -862,7 +862,7 @@ def _allows(
     add(
         "reference images for two energies",
         bool(images),
-        f"{len(images)} pairs" if images else "no object measured at two tube voltages with a `scene`",
+        counted(len(images), "pair") if images else "no object measured at two tube voltages with a `scene`",
     )
     afterglow = serving(LAG)
     add("lag", bool(afterglow), names(afterglow) or "no afterglow series (beam off straight after exposure)")

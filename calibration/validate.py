@@ -20,7 +20,7 @@ from ..generator.frames.present_line import present_line
 from ..generator.line.measured_flats import measured_flats
 from ..generator.line.twin import Estimate, Twin
 from ..generator.predictions.predict import predict_flatfield
-from ..results import Result, Table, axes_or_new, frame, plain
+from ..results import Result, Table, axes_or_new, counted, frame, plain
 from .frame_sums import effective_frames, sum_frames
 from .wedges import measure_transmissions, predict_transmission, transmissions_of_evidence
 
@@ -190,7 +190,9 @@ class Validation(Result):
             )
             for row in self.rows
         ]
-        title = f"{len(self.rows)} flats and {len(self.wedges)} steps of wedges against predictions"
+        title = (
+            f"{counted(len(self.rows), 'flat')} and {counted(len(self.wedges), 'step')} of wedges against predictions"
+        )
         notes = [f"skipped: {line}" for line in self.skipped]
         if self.rows:
             found = _summary(self.rows)

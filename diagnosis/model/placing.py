@@ -28,6 +28,8 @@ from .point_maps import sampled_at_points
 
 SHARP_SCENES = ("edge", "disc")  # drawn true to their outline; steps of wedges and products only to their maps' pixels
 _Blur = Callable[[Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float64]]]
+_PLACEMENTS = 2  # rounds in which a scene is drawn where it was found to lie
+_CLOSER = 0.5  # of the displacement: what a round may add to it
 # an edge that is smeared over many pixels: lengths of boxes along the belt, and standard deviations, px; a wedge that moved by 15 px
 # was found 1.5 px from where it lies with a box of that length
 _BOXES_PX = (5, 7, 9, 11, 13, 15, 17, 21, 25, 31, 37)
@@ -173,9 +175,9 @@ def _placement(
     else:
         # steps of many heights: their places are told by slopes, not by what is left, which other things make as well
         found, blur = _smeared(members, seen, pictured, noises, clean, found)
-        for _ in range(2):
+        for _ in range(_PLACEMENTS):
             rest = register(seen, blur(drawn((found.row_px, found.column_px))), noises, clean)
-            if math.hypot(rest.row_px, rest.column_px) > 0.5 * math.hypot(found.row_px, found.column_px):
+            if math.hypot(rest.row_px, rest.column_px) > _CLOSER * math.hypot(found.row_px, found.column_px):
                 break  # it leads away: something else is seen than a displacement
             found = replace(rest, row_px=found.row_px + rest.row_px, column_px=found.column_px + rest.column_px)
     # nowhere near its maps: compared as it is, and the gap says so

@@ -26,6 +26,7 @@ _WEAK = 0.05  # of what shows along the other direction
 _BEYOND_PX = 12  # of a picture's border that its splines hold
 _FAR_SHARES = ((4, 0.01), (12, 0.003))  # (pixels to each side, share)
 SHARP_PX = 0.3  # spread below which a picture's splines ring more than a displacement shows
+_DRAWN_ROUNDS = 6  # of drawing anew
 _DRAWN_STEP_PX, _DRAWN_ENOUGH_PX = (
     0.03,
     0.002,
@@ -263,7 +264,7 @@ def register_drawn(
     rest = fit.of(models)
     covariance: NDArray[np.float64] = np.eye(2)
     slopes: list[NDArray[np.float64]] = []
-    for _ in range(6):
+    for _ in range(_DRAWN_ROUNDS):
         if not slopes:
             moved = [drawn((float(at[0]), float(at[1]))) for at in current + _DRAWN_STEP_PX * np.eye(2)]
             slopes = [

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,12 +11,12 @@ from numpy.typing import NDArray
 
 from ..acquisition.instrument import Instrument
 from ..acquisition.setting import text_from_filters
-from ..errors import InputError
+from ..errors import FitError, InputError
 from ..generator.line.spectral_signal import OpenBeam, absorber_of_parameter
 from ..generator.line.twin import SpectralPosterior
 from ..generator.line.twin_spectrum import model_of_posterior
 from ..generator.predictions.tube_twin import NO_DETECTOR, NO_OUTPUT, TubeTwin
-from .dose_data import DOSIMETER_CALIBRATION, DOSIMETER_HARDNESS, KermaRatio, KermaReading
+from .dose_data import DOSE_FILTRATION, DOSIMETER_CALIBRATION, DOSIMETER_HARDNESS, KermaRatio, KermaReading
 from .output_table import OutputTable
 from .spectral_fit import SpectralFit, contradicts, fit_evidence, fit_spectrum, unlike_output
 from .transmission_table import TransmissionTable
@@ -29,8 +30,8 @@ _EFFICIENCY = 0.37
 _LEAST_TO_JUDGE = 4
 _MOST_STRAYS = 5  # one in so many: beyond, the table is not mostly right
 _RARE = 0.05
-_TRIED = 4  # without each of which the others are fitted: one that is far off bends the fit, and another departs more from it
-_OF_TUBE = ("inherent_filtration_mm_Al", "kV_error", "log_output", "log_mu_")
+_FILTRATION = "inherent_filtration_mm_Al"
+_OF_TUBE = (_FILTRATION, "kV_error", "log_output", "log_mu_")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,10 +139,15 @@ def fit_without_strays(
     warnings = list(data.notes)
     for _ in range(len(data.kermas) // _MOST_STRAYS + len(data.ratios) // _MOST_STRAYS):
         # what is wrong pulls the fit towards itself, and is judged by a fit that has not seen it
-        refits = [(item, _without(kept, item)) for item in _suspects(found, kept)]
-        if not refits:
+        tried: list[tuple[SpectralFit, DoseData, KermaReading | KermaRatio]] = []
+        for suspect in suspects(found, kept):
+            others = _without(kept, suspect)
+            with suppress(FitError):
+                tried.append((fit(others), others, suspect))
+                if not contradicts(tried[-1][0]):
+                    break
+        if not tried:
             break
-        tried = [(fit(others), others, item) for item, others in refits]
         refit, others, suspect = min(tried, key=lambda one: one[0].chi_square)
         departure = _stray(refit.posterior, others, suspect)
         if departure is None:
@@ -235,23 +241,37 @@ def departures(
     return np.array(read), np.array(behind)
 
 
-def _suspects(fit: SpectralFit, data: DoseData) -> list[KermaReading | KermaRatio]:
-    """Data that depart from a fit of all by what is rare among so many Gaussian ones, the farthest first, `_TRIED` at most.
+def suspects(fit: SpectralFit, data: DoseData) -> list[KermaReading | KermaRatio]:
+    """The datum that departs most from a fit of all, if so much is rare among so many Gaussian ones; none: an empty list.
 
-    All of the farthest, where they contradict the fit: a few that it bends to scatter as widely as the one that bends it.
+    Where the fit contradicts the data, that which departs most from a tube as it is expected comes first, a common factor aside: one
+    that is off by orders of magnitude bends the fit until another departs from it more.
     """
+    found = _farthest(fit.posterior, data, level_free=False)
+    if contradicts(fit):
+        names = fit.posterior.names
+        expected = np.where([name == _FILTRATION for name in names], DOSE_FILTRATION.centre, 0.0)
+        usual = replace(fit.posterior, samples=expected[None, :])
+        found = [*_farthest(usual, data, level_free=True), *found]
+    return list(dict.fromkeys(found))
+
+
+def _farthest(posterior: SpectralPosterior, data: DoseData, *, level_free: bool) -> list[KermaReading | KermaRatio]:
+    """The datum that departs most from what a posterior's draws expect, if it is rare; level_free: from the median departure."""
     from scipy.special import ndtri
 
-    limit = 0.0 if contradicts(fit) else 1.0
-    found: list[tuple[float, KermaReading | KermaRatio]] = []
+    worst: tuple[float, list[KermaReading | KermaRatio]] = (1.0, [])
     kinds: tuple[Sequence[KermaReading | KermaRatio], ...] = (data.kermas, data.ratios)
-    for items, departure in zip(kinds, departures(fit.posterior, data.kermas, data.ratios), strict=True):
+    for items, departure in zip(kinds, departures(posterior, data.kermas, data.ratios), strict=True):
         if len(items) <= _LEAST_TO_JUDGE:
             continue
         own = np.array([item.relative_sd for item in items])
-        size = np.abs(departure) / np.hypot(_scatter(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
-        found += [(float(one), item) for one, item in zip(size, items, strict=True) if one > limit]
-    return [item for _, item in sorted(found, key=lambda one: -one[0])[:_TRIED]]
+        size = np.abs(departure - (float(np.median(departure)) if level_free else 0.0))
+        size = size / np.hypot(_scatter(departure), own) / -float(ndtri(0.5 * _RARE / len(items)))
+        place = int(np.argmax(size))
+        if size[place] > worst[0]:
+            worst = (float(size[place]), [items[place]])
+    return worst[1]
 
 
 def _without(data: DoseData, left_out: KermaReading | KermaRatio) -> DoseData:

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from raytwin.acquisition.instrument import Instrument
 from raytwin.acquisition.setting import Filter, Setting, filters_from_text
 from raytwin.calibration.dose_data import KermaRatio, KermaReading
 from raytwin.calibration.output_table import read_output_table
-from raytwin.calibration.spectral_fit import fit_spectrum
+from raytwin.calibration.spectral_fit import SpectralFit, fit_spectrum
 from raytwin.calibration.transmission_table import read_transmission_table
-from raytwin.calibration.tube import calibrate_tube, predict_ratio
+from raytwin.calibration.tube import calibrate_tube, departures, dose_data, predict_ratio, suspects
 from raytwin.cli import main
 from raytwin.errors import InputError
 from raytwin.generator.line.spectral_signal import KERMA_OUTPUT, OpenBeam, SpectralModel
@@ -239,8 +240,23 @@ def test_one_wrong_row_among_many_is_named_and_left_out(tmp_path):
     assert twin.spectral.interval("inherent_filtration_mm_Al").high < 4.0
 
 
-def test_a_reading_a_thousand_times_too_large_does_not_bend_the_fit_towards_itself(tmp_path):
-    """Another reading departs farther from the fit of all."""
+def test_a_reading_a_thousand_times_too_large_is_suspected_though_it_bends_the_fit(tube, tmp_path):
+    """A fit drawn towards it leaves another reading that departs farther."""
+    rows = dose_rows(SETTINGS)
+    rows[0] = (*rows[0][:4], f"{1000.0 * float(rows[0][4]):.6g}", 1)
+    data = dose_data(read_output_table(written(tmp_path / "doses.csv", HEADER, rows)), None)
+    bent = tube.spectral.samples.copy()
+    bent[:, tube.spectral.names.index("inherent_filtration_mm_Al")] = 1e-4
+    bent[:, tube.spectral.names.index("log_output")] = -1.05
+    posterior = replace(tube.spectral, samples=bent)
+    away = np.abs(departures(posterior, data.kermas, ())[0])
+    assert data.kermas[int(np.argmax(away))].rows != (2,)
+    fit = SpectralFit(posterior=posterior, effective_draws=900.0, chi_square=3500.0, data=6, discrepancy={})
+    assert suspects(fit, data)[0].rows == (2,)
+
+
+@pytest.mark.slow
+def test_a_reading_a_thousand_times_too_large_is_named_and_left_out(tmp_path):
     rows = dose_rows(SETTINGS)
     rows[0] = (*rows[0][:4], f"{1000.0 * float(rows[0][4]):.6g}", 1)
     twin = calibrate_tube(

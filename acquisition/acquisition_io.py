@@ -416,7 +416,7 @@ def _series(group: Any, name: str, *, path: str) -> Series:
     source_detector_mm = positive("source_detector_mm", "mm")
     setting = None
     if kV is not None and exposure_ms:
-        with _named(where):
+        with named(where):
             setting = Setting(
                 kV=kV,
                 exposure_ms=exposure_ms,
@@ -473,23 +473,22 @@ def _series(group: Any, name: str, *, path: str) -> Series:
 
 
 @contextmanager
-def _named(where: str) -> Iterator[None]:
-    """Errors of a setting or filter, told with the series they stand in."""
+def named(where: str, kind: type[InputError] = FileFormatError) -> Iterator[None]:
+    """Errors of a setting or a label are told with the file and series they stand in; kind: as which they are raised."""
     try:
         yield
     except FileFormatError:
         raise
     except InputError as error:
-        raise FileFormatError(
-            f"{where}, {error.argument}", received=error.received, expected=error.expected, remedy=error.remedy
-        ) from None
+        argument = error.argument if error.argument.startswith(where) else f"{where}, {error.argument}"
+        raise kind(argument, received=error.received, expected=error.expected, remedy=error.remedy) from None
 
 
 def _layers(node: Any, name: str, *, where: str) -> tuple[Filter, ...] | None:
     text = text_attribute(node, name, where=where)
     if text is None:
         return None
-    with _named(where):
+    with named(where):
         return filters_from_text(text)
 
 
@@ -585,7 +584,7 @@ def read_instrument(node: Any, *, path: str) -> Instrument:
     for name in BOOLEAN_FIELDS:
         if values[name] is not None:
             values[name] = bool(values[name])
-    with _named(path):
+    with named(path):
         return Instrument(**values)
 
 

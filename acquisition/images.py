@@ -55,7 +55,7 @@ ImageJ files; where both state it, the sidecar counts and the difference is told
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ from ._sidecar import (
     tables_of,
     text_of,
 )
-from .acquisition_io import AcquisitionWriter, SeriesWriter, write_acquisition
+from .acquisition_io import AcquisitionWriter, SeriesWriter, named, write_acquisition
 from .image_header import INSTRUMENT_WORDS, SETTING_WORDS, agreement, alike, read_image_header
 from .import_report import ImportReport, Skipped
 from .instrument import Instrument
@@ -338,18 +338,6 @@ def _places(folder: Path, table: Mapping[str, Any], number: int, *, where: str) 
         yield place, place.name, f"{place.name}_{suffix}"
 
 
-@contextmanager
-def _named(where: str) -> Iterator[None]:
-    """Errors in the block name the sidecar and the series."""
-    try:
-        yield
-    except FileFormatError:
-        raise
-    except InputError as error:
-        argument = error.argument if error.argument.startswith(where) else f"{where}, {error.argument}"
-        raise InputError(argument, received=error.received, expected=error.expected, remedy=error.remedy) from None
-
-
 def _write_series(
     writer: AcquisitionWriter, plan: _Plan, raw: RawLayout | None, used: _Used, notes: list[str]
 ) -> dict[str, Any]:
@@ -362,7 +350,7 @@ def _write_series(
     filter_text = text_of(table, "filter", where=where)
     if filter_text is not None:
         attributes["filters"] = filters_from_text(filter_text)
-    with _named(where):
+    with named(where, InputError):
         setting = None if setting_text is None else setting_from_text(setting_text)
     corrected = [word for word in (text_of(table, "corrected", where=where) or "").split("+") if word]
     if "corrected" not in table:
@@ -375,7 +363,7 @@ def _write_series(
         for image in iter_images(path, raw=raw):
             if series is None:
                 shape = (image.shape[0], image.shape[1])
-                with _named(where):
+                with named(where, InputError):
                     series = writer.add_series(
                         plan.name,
                         kind=text_of(table, "kind", where=where) or "",

@@ -97,6 +97,8 @@ OTHER_SCINTILLATOR = (Filter(material="Gd2O2S@7.32", thickness_mm=0.15),)
 class SpectralFit:
     """Posterior and how well it was drawn: effective sample size of the last round, chi-square at the best point.
 
+    Draws of a posterior that contradicts its data are spread out, see `_spread_out`.
+
     discrepancy: median and 95 % interval of the learned relative sd of a level and of a gain beyond the parameters. output: the
     tube's over the model's, where it is so far from 1 that labels must be wrong and nothing else was learnt from it; None elsewhere.
     """
@@ -111,7 +113,11 @@ class SpectralFit:
 
 def contradicts(fit: SpectralFit) -> bool:
     """Whether the data lie farther from the best point than their noise allows, by four standard deviations of chi-square."""
-    return fit.chi_square > fit.data + 4 * math.sqrt(2 * fit.data)
+    return _too_far(fit.chi_square, fit.data)
+
+
+def _too_far(chi_square: float, data: int) -> bool:
+    return chi_square > data + 4 * math.sqrt(2 * data)
 
 
 def unlike_output(fit: SpectralFit) -> list[str]:
@@ -389,9 +395,14 @@ def fit_spectrum(
         # believed, a slip of units would be made up for by the spectrum
         other, found = sampled(priors | {_OUTPUT: UNLIKE_OUTPUT})
         logarithm = found[1][:, place]
-        if abs(float(np.mean(logarithm))) > _UNLIKE * math.hypot(float(np.std(logarithm)), believed.sd):
+        away = abs(float(np.mean(logarithm))) / math.hypot(float(np.std(logarithm)), believed.sd)
+        # a slip of the output alone leaves data that agree
+        if away > _UNLIKE and not _too_far(other.chi_square(found[0]), len(data)):
             posterior, (best, samples, discrepancies, effective) = other, found
             output, priors = math.exp(float(np.median(logarithm))), priors | {_OUTPUT: UNLIKE_OUTPUT}
+    chi_square = posterior.chi_square(best)
+    if _too_far(chi_square, len(data)):
+        samples = _spread_out(samples, math.sqrt(chi_square / len(data)), [priors[name] for name in model.names])
     names = model.names
     voltages = [level.kV or 0.0 for level in known] or [kV for kV, _ in read]
     measured = [level.filters for level in known] or [filters for _, filters in read]
@@ -419,7 +430,7 @@ def fit_spectrum(
             calibrated_filters=tuple(sorted({text_from_filters(filters) for filters in measured})),
         ),
         effective_draws=effective,
-        chi_square=posterior.chi_square(best),
+        chi_square=chi_square,
         data=len(data),
         discrepancy={
             name: tuple(float(value) for value in np.quantile(draws, [0.5, 0.025, 0.975]))  # type: ignore[misc]
@@ -427,6 +438,19 @@ def fit_spectrum(
         },
         output=output,
     )
+
+
+def _spread_out(samples: NDArray[np.float64], ratio: float, priors: Sequence[Prior]) -> NDArray[np.float64]:
+    """Draws (draw, parameter) spread about their means by a Birge ratio, no parameter wider than its prior or beyond its bounds.
+
+    Data that contradict a model are taken to err by so much more than they state, all alike.
+
+    Source: Birge (1932), doi:10.1103/PhysRev.40.207; ratio: sqrt(chi-square / number of data).
+    """
+    middle, sd = samples.mean(axis=0), samples.std(axis=0)
+    most = np.array([prior.spread for prior in priors]) / np.maximum(sd, 1e-300)
+    wider = middle + (samples - middle) * np.clip(most, 1.0, ratio)
+    return np.asarray(np.clip(wider, [prior.low for prior in priors], [prior.high for prior in priors]))
 
 
 def _shares(levels: Sequence[Level], noise: NoiseModel | None) -> list[float]:

@@ -106,8 +106,8 @@ def calibrate_tube(
     warnings += unlike_output(found)
     if contradicts(found):
         warnings.append(
-            f"the tables do not fit any spectrum of this tube (chi-square {found.chi_square:.0f} for {found.data} data):"
-            " check kV, filters, loads and distances"
+            f"the tables do not fit any spectrum of this tube (chi-square {found.chi_square:.0f} for {found.data} data),"
+            " and intervals are widened for it: check kV, filters, loads and distances"
         )
     if not data.kermas:
         warnings.append(NO_OUTPUT)

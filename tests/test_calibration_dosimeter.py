@@ -255,6 +255,21 @@ def test_a_reading_a_thousand_times_too_large_is_suspected_though_it_bends_the_f
     assert suspects(fit, data)[0].rows == (2,)
 
 
+def test_two_wild_readings_that_nobody_can_tell_widen_the_intervals(tmp_path):
+    """One in five may be left out; a table that fits no spectrum all the same knows little."""
+    rows = dose_rows(SETTINGS)
+    for place in (0, 5):
+        rows[place] = (*rows[place][:4], f"{0.1 * float(rows[place][4]):.6g}", 1)
+    twin = calibrate_tube(
+        rng=np.random.default_rng(1), output=read_output_table(written(tmp_path / "doses.csv", HEADER, rows))
+    )
+    assert any("do not fit any spectrum" in text and "intervals are widened" in text for text in twin.warnings)
+    assert not any(text.startswith("output is") for text in twin.warnings)
+    filtration = twin.spectral.interval("inherent_filtration_mm_Al")
+    assert filtration.low <= FILTRATION_MM_AL <= filtration.high
+    assert filtration.low >= 0.0
+
+
 @pytest.mark.slow
 def test_a_reading_a_thousand_times_too_large_is_named_and_left_out(tmp_path):
     rows = dose_rows(SETTINGS)

@@ -12,6 +12,7 @@ from ._projection_loops import REACH, weigh_template
 from .probes import ProbeName
 from .registration import gradient
 
+_INDEPENDENT = 1e-3  # share of a template's square that those before it must leave
 _LEAST_NORM = 1e-6  # standard deviations that a template stands for; below it is rounding
 
 
@@ -61,7 +62,7 @@ class MapProjection:
         columns: list[NDArray[np.float64]] = []
         for number in range(len(used)):
             rest = float(left[number, number])
-            if rest > 1e-3 * own[number]:
+            if rest > _INDEPENDENT * own[number]:
                 chosen.append(number)
                 columns.append(left[number] / math.sqrt(rest))
                 left -= np.outer(columns[-1], columns[-1])

@@ -51,6 +51,39 @@ def test_the_hidden_truth_lies_within_four_standard_deviations_of_every_answer(s
             assert level[name] == pytest.approx(exact[name], rel=0.05)
 
 
+def _exposures_in_s(file):
+    for series in file["series"].values():
+        if series.attrs["kind"] == "flat":
+            series.attrs["exposure_ms"] /= 1000.0
+
+
+def _pitch_in_um(file):
+    file["instrument"].attrs["pixel_mm"] *= 1000.0
+
+
+def _powers_times_4(file):
+    for series in file["series"].values():
+        if "power_W" in series.attrs:
+            series.attrs["power_W"] *= 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("slip", "output"), [(_exposures_in_s, 1000.0), (_pitch_in_um, 1e-6), (_powers_times_4, 0.25)])
+def test_labels_of_another_unit_are_named_and_bend_no_filtration_of_a_lab_line(session, tmp_path, slip, output):
+    path = tmp_path / "slipped.h5"
+    shutil.copy(session["path"], path)
+    with h5py.File(path, "r+") as file:
+        slip(file)
+    with open_acquisition(path) as acquisition:
+        twin = calibrate_twin(acquisition, rng=np.random.default_rng(1), advise=False)
+    (told,) = [text for text in twin.warnings if text.startswith("output is")]
+    truth = session["truth"]
+    assert float(told.split()[2]) == pytest.approx(output * truth["flux_scale"], rel=0.4)
+    assert not any(text.startswith("output is") for text in session["twin"].warnings)
+    found = twin.spectral.interval("inherent_filtration_mm_Al")
+    assert found.low <= truth["inherent_filtration_mm_Al"] <= found.high
+
+
 def test_the_lab_s_bad_pixels_are_found_and_few_others(session):
     marked = session["twin"].maps.bad_pixels > 0
     for pixel in session["truth"]["bad_pixels"]:

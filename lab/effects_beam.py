@@ -229,19 +229,26 @@ def _focal_spot(request: Asked, site: Site) -> Planted:
 
 
 def _off_focal(request: Asked, site: Site) -> Planted:
+    from scipy.ndimage import shift
+
     share, radius_mm = request.strength / 100.0, float(site.rng.uniform(5.0, 12.0))
+    # the spot lies anywhere from the middle of what else is struck to its rim
+    aside_mm, towards = radius_mm * float(site.rng.uniform(0.0, 1.0)), float(site.rng.uniform(0.0, 2.0 * math.pi))
 
     def second_source(rates: FineRates, exposure: Exposure) -> FineRates:
         if not exposure.scene:
             return rates
         system = exposure.system
-        wide_px = radius_mm * (system.magnification - 1.0) / system.pixel_mm
+        px_per_mm = (system.magnification - 1.0) / system.pixel_mm
+        wide_px, aside_px = radius_mm * px_per_mm, aside_mm * px_per_mm
+        away_px = aside_px * math.cos(towards), aside_px * math.sin(towards)
         spelled = rates.spelled_out()
         out = np.empty_like(spelled)
         for number in range(spelled.shape[2]):
             plane = np.ascontiguousarray(spelled[:, :, number])
             blocks = plane.reshape(plane.shape[0] // SUBPIXELS, SUBPIXELS, plane.shape[1] // SUBPIXELS, SUBPIXELS)
             wide = mixed_gaussians(blocks.mean(axis=(1, 3)), ((0.5, 0.35 * wide_px), (0.5, 0.8 * wide_px)))
+            wide = shift(wide, away_px, order=1, mode="nearest")
             smooth = np.repeat(np.repeat(wide, SUBPIXELS, axis=0), SUBPIXELS, axis=1)
             out[:, :, number] = np.float32(1.0 - share) * plane + np.float32(share) * smooth
         return rates_of_map(out, rates)
@@ -249,7 +256,7 @@ def _off_focal(request: Asked, site: Site) -> Planted:
     return _told(
         request,
         "a share of the photons comes from a wide spot around the focus",
-        {"radius_mm": radius_mm},
+        {"radius_mm": radius_mm, "aside_mm": aside_mm, "towards_rad": towards},
         rates=second_source,
     )
 

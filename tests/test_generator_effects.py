@@ -1429,14 +1429,30 @@ def test_only_counters_lose_counts(series_line):
 
 
 @pytest.mark.parametrize(
-    ("peakedness", "source_object_mm"), [(0.0, 990.0), (0.5, 850.0), (1.0, 990.0), (-1.0 / 3.0, 850.0), (-0.5, 850.0)]
+    ("peakedness", "source_object_mm", "aside_mm", "turned_deg"),
+    [
+        (0.0, 990.0, (0.0, 0.0), 0.0),
+        (0.5, 990.0, (3.0, -4.0), 0.0),
+        (1.0, 990.0, (0.0, 0.0), 0.0),
+        (1.0, 990.0, (0.0, 5.0), 180.0),
+        (0.0, 850.0, (5.0, 2.0), 90.0),
+        (-1.0 / 3.0, 850.0, (0.0, 3.0), 0.0),
+        (-0.5, 850.0, (0.0, 0.0), 0.0),
+    ],
 )
-def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_line, peakedness, source_object_mm):
+def test_off_focal_radiation_throws_the_shadows_of_many_source_points(
+    series_line, peakedness, source_object_mm, aside_mm, turned_deg
+):
     """Points are drawn on the source and shadows thrown one by one; no transfer function is used."""
     strength, width_mm, count = 15.0, 3.0, 4_000_000
-    effect = applied("off_focal", strength, width_mm=width_mm, peakedness=peakedness)
+    down_mm, right_mm = aside_mm
+    effect = applied(
+        "off_focal", strength, width_mm=width_mm, peakedness=peakedness, down_mm=down_mm, right_mm=right_mm
+    )
+    # what lies to the right of an upright panel lies to the left of one turned by 180 degrees
+    across_mm = {0.0: right_mm, 90.0: -down_mm, 180.0: -right_mm}[turned_deg]
     plate = {"Al": np.where(np.arange(40) < 20, 30.0, 0.0) * np.ones((40, 1))}
-    asked = request("object", thickness_mm=plate, source_object_mm=source_object_mm)
+    asked = request("object", thickness_mm=plate, source_object_mm=source_object_mm, panel_rotation_deg=turned_deg)
     found, sharp = expect(series_line, asked, effect), expect(series_line, asked)
     even = series_line.level_nearest(asked.setting).flat_shape
     known, plain = ((one.signal_DN / even).mean(axis=0) for one in (found, sharp))
@@ -1444,13 +1460,13 @@ def test_off_focal_radiation_throws_the_shadows_of_many_source_points(series_lin
     if peakedness < 0.0:
         # an even disc, or its rim alone: of such radii that the standard deviation along a line is the width
         radius = 2.0 * np.sqrt(rng.random(count)) if peakedness > -0.4 else math.sqrt(2.0)
-        along = radius * np.cos(2.0 * math.pi * rng.random(count))
+        along = width_mm * radius * np.cos(2.0 * math.pi * rng.random(count)) + across_mm
     else:
-        # Gaussians of variances that differ fall from a peak with a long tail
-        size = np.sqrt(rng.gamma(1.0 / peakedness, peakedness, count)) if peakedness else 1.0
-        along = size * rng.standard_normal(count)
-    place_mm = width_mm * along * (rng.random(count) < strength / 100.0)
-    border = 20.0 - (1059.0 / source_object_mm - 1.0) / series_line.instrument.pixel_mm * place_mm
+        # Gaussians of variances that differ fall from a peak with a long tail; the wider ones lie farther aside
+        size = rng.gamma(1.0 / peakedness, peakedness, count) if peakedness else np.ones(count)
+        along = width_mm * np.sqrt(size) * rng.standard_normal(count) + across_mm * size
+    place_mm = along * (rng.random(count) < strength / 100.0)
+    border = 20.0 + (1059.0 / source_object_mm - 1.0) / series_line.instrument.pixel_mm * place_mm
     column, luck = rng.uniform(0.0, 40.0, count), rng.random(count)
     landed = column + series_line.noise.spread.value.sigma_px * rng.standard_normal(count)
     passed, before = (luck < np.where(column < side, plain.min() / plain.max(), 1.0) for side in (border, 20.0))

@@ -17,7 +17,7 @@ from ...acquisition.instrument import Instrument
 from ...acquisition.setting import Setting
 from ...errors import InputError
 from ..effects import AppliedEffect, effect_of, in_order
-from ..frames._spread import NoisePattern, noise_pattern, optical_transfer
+from ..frames._spread import NoisePattern, noise_pattern, object_transfer, optical_transfer
 from ..frames.flat_change import has_always_bent, is_in_noise
 from ..frames.light import Charge, charge_of, of_quanta
 from ..frames.response import light_of, responded
@@ -294,15 +294,13 @@ class ImageEffects:
 
         shape = before.shape[0], before.shape[1]
         f_row, f_column = np.arange(shape[0])[:, None] / (2.0 * shape[0]), np.arange(shape[1])[None] / (2.0 * shape[1])
-        ratio: FloatArray | None = None
+        ratio = object_transfer(state, f_row, f_column)
         if state.tails or state.optical_transfers:
             base = self.twin.noise.spread.value
             calibrated = base.transfer(f_row, f_column)
             # where the calibrated spread leaves nothing there is nothing to put elsewhere
-            ratio = optical_transfer(state, base, f_row, f_column) / np.maximum(calibrated, 1e-3)
-        for transfer in state.object_transfers:
-            part = transfer(f_row, f_column)
-            ratio = part if ratio is None else ratio * part
+            of_light = optical_transfer(state, base, f_row, f_column) / np.maximum(calibrated, 1e-3)
+            ratio = of_light if ratio is None else ratio * of_light
         after = state.signal_DN
         if ratio is not None:
             after = sampled_picture([(dctn(after, type=2), ratio)], shape, (0.0, 0.0), state.course_px)

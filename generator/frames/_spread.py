@@ -1,5 +1,6 @@
 """Blur and noise correlation of one series: transfer functions on cosine transforms, whose borders mirror."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -161,12 +162,20 @@ def _cosines(points: int, kept: int) -> NDArray[np.float64]:
     return np.asarray(2.0 * np.cos(np.pi / points * np.outer(np.arange(kept), np.arange(points) + 0.5)))
 
 
-def _object_transfer(state: LineState, f_row: FloatArray, f_column: FloatArray) -> FloatArray | None:
-    result: FloatArray | None = None
-    for factor in state.object_transfers:
-        part = factor(f_row, f_column)
-        result = part if result is None else result * part
-    return result
+def object_transfer(state: LineState, f_row: FloatArray, f_column: FloatArray) -> NDArray[np.inexact] | None:
+    """Transfer function (n, m) of what blurs what stands in the beam, None: nothing does.
+
+    Where a blur goes to one side it is complex, (2, n, m): at (f_row, f_column) and at (f_row, -f_column).
+    """
+    if not state.object_transfers:
+        return None
+
+    def product(f_column: FloatArray) -> NDArray[np.inexact]:
+        parts = [factor(f_row, f_column) for factor in state.object_transfers]
+        return np.asarray(math.prod(parts[1:], start=parts[0]))
+
+    found = product(f_column)
+    return np.stack(np.broadcast_arrays(found, product(-f_column))) if np.iscomplexobj(found) else found
 
 
 def spread_maps(
@@ -219,17 +228,17 @@ def spread_maps(
             blurred = blurred + drawn(rest, shape)
     else:
 
-        def transfer(counts: Sequence[int]) -> FloatArray:
-            def made() -> FloatArray:
+        def transfer(counts: Sequence[int]) -> NDArray[np.inexact]:
+            def made() -> NDArray[np.inexact]:
                 frequency = [fine_frequencies(length)[:count] for length, count in zip(shape, counts, strict=True)]
                 f_row, f_column = frequency[0][:, None], frequency[1][None, :]
                 whole = optical_transfer(state, spread, f_row, f_column)
-                blur = _object_transfer(state, f_row, f_column)
+                blur = object_transfer(state, f_row, f_column)
                 return whole if blur is None else whole * blur
 
             return np.asarray(made() if kept is None else kept((shape, *counts), made))
 
-        pictures: list[tuple[NDArray[np.floating], FloatArray]] = []
+        pictures: list[tuple[NDArray[np.floating], NDArray[np.inexact]]] = []
         if fine is not None:
             sharp = fine.scale * fine.fine.transform[: cosines[0], : cosines[1]]
             pictures.append((sharp, transfer(cosines)))
@@ -239,7 +248,7 @@ def spread_maps(
     radial_px, turn_px = state.distortion_px
     blurred = distorted(np.asarray(blurred, dtype=np.float64), radial_px=radial_px, turn_px=turn_px)
     f_row, f_column = _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :]
-    blur = _object_transfer(state, f_row, f_column)
+    blur = object_transfer(state, f_row, f_column)
     if draft:
         variance = (
             variance_DN2 if blur is None else sampled_picture([(dctn(variance_DN2, type=2), blur)], shape, (0.0, 0.0))
@@ -265,7 +274,7 @@ def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
     from scipy.fft import dctn
 
     shape = (signal.shape[0], signal.shape[1])
-    blur = _object_transfer(state, _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
+    blur = object_transfer(state, _frequencies(shape[0])[:, None], _frequencies(shape[1])[None, :])
     radial_px, turn_px = state.distortion_px
     spread = [
         distorted(
@@ -293,10 +302,10 @@ def from_beyond(state: LineState, spread: Spread) -> FloatArray:
     around = ((rows, rows), (columns, columns))
     more = np.pad(state.signal_DN, around, mode="edge") - np.pad(state.signal_DN, around, mode="symmetric")
     f_row, f_column = fftfreq(3 * rows)[:, None], rfftfreq(3 * columns)[None, :]
-    transfer = optical_transfer(state, spread, f_row, f_column)
-    blur = _object_transfer(state, f_row, f_column)
+    transfer: NDArray[np.inexact] = optical_transfer(state, spread, f_row, f_column)
+    blur = object_transfer(state, f_row, f_column)
     if blur is not None:
-        transfer = transfer * blur
+        transfer = transfer * (blur[0] if np.iscomplexobj(blur) else blur)
     transfer = transfer - spread.transfer(f_row, f_column)
     inside = np.s_[rows : 2 * rows, columns : 2 * columns]
     sides = (

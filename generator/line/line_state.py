@@ -44,6 +44,8 @@ STAGES = (
 FloatArray = NDArray[np.float64]
 # (cycles per pixel along rows (n, 1), along columns (1, m)) -> factor that broadcasts to (n, m); even in both
 Transfer = Callable[[FloatArray, FloatArray], FloatArray]
+# the same of a blur that may go to one side: complex then, of -f the conjugate
+SidedTransfer = Callable[[FloatArray, FloatArray], NDArray[np.inexact]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +192,7 @@ class LineState:
         shift_px: of the object against its thickness maps, along rows and columns.
         course_px: where it stands in turn along rows and along columns, from there, equally long; empty: it stays.
         distortion_px: rms displacement of an enlargement and of a counter-clockwise turn of the picture.
-        object_transfers: blur of what stands in the beam.
+        object_transfers: blur of what stands in the beam, to one side perhaps.
         optical_transfers: spread of light beyond the calibrated one, as factors on the picture's transfer function.
         tails: (weight, transfer) of light that takes another spread in place of the calibrated one.
         power_transfers: factors on the noise power that are not the square of a transfer function.
@@ -223,7 +225,7 @@ class LineState:
     shift_px: tuple[float, float] = (0.0, 0.0)
     course_px: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     distortion_px: tuple[float, float] = (0.0, 0.0)
-    object_transfers: tuple[Transfer, ...] = ()
+    object_transfers: tuple[SidedTransfer, ...] = ()
     optical_transfers: tuple[Transfer, ...] = ()
     tails: tuple[tuple[float, Transfer], ...] = ()
     power_transfers: tuple[Transfer, ...] = ()

@@ -228,7 +228,6 @@ def kept_cosines(along: FloatArray, least: float) -> int:
     return min(along.size, max(last, along.size // FINE) + 1)
 
 
-@lru_cache(maxsize=32)
 def cosines_at_pixels(
     length: int, points: int, count: int, shift_px: float, places_px: tuple[float, ...] = ()
 ) -> FloatArray:
@@ -237,13 +236,19 @@ def cosines_at_pixels(
     The picture is moved on by `shift_px` (and stands at `places_px` from there in turn), and mirrors at its borders. What no pixel
     can tell apart (frequencies beyond half a cycle a pixel) adds up.
     """
+    return _waves_at_pixels(length, points, count, shift_px, places_px)[0]
+
+
+@lru_cache(maxsize=32)
+def _waves_at_pixels(
+    length: int, points: int, count: int, shift_px: float, places_px: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """The same of each cosine, and of the sine of its frequency: (length, count) each."""
     scale = np.where(np.arange(count) == 0, 0.5, 1.0) / points
-    if not places_px:
-        angle = np.pi * np.outer((np.arange(length) + 0.5 - shift_px) / length, np.arange(count))
-        return np.asarray(np.cos(angle) * scale)
     even, odd = _moved(length, count, shift_px, places_px)
     angle = np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(count))
-    return np.asarray((np.cos(angle) * even + np.sin(angle) * odd) * scale)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return (cosine * even + sine * odd) * scale, (sine * even - cosine * odd) * scale
 
 
 def _moved(length: int, count: int, shift_px: float, places_px: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
@@ -301,7 +306,7 @@ def _fold(found: FloatArray, length: int, sign: float) -> FloatArray:
 
 
 def sampled_picture(
-    transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
+    transforms: Sequence[tuple[NDArray[np.floating], NDArray[np.inexact] | None]],
     shape: tuple[int, int],
     shift_px: tuple[float, float],
     course_px: tuple[tuple[float, ...], tuple[float, ...]] = ((), ()),
@@ -309,12 +314,14 @@ def sampled_picture(
     """Pixels (row, column) of the sum of pictures given by their cosine transforms, blurred and displaced.
 
     Args:
-        transforms: (the first amplitudes of a transform over pixels or cells, transfer function of its shape or None) each.
+        transforms: (the first amplitudes of a transform over pixels or cells, transfer function of its shape or None) each; of a
+            blur to one side it is complex (2, ...), with frequencies along columns as they are and reversed.
         shape: rows and columns of the pixels.
         shift_px: displacement along rows and columns.
         course_px: where the picture stands in turn along each, from there; empty: it stays.
     """
-    if max(shape) <= _MATRICES_TO_PX:
+    to_one_side = any(filters is not None and np.iscomplexobj(filters) for _, filters in transforms)
+    if to_one_side or max(shape) <= _MATRICES_TO_PX:
         return _sampled_by_matrices(transforms, shape, shift_px, course_px)
     from scipy.fft import idct, idst
 
@@ -339,17 +346,27 @@ def sampled_picture(
 
 
 def _sampled_by_matrices(
-    transforms: Sequence[tuple[NDArray[np.floating], FloatArray | None]],
+    transforms: Sequence[tuple[NDArray[np.floating], NDArray[np.inexact] | None]],
     shape: tuple[int, int],
     shift_px: tuple[float, float],
     course_px: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> FloatArray:
-    """`sampled_picture` as one product a side."""
+    """`sampled_picture` as products of matrices, one a side.
+
+    A blur with H = E - i O, E even and O odd in f, makes of cos(a) the wave E cos(a) + O sin(a). cos(a) cos(b) is half of
+    cos(a + b) and half of cos(a - b), so it becomes, with sums and differences of H at (f_row, f_column) and (f_row, -f_column),
+    1/2 [(E+ + E-) cos(a) cos(b) - (E+ - E-) sin(a) sin(b) + (O+ + O-) sin(a) cos(b) + (O+ - O-) cos(a) sin(b)].
+    """
     result = np.zeros(shape)
     for transform, filters in transforms:
-        rows, columns = (
-            cosines_at_pixels(length, length if count == length else FINE * length, count, shift, places)
+        (cosine_rows, sine_rows), (cosine_columns, sine_columns) = (
+            _waves_at_pixels(length, length if count == length else FINE * length, count, shift, places)
             for length, count, shift, places in zip(shape, transform.shape, shift_px, course_px, strict=True)
         )
-        result += rows @ (transform if filters is None else transform * filters) @ columns.T
+        if filters is None or not np.iscomplexobj(filters):
+            result += cosine_rows @ (transform if filters is None else transform * filters.real) @ cosine_columns.T
+            continue
+        alike, unlike = transform * (0.5 * (filters[0] + filters[1])), transform * (0.5 * (filters[0] - filters[1]))
+        result += (cosine_rows @ alike.real - sine_rows @ alike.imag) @ cosine_columns.T
+        result -= (sine_rows @ unlike.real + cosine_rows @ unlike.imag) @ sine_columns.T
     return result

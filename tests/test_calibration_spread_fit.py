@@ -46,8 +46,40 @@ SPREADS = {
 }
 
 
-@pytest.mark.parametrize("spread", SPREADS.values(), ids=SPREADS)
-def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(spread):
+def is_narrow(fit):
+    assert fit.spread.model == "aperture"
+    assert abs(fit.sigma_px - 0.4) < 4.0 * fit.sigma_sd_px < 0.05
+    # a weak tail may be as likely as none
+    assert fit.criteria["Gaussian, light collected in pixels"] < 10.0
+    assert fit.criteria["Gaussian, quanta counted in pixels"] > 100.0
+
+
+def is_counted(fit):
+    assert fit.spread.model == "sampled"
+
+
+def has_two_widths(fit):
+    assert abs(fit.spread.aspect - 1.25) < 4.0 * fit.spread_sd["aspect"]
+
+
+def has_a_clear_tail(fit):
+    assert fit.spread.tail_share > 0.3
+    assert fit.criteria["Gaussian, light collected in pixels"] > 100.0
+    # where there is nothing to be said against a tail, nothing without one is kept
+    assert all(item.value.tail_share > 0.2 for item in fit.others)
+
+
+FAMILIES = {
+    "narrow": is_narrow,
+    "counted in pixels": is_counted,
+    "two widths": has_two_widths,
+    "Lorentzian tail": has_a_clear_tail,
+}
+
+
+@pytest.mark.parametrize("name", SPREADS)
+def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(name):
+    spread = SPREADS[name]
     fit = fit_spread(powers(spread, seed=7), group=GROUPS)
     for place, gain in enumerate((8.0, 14.0)):
         assert abs(fit.gain_DN[place] - gain) < 4.0 * fit.gain_sd_DN[place]
@@ -58,6 +90,8 @@ def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(sp
     assert abs(fit.read_variance_DN2 - READ_DN2) < 4.0 * fit.read_sd_DN2
     assert fit.spread.variance_share == pytest.approx(spread.variance_share, rel=0.2)
     assert fit.chi_square < 1.6 * fit.degrees
+    # the family follows the evidence; of short tails frames of this size leave the form open
+    FAMILIES.get(name, lambda fit: None)(fit)
 
 
 def test_a_series_with_the_noise_of_averages_widens_what_it_spoils():
@@ -92,19 +126,6 @@ def test_interference_in_the_electronics_is_noise_of_the_darks_and_no_reason_to_
     assert fit.chi_square < 2.0 * fit.degrees
 
 
-def test_the_family_follows_the_evidence():
-    narrow = fit_spread(powers(SPREADS["narrow"]), group=GROUPS)
-    assert narrow.spread.separable and narrow.spread.model == "aperture"
-    assert abs(narrow.sigma_px - 0.4) < 4.0 * narrow.sigma_sd_px < 0.05
-    counted = fit_spread(powers(SPREADS["counted in pixels"]), group=GROUPS)
-    assert counted.spread.model == "sampled"
-    wide = fit_spread(powers(SPREADS["two widths"]), group=GROUPS)
-    assert abs(wide.spread.aspect - 1.25) < 4.0 * wide.spread_sd["aspect"]
-    tailed = fit_spread(powers(SPREADS["Lorentzian tail"]), group=GROUPS)
-    assert tailed.spread.tail_share > 0.3
-    assert tailed.criteria["Gaussian, light collected in pixels"] > 100.0
-
-
 @pytest.mark.parametrize("aspect", [1.0, 1.2])
 def test_behind_a_screen_frames_of_a_simulation_are_known_as_such(aspect):
     """No screen counts quanta in pixels; simulations do, and say that they have one."""
@@ -114,6 +135,9 @@ def test_behind_a_screen_frames_of_a_simulation_are_known_as_such(aspect):
     assert abs(fit.spread.aspect - aspect) < max(4.0 * fit.spread_sd["aspect"], 0.01)
     for place, gain in enumerate((8.0, 14.0)):
         assert abs(fit.gain_DN[place] - gain) < 4.0 * fit.gain_sd_DN[place] < 0.2 * gain
+
+
+def test_a_real_screen_is_no_simulation():
     real = fit_spread(powers(SPREADS["exponential tail"]), group=GROUPS, screen=True)
     assert real.spread.model == "aperture"
     assert not any(item.value.model == "sampled" for item in real.others)
@@ -139,9 +163,6 @@ def test_families_that_the_noise_leaves_open_are_kept_with_their_probability():
     spread = fit.spread if own is fit else own.value
     assert spread.tail_order == 1.5 and spread.variance_share == pytest.approx(tailed.variance_share, rel=0.2)
     assert spread.sigma_px == pytest.approx(0.9, rel=0.05) and 0.05 < spread.tail_share < 0.3
-    # where there is nothing to be said of a tail, none is kept
-    clear = fit_spread(powers(SPREADS["Lorentzian tail"], seed=3), group=GROUPS)
-    assert all(item.value.tail_share > 0.2 for item in clear.others)
 
 
 @pytest.mark.slow

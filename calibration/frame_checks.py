@@ -35,6 +35,7 @@ WIDEST_SPREAD_PX = 3.0  # Gaussian width of the optical spread: wider than that 
 _MOST_FRAMES = 512  # block means kept: longer series are thinned evenly
 _LONG_PAIRS = 8  # differences from the first frame, over the whole series
 _SHAPE_DEGREE = 4
+_WEIGHINGS = 5  # of the variance law: weights follow the fitted variances
 _KEPT_PIXELS = 4096  # for the noise of a pixel and the chance of equal numbers
 
 
@@ -423,9 +424,14 @@ def _variance_law(mixed: NDArray[np.float64], local: NDArray[np.float64]) -> NDA
     floor = max(float(np.max(found)) * 1e-6, 1e-12)
     if bins == 1:
         return np.full(local.shape, max(float(found[0]), floor))
-    # relative errors are alike in all bins
-    weight = 1.0 / np.maximum(found, floor)
-    solution, _ = nnls(np.stack([np.ones_like(signal), signal], axis=1) * weight[:, None], found * weight)
+    # Errors are relative to the law, not to what was found: light that strays from afar brings signal with little noise, and a
+    # bin in such a shadow would pull the noise of all others down to its own.
+    expected = np.full(len(found), float(np.median(found)))
+    solution = np.zeros(2)
+    for _ in range(_WEIGHINGS):
+        weight = 1.0 / np.maximum(expected, floor)
+        solution, _ = nnls(np.stack([np.ones_like(signal), signal], axis=1) * weight[:, None], found * weight)
+        expected = solution[0] + solution[1] * signal
     return np.asarray(np.maximum(solution[0] + solution[1] * local, floor))
 
 

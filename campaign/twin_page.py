@@ -129,7 +129,7 @@ def _parameters(twin: Twin | TubeTwin, answer: Mapping[str, Any]) -> SortedTable
         "dark": ("dark_DN", "DN"),
         "read noise": ("read_noise_DN", "DN"),
         "optical spread, Gaussian width": ("psf_sigma_px", "px"),
-        "inherent filtration": ("inherent_filtration_mm_Al", "mm Al"),
+        "further filtration": ("inherent_filtration_mm_Al", "mm Al"),
         "flux over the spectrum model's": ("flux_scale", ""),
     }
     rows = [(name, _interval(answer[key], unit)) for name, (key, unit) in units.items() if key in answer]

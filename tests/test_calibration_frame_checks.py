@@ -73,6 +73,23 @@ def test_a_turned_object_a_moved_table_and_a_shutter_are_other_scenes():
     assert (closed.same, closed.change) == (False, SceneChange.LEVEL)
 
 
+@pytest.mark.parametrize("share", [0.08, 0.16, 0.3])
+def test_light_that_strays_into_a_shadow_without_noise_is_one_scene(share):
+    """Behind lead only the tail of the spread brings light: 0.7 % of the field's, averaged over so many pixels that it has no noise."""
+    rng = np.random.default_rng(6)
+    y, x = np.mgrid[:80, :96]
+    behind = np.hypot(y - 40, x - 48) < np.sqrt(share * y.size / np.pi)
+    direct = gaussian_filter(np.where(behind, 0.0, 12000.0), 0.5)
+    frames = []
+    for _ in range(8):
+        noise = gaussian_filter(np.sqrt(GAIN_DN * direct) * rng.standard_normal(direct.shape), 0.5)
+        frames.append(np.rint(DARK_DN + direct + 80.0 + noise + 2.0 * rng.standard_normal(direct.shape)))
+    found = same_scene([np.array(frames).astype(np.uint16)], offset_DN=DARK_DN)
+    assert found.same is True, found
+    frames[4:] = [np.roll(frame, 1, axis=1) for frame in frames[4:]]
+    assert same_scene([np.array(frames).astype(np.uint16)], offset_DN=DARK_DN).same is False
+
+
 def test_a_speck_of_dust_is_named_but_is_no_other_scene():
     rng = np.random.default_rng(4)
     mean = np.full((128, 160), 9000.0)

@@ -593,6 +593,27 @@ def test_the_focal_spot_blurs_by_a_times_magnification_less_one(series_line, sou
         assert found == pytest.approx(math.exp(-2 * (math.pi * sigma_px * frequency) ** 2), rel=1e-3)
 
 
+def test_the_focal_spot_that_the_instrument_states_blurs_objects_and_a_larger_one_adds_its_variance(series_line):
+    stated = replace(series_line, instrument=replace(series_line.instrument, focal_spot_mm=0.4))
+    asked = request("object", source_object_mm=700.0)
+    order, place = 12, (np.indices(SHAPE)[0] + 0.5) / 40
+    plate = replace(asked, thickness_mm=ripple(0, order))
+    wave = np.cos(np.pi * order * place)
+    flats = [expect(line, replace(asked, thickness_mm=None)).signal_DN for line in (series_line, stated)]
+    np.testing.assert_array_equal(*flats)  # the open beam knows no spot
+    heights = {
+        (line is stated, size_mm): float(
+            np.mean(wave * expect(line, plate, applied("focal_spot", size_mm)).signal_DN / flat)
+        )
+        for line, flat in zip((series_line, stated), flats, strict=True)
+        for size_mm in (0.0, 0.3)
+    }
+    for size_mm, width_mm in ((0.0, 0.4), (0.3, 0.5)):
+        sigma_px = width_mm * (1059.0 / 700.0 - 1.0) / 0.15 / 2.3548
+        expected = math.exp(-2 * (math.pi * sigma_px * order / 80) ** 2)
+        assert heights[True, size_mm] / heights[False, 0.0] == pytest.approx(expected, rel=1e-3)
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_motion_blurs_along_the_belt_in_proportion_to_the_exposure(series_line, axis):
     for exposure_ms in (20, 50):

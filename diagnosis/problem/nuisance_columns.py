@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...generator.frames.declared_spot import declared_spot_px
 from ...generator.line.line_state import TilePattern
 from ..model import changes as scales
 from ..model.forward_model import ForwardModel
@@ -63,6 +64,7 @@ def _of_its_own(model: ForwardModel, probes: SeriesProbes, signal: NDArray[np.fl
         dy, dx = gradient(signal)
         columns |= _of_thickness(probes, signal, redrawn.thicker, beams_differ)
         images |= _of_scene(item, dy, dx, sharp=model.sharp, rough=probes.rendered / RENDER_SHARE)
+        images |= _of_spot(declared_spot_px(model.base, item.request), dy, dx)
         if model.sharp:
             images |= _between_points(item, signal)
         if redrawn.straight is not None:
@@ -259,6 +261,18 @@ def _of_scene(
     for number, field in enumerate(_rough_fields(dy.shape, place)):
         images[f"rough edge {number} of {place}"] = rough * slope * field
     return images
+
+
+def _of_spot(sigma_px: float, dy: NDArray[np.float64], dx: NDArray[np.float64]) -> _Images:
+    """What another size of the focal spot than the instrument states does: blur that grows with the magnification.
+
+    sigma_px: of its image behind this scene; dy, dx: slopes of the signal (row, column), DN a pixel.
+    """
+    if sigma_px == 0.0:
+        return {}
+    (yy, _), (_, xx) = gradient(dy), gradient(dx)
+    half = scales.SPOT_SD * sigma_px**2  # of the change of variance, 2 SPOT_SD sigma^2
+    return {"size of the focal spot, columns": half * xx, "size of the focal spot, rows": half * yy}
 
 
 def _between_points(item: SessionSeries, signal: NDArray[np.float64]) -> _Images:

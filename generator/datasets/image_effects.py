@@ -223,7 +223,7 @@ class ImageEffects:
         Args:
             signal, variance: (3 row, 3 column) behind the scene, over those of the open beam, on three rays a pixel and axis.
             thickness_mm: material -> (row, column) path length through the middle of each pixel.
-            focal_blur_px: sd of the focal spot's image, unless an effect says how large the spot is.
+            focal_blur_px: sd of the image of the instrument's focal spot; an effect adds to it.
         """
         level = self.open_level_DN
         cells = np.asarray(signal, dtype=np.float64)
@@ -238,7 +238,7 @@ class ImageEffects:
             state = replace(state, picture=FinePicture(fine=FineCells(cells), scale=level, signal_DN=means))
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
         state = replace(self._through(state, later, thickness_mm), shift_px=(0.0, 0.0))  # masks stay with the picture
-        if focal_blur_px > 0 and not any(effect_of(item).images.spot for item in self.effects):
+        if focal_blur_px > 0:
             state = replace(state, object_transfers=(*state.object_transfers, _gaussian(focal_blur_px)))
         charge = self._charge(state)
         ratio = np.maximum(responded(state, charge.mean), 1e-30) / np.maximum(self.flat_DN, 1e-30)

@@ -155,13 +155,11 @@ class Variation:
 class InImages:
     """What single images hold of an effect.
 
-    Fields: left_out: why images have nothing of it; not_in_references: why images made from references have not; spot: it states
-    the whole focal spot, in place of the instrument's.
+    Fields: left_out: why images have nothing of it; not_in_references: why images made from references have not.
     """
 
     left_out: str = ""
     not_in_references: str = ""
-    spot: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Focal spot: it blurs what stands in the beam and correlates no noise.
 
 Variance of a Gaussian of full width a (M - 1) at the detector, M = source-detector over source-object; profile from Gaussian to
-even brightness.
+even brightness. The spot that the instrument states is in every picture already; the effect adds to its variance.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..line.line_state import FloatArray, LineContext, LineState, needed
-from .effect import Effect, Grid, InImages, Parameter, Shows
+from .effect import Effect, Grid, Parameter, Shows
 
 _SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
@@ -95,5 +95,4 @@ FOCAL_SPOT = Effect(
     ),
     # of 64 sealed sessions without effect six showed 4 to 8, edges being drawn no better; two panels without effect, in squares of
     # pixels, 77 of a spot of 0.47 mm, one with a spot of 0.6 mm 107
-    images=InImages(spot=True),
 )

@@ -18,6 +18,7 @@ from ..line.twin import Twin
 from ..spread.psf import Spread
 from ._spread import Kept, NoisePattern, noise_pattern, spread_maps
 from .beam import BeamProjection, model_of, project_beam
+from .declared_spot import blur_by_declared_spot
 from .model_cache import ModelCache
 
 # what a series is called and when it was taken does not change the light
@@ -256,6 +257,7 @@ def _drawn(
             secondary_DN=projection.secondary_DN,
             picture=projection.picture,
             shift_px=request.displacement_px if request.thickness_mm else (0.0, 0.0),
+            object_transfers=blur_by_declared_spot(twin, request),
         )
         for applied, effect, numbers in acting:
             if effect.stage != "beam":

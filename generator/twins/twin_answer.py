@@ -100,7 +100,7 @@ def twin_table(twin: Twin) -> Table:
             ("dark", "dark_DN", "DN"),
             ("read noise", "read_noise_DN", "DN"),
             ("optical spread (sigma)", "psf_sigma_px", "px"),
-            ("inherent filtration", "inherent_filtration_mm_Al", "mm Al"),
+            ("further filtration", "inherent_filtration_mm_Al", "mm Al"),
             ("flux scale", "flux_scale", "x model"),
         )
     ]
@@ -186,7 +186,7 @@ def tube_table(twin: TubeTwin) -> Table:
     rows = tuple(
         (name, *interval_text(answer[key]), unit)
         for name, key, unit in (
-            ("inherent filtration", "inherent_filtration_mm_Al", "mm Al"),
+            ("further filtration", "inherent_filtration_mm_Al", "mm Al"),
             ("output", "flux_scale", "x model"),
         )
     )

@@ -196,7 +196,7 @@ def _text(result: dict[str, Any], path: Path) -> str:
             f"optical spread      {_spread(result)}",
         ]
     lines += [
-        f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
+        f"further filtration  {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
         f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
     ]
     if bad_pixels is not None:

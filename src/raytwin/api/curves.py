@@ -419,8 +419,8 @@ def fit_pod(
             "explain": explain,
             "as_published": as_published,
         }
-        for name, value in of_hits.items():
-            if value:
+        for name, asked in of_hits.items():
+            if asked:
                 raise InputError(
                     name, received="with a response", expected="hits and misses, not a continuous response"
                 )
@@ -543,10 +543,11 @@ def _hit_curve(
 
 def _better_curve(alternatives: "Sequence[Alternative]", fit: "PodFit") -> list[str]:
     """A warning where hits contradict the chosen link and scale: another fits far better."""
-    known = [one for one in alternatives if one.aic is not None]
-    if fit.aic is None or not known or fit.method != "ml" or fit.aic <= known[0].aic + _CONTRADICTED:
+    best = next((one for one in alternatives if one.aic is not None), None)
+    if fit.aic is None or best is None or best.aic is None or fit.method != "ml":
         return []
-    best = known[0]
+    if fit.aic <= best.aic + _CONTRADICTED:
+        return []
     told = "none" if best.a90 is None else f"{best.a90:.4g}"
     return [
         f"the hits contradict this curve: {best.link} on {'ln ' if best.log_size else ''}size fits better (AIC lower by"

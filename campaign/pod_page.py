@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import FitError
 from ..pod import PodFit, ResponseFit, Trials
+from ..pod.answer import trusted_from_answer
 from ..pod.band import curve_rows
 from ..pod.plots import grouped_hits
 from ..reports import AFTER, BEFORE, Band, Chart, KeyFigure, Line, Points, ResultPage, Rule, Section, SortedTable, Step
@@ -31,7 +32,7 @@ def pod_page(
         response: sizes and responses (row,), of a continuous response.
     """
     size = str(answer["size"])
-    a90, bound = answer["a90"], _best(answer["a90_95"])
+    a90, bound = answer["a90"], trusted_from_answer(answer, "a90_95")
     key = []
     if a90 is None:
         lines = [f"These data support no a90: {_reason(answer)}."]
@@ -191,11 +192,6 @@ def _response_chart(fit: ResponseFit, response: tuple[Sequence[float], Sequence[
         wide=True,
         height_px=420,
     )
-
-
-def _best(bounds: Mapping[str, float | None]) -> float | None:
-    modified = bounds.get("modified")
-    return modified if modified is not None else bounds.get("likelihood_ratio")
 
 
 def _reason(answer: Mapping[str, Any]) -> str:

@@ -199,6 +199,7 @@ def curve_of_table(
         link, log_size, method: see `pod.fit_pod`.
     """
     from ..pod import curve_rows, false_alarm_rate, fit_pod, read_pod_table
+    from ..pod.hit_miss import trusted_bound
 
     table = read_pod_table(table_path, size=size)
     objects = len(set(table.image or ()))
@@ -239,7 +240,7 @@ def curve_of_table(
         told["warnings"] = [str(error)]
         return told
     low, high, upper = (
-        bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
+        trusted_bound(bounds, separated=fit.separated)
         for bounds in (fit.a90_low_two_sided, fit.a90_95_two_sided, fit.a90_95)
     )
     told |= {

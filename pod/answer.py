@@ -1,5 +1,6 @@
 """POD fits as plain numbers, and what a table of trials asks of a fit."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -86,6 +87,15 @@ def fit_answer(fit: PodFit) -> dict[str, Any]:
     return result
 
 
+def trusted_from_answer(answer: Mapping[str, Any], name: str) -> Any:
+    """`trusted_bound` of an answer's `name` (a90_95 and the like); None where there is none, or no such entry."""
+    bounds = answer.get(name)
+    if not isinstance(bounds, Mapping):
+        return None
+    kinds = ("wald",) if answer.get("separated") else ("modified", "likelihood_ratio")
+    return next((bounds[kind] for kind in kinds if bounds.get(kind) is not None), None)
+
+
 def response_answer(fit: ResponseFit) -> dict[str, Any]:
     """A fit of a continuous response as the POD answer."""
     return {
@@ -119,6 +129,8 @@ def response_answer(fit: ResponseFit) -> dict[str, Any]:
                 "intercept",
                 "slope",
                 "scatter",
+                "p_line",
+                "p_scatter",
                 "mu",
                 "sigma",
                 "n_left_censored",

@@ -26,7 +26,8 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
     Likelihood-ratio band, each size for itself or (`simultaneous`) the whole curve at once, from the joint region. With
     crossed random effects the population-averaged curve, its band by the delta method on the logit scale. For `cluster`
     the pooled curve and the likelihood of as many trials as have its variance. Both take Student's quantile as the
-    bounds on a90 do (Scheffe's F with 2 and as many degrees of freedom where simultaneous).
+    bounds on a90 do (Scheffe's F with 2 and as many degrees of freedom where simultaneous). Where the data separate the
+    band is Wald's.
 
     Args:
         fit: a fit that has a curve.
@@ -54,7 +55,13 @@ def curve_with_band(fit: PodFit, size: ArrayLike, *, simultaneous: bool = False)
             variance, freedom = fit.clustered.variance(toward)
             allowed = _quantile(freedom, simultaneous=simultaneous)
             allowed = allowed * variance / np.einsum("ki,ij,kj->k", toward, curve.covariance, toward)
-        low, high = eta_band(curve, x.ravel(), quantile=allowed)
+        if fit.separated:  # as the bounds on a90: likelihood regions are too narrow
+            toward = np.stack((np.ones(x.size), x.ravel()), axis=1)
+            spread = np.sqrt(quantile * np.einsum("ki,ij,kj->k", toward, curve.covariance, toward))
+            middle = toward @ np.array(curve.coefficients)
+            low, high = middle - spread, middle + spread
+        else:
+            low, high = eta_band(curve, x.ravel(), quantile=allowed)
         if fit.spread_unknown:
             low, high = np.full(x.size, -np.inf), np.full(x.size, np.inf)
         eta = curve.coefficients[0] + curve.coefficients[1] * x

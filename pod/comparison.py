@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import FitError, InputError, check_number
 from .crossed import usable_factors
 from .few_groups import ONE_SIDED, TWO_SIDED, student_quantile
-from .hit_miss import PodFit
+from .hit_miss import PodFit, trusted_bound
 from .likelihood import Curve
 from .links import LINKS
 from .mixed import fit_mixed
@@ -251,7 +251,7 @@ def _ends(fit: PodFit, share: float) -> tuple[float | None, float | None]:
     """Two-sided interval of a90, its arms shortened to `share`: modified likelihood ratio where there is one."""
     ends: list[float | None] = []
     for bounds in (fit.a90_low_two_sided, fit.a90_95_two_sided):
-        end = bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
+        end = trusted_bound(bounds, separated=fit.separated)
         ends.append(None if end is None or fit.a90 is None else fit.a90 + share * (end - fit.a90))
     return ends[0], ends[1]
 

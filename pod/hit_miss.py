@@ -1,8 +1,9 @@
 """POD from hits and misses: generalised linear model g(POD) = c0 + c1 x, x the size or its natural logarithm.
 
 Sizes: a_p = (g(p) - c0) / c1 on the scale of x, and its exponential on log size.
-Likelihood-ratio bounds are those of the ordinary likelihood, for a bias-reduced fit too: its supremum exists even where
-the data separate, and the bounds then do not depend on which estimate is shown.
+Likelihood-ratio bounds are those of the ordinary likelihood, for a bias-reduced fit too, so they do not depend on which
+estimate is shown. Where the data separate they are far too short and are not given: Wald's upper bounds of the
+bias-reduced fit stand. There are no lower ones then, as steep curves through any size of the gap fit alike.
 Validity: independent trials (see `crossed`, `cluster` and `scaled` in `repeats.py` for repeated looks), POD that rises
 from 0 to 1 with size (see `lapse.py` where it does not reach 1). A size outside the tested range is not given out.
 Source: MIL-HDBK-1823A (2009) appendix G; Firth, Biometrika 80 (1993) 27, doi:10.1093/biomet/80.1.27.
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import FitError
 from ..results import ByValue
 from .few_groups import ONE_SIDED, TWO_SIDED, Levels, not_short_of_likelihood, size_from_test, student_quantile
-from .likelihood import Curve, size_bound
+from .likelihood import Curve, may_be_flat, size_bound
 from .links import Link
 from .modified import modified_bound
 from .robust import Clustered
@@ -40,8 +41,9 @@ class Bounds:
     """One bound by each construction, in the size's unit; None where the data support none.
 
     modified: the likelihood ratio with a correction for few trials (see `modified.py`, `_averaged_size.py`); None for a
-    bias-reduced fit and for scaled repeats. With clusters or random effects all three take Student's quantile (see
-    `few_groups.py`), and wald is the bound of Wald's test at each size (Fieller), or `modified` where that lies farther out.
+    bias-reduced fit and for scaled repeats. Where the data separate wald alone is given, and no lower bound. With clusters
+    or random effects all three take Student's quantile (see `few_groups.py`), and wald is the bound of Wald's test at each
+    size (Fieller), or `modified` where that lies farther out.
     """
 
     likelihood_ratio: float | None = None
@@ -50,6 +52,13 @@ class Bounds:
 
 
 NO_BOUNDS = Bounds()
+
+
+def trusted_bound(bounds: Bounds, *, separated: bool) -> float | None:
+    """The bound to show where one is shown: Wald's where the data separate, else modified, else the likelihood ratio."""
+    if separated:
+        return bounds.wald
+    return bounds.modified if bounds.modified is not None else bounds.likelihood_ratio
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +136,8 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
         if used == "firth":
             notes.append(
                 "hits and misses do not overlap in size (the data separate): no most likely curve exists; the curve is"
-                " Firth's bias-reduced one, and sizes with more overlap would say more"
+                " Firth's bias-reduced one, with Wald's upper bounds on a90 and no lower ones; sizes with more overlap would"
+                " say more"
             )
     common: dict[str, Any] = {
         "link": link.name,
@@ -184,7 +194,7 @@ def fit_pooled(table: Trials, *, link: Link, log_size: bool, method: str, diviso
         divisor=divisor,
         at_maximum=used == "ml",
     )
-    sizes = sizes_from_curve(curve, table=table, log_size=log_size)
+    sizes = sizes_from_curve(curve, table=table, log_size=log_size, separated=separated)
     return PodFit(
         **common,
         c0=curve.coefficients[0],
@@ -219,7 +229,9 @@ class Sizes:
     degrees_of_freedom: float | None = None
 
 
-def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: Clustered | None = None) -> Sizes:
+def sizes_from_curve(
+    curve: Curve, *, table: Trials, log_size: bool, clustered: Clustered | None = None, separated: bool = False
+) -> Sizes:
     """a50, a90 and its bounds in the data's unit; a size outside the tested range is None with its reason.
 
     Args:
@@ -228,6 +240,7 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: 
         log_size: whether the curve is on ln size.
         clustered: variances to take in the place of the curve's own, with their degrees of freedom. Likelihood bounds are
             then those of as many independent trials as have this variance of eta at a90 (the design effect).
+        separated: the data separate, so Wald's upper bounds alone are given, where the likelihood gives any.
     """
     notes: list[str] = []
     smallest, largest = float(curve.x[0]), float(curve.x[-1])
@@ -262,11 +275,17 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: 
             freedom = float(freedom_at)
             judged = effective_trials(curve, float(spread) / float(toward @ curve.covariance @ toward))
         eta = curve.link.eta_from_pod(0.9)
+        inside = x90 if separated else curve.most_likely_x(eta)
         bounds = {}
         for key, below, upper in (("one", ONE_SIDED, True), ("two", TWO_SIDED, True), ("low", TWO_SIDED, False)):
             z = float(student_quantile(below, freedom))
-            ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=x90)
             wald: float | None = x90 + z * error if upper else x90 - z * error
+            if separated:
+                if not upper or may_be_flat(judged, eta=eta, quantile=z * z, upper=upper):
+                    wald = None
+                bounds[key] = Bounds(wald=size_from_x(wald, log_size=log_size))
+                continue
+            ratio = size_bound(judged, eta=eta, quantile=z * z, upper=upper, start=inside)
             if clustered is not None:
                 wald = size_from_test(
                     lambda at: _excess(curve, clustered, eta=eta, x=at),
@@ -286,8 +305,8 @@ def sizes_from_curve(curve: Curve, *, table: Trials, log_size: bool, clustered: 
                 modified=size_from_x(modified, log_size=log_size),
             )
         one, two, low = bounds["one"], bounds["two"], bounds["low"]
-        if two.likelihood_ratio is None:
-            which = "one-sided or two-sided" if one.likelihood_ratio is None else "two-sided"
+        if trusted_bound(two, separated=separated) is None:
+            which = "one-sided or two-sided" if trusted_bound(one, separated=separated) is None else "two-sided"
             notes.append(
                 f"a flat curve is within the {which} 95 % likelihood region: the data give no upper likelihood-ratio"
                 " bound on a90 (more trials, or sizes over a wider range, would)"
@@ -381,7 +400,16 @@ def _fit_statsmodels(design: Array, hits: Array, misses: Array, link: Link) -> A
 
 def _inverse(information: Array) -> Array:
     scale = 1.0 / np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
+    try:
+        inverse = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(information, np.nan)
+    if not np.all(np.diag(inverse) > 0):
+        raise FitError(
+            "the sizes differ too little beside their distance from 0 to tell the slope of the POD curve; subtract a constant"
+            " from them"
+        )
+    return np.asarray(inverse)
 
 
 def _saturated_log_likelihood(hits: Array, misses: Array) -> float:

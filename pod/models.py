@@ -1,22 +1,27 @@
 """Model choice, shown: every link on size and on log size, by deviance, AIC and goodness of fit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
-from .hit_miss import PodFit, fit_pooled
+from .hit_miss import PodFit, fit_pooled, trusted_bound
 from .links import LINKS, Link
 from .solver import fit_batch
 from .trials import Trials
 
 Array = NDArray[np.float64]
 
+_ALIKE = 2.0  # in AIC
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alternative:
     """One link and scale on the same trials. deviance, aic: smaller fits better; a90 in the data's unit or None.
+
+    a90_95, a90_low, a90_high: its one-sided 95 % bound and the ends of its two-sided 95 % interval, None as in `PodFit`.
 
     p_link: p-value of Pregibon's link test (small: the curve has another shape than this link gives it).
     p_fit: p-value of a chi-square test of hits over up to ten groups of size (Hosmer & Lemeshow), None with few trials.
@@ -29,6 +34,55 @@ class Alternative:
     a90: float | None
     p_link: float | None
     p_fit: float | None
+    a90_95: float | None = None
+    a90_low: float | None = None
+    a90_high: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OverLinks:
+    """What the links and scales say together that fit as well as the best one, and the one that was chosen.
+
+    Fields: curves (their names, `ln` before those on log size); a90_lowest, a90_highest; a90_95, a90_low, a90_high: the
+    farthest of their bounds. None where one of them gives none.
+    """
+
+    curves: tuple[str, ...]
+    a90_lowest: float | None
+    a90_highest: float | None
+    a90_95: float | None
+    a90_low: float | None
+    a90_high: float | None
+
+
+def over_links(found: tuple[Alternative, ...], *, link: str, log_size: bool) -> OverLinks | None:
+    """The alternatives whose AIC is within 2 of the best, joined; None where there is none with an AIC.
+
+    One link's interval takes its shape as known, and small tables cannot tell shapes (VALIDATION pod-29).
+    Source: Burnham & Anderson, Model Selection and Multimodel Inference (2002), 2.6 (AIC within 2: substantial support).
+    """
+    known = [one for one in found if one.aic is not None]
+    if not known:
+        return None
+    best = min(one.aic for one in known if one.aic is not None)
+    alike = [
+        one
+        for one in known
+        if (one.aic is not None and one.aic <= best + _ALIKE) or (one.link, one.log_size) == (link, log_size)
+    ]
+
+    def farthest(pick: Callable[[list[float]], float], name: str) -> float | None:
+        values = [getattr(one, name) for one in alike]
+        return None if None in values else pick(values)
+
+    return OverLinks(
+        curves=tuple(("ln " if one.log_size else "") + one.link for one in alike),
+        a90_lowest=farthest(min, "a90"),
+        a90_highest=farthest(max, "a90"),
+        a90_95=farthest(max, "a90_95"),
+        a90_low=farthest(min, "a90_low"),
+        a90_high=farthest(max, "a90_high"),
+    )
 
 
 def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) -> tuple[Alternative, ...]:
@@ -55,6 +109,9 @@ def compare_models(table: Trials, *, log_sizes: tuple[bool, ...] | None = None) 
                     a90=fit.a90,
                     p_link=p_link,
                     p_fit=p_fit,
+                    a90_95=trusted_bound(fit.a90_95, separated=fit.separated),
+                    a90_low=trusted_bound(fit.a90_low_two_sided, separated=fit.separated),
+                    a90_high=trusted_bound(fit.a90_95_two_sided, separated=fit.separated),
                 )
             )
     return tuple(sorted(found, key=lambda one: np.inf if one.aic is None else one.aic))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..errors import FitError
 from .band import CHI2_95, curve_with_band
 from .comparison import Comparison
-from .hit_miss import PodFit
+from .hit_miss import PodFit, trusted_bound
 from .likelihood import joint_region
 from .models import Alternative
 from .response import ResponseFit
@@ -35,7 +35,7 @@ def draw_pod(axes: Any, fit: PodFit, table: Trials, *, size_label: str) -> None:
     """`plot_pod` on the axes given."""
     _draw_hits(axes, table, log_size=fit.log_size)
     _draw_curve(axes, fit, color=_BLUE, label=f"POD ({fit.link}, {fit.repeats})")
-    bound = fit.a90_95.modified if fit.a90_95.modified is not None else fit.a90_95.likelihood_ratio
+    bound = trusted_bound(fit.a90_95, separated=fit.separated)
     if fit.a90 is not None:
         axes.plot([fit.a90] * 2, [0, 0.9], color=_GREY, lw=1, ls="--")
         axes.axhline(0.9, color=_GREY, lw=0.6, ls=":")

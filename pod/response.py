@@ -28,13 +28,17 @@ from .trials import codes_from_labels
 Array = NDArray[np.float64]
 
 _PROBIT = LINKS["probit"]
+_DOUBTED = 0.01  # 1 to 5 of 100 straight lines with one scatter are doubted, of 20 rows 7
+_REJECTED = 0.001
+_FEWEST_TO_TEST = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ResponseFit(ByValue):
     """A fitted line and its POD curve. Sizes in the data's unit, None where the data cannot support a number.
 
-    intercept, slope, scatter: b0, b1, tau on the transformed scales. box_cox: lambda (1 = as it is, 0 = logarithm).
+    intercept, slope, scatter: b0, b1, tau on the transformed scales. p_line, p_scatter: p-values of tests that the line is
+    straight and its scatter the same at every size (None for repeated looks). box_cox: lambda (1 = as it is, 0 = logarithm).
     mu, sigma: of the POD curve on x. covariance: of (c0, c1). a90_95 and the like: see `PodFit`.
     """
 
@@ -66,6 +70,8 @@ class ResponseFit(ByValue):
     reaches_90: bool
     repeats: str
     warnings: tuple[str, ...]
+    p_line: float | None = None
+    p_scatter: float | None = None
 
 
 def fit_response_pod(
@@ -98,10 +104,11 @@ def fit_response_pod(
         FitError: too few responses between the limits, or one size only.
     """
     x, y = _checked(size, response, log_size=log_size)
+    for name, limit in (("decision", decision), ("left", left), ("right", right)):
+        if limit is not None and not (isinstance(limit, int | float | np.number) and math.isfinite(limit)):
+            raise InputError(name, received=repr(limit), expected="a finite response")
     if left is not None and right is not None and not left < right:
         raise InputError("left and right", received=f"{left:g} and {right:g}", expected="a left limit below the right")
-    if not math.isfinite(decision):
-        raise InputError("decision", received=decision, expected="a finite response")
     if box_cox is None:
         from scipy.optimize import minimize_scalar
 
@@ -197,6 +204,25 @@ def fit_response_pod(
         one, two, low = bounds
         if two.likelihood_ratio is None:
             notes.append("the likelihood gives no upper bound on a90: more sizes above it would")
+    p_line = p_scatter = None
+    if repeats == "pooled":
+        p_line, p_scatter = _tests_of_line(line, x)
+        departs = [
+            f"{what} (p {p:.2g})"
+            for what, p in (("the response bends", p_line), ("its scatter changes with size", p_scatter))
+            if p is not None and p < _DOUBTED
+        ]
+        if departs:
+            rejected = min(p for p in (p_line, p_scatter) if p is not None) < _REJECTED
+            if rejected:
+                one = two = low = NO_BOUNDS
+            notes.append(
+                " and ".join(departs)
+                + ", and a90 rests on a straight line with one scatter: "
+                + ("no bounds on a90" if rejected else "a90 and its bounds may be wrong")
+                + "; try log size, the logarithm of the response, box_cox auto, or hits above the decision, and name"
+                " the columns of looks that repeat"
+            )
     sizes = np.exp(x) if log_size else x
     return ResponseFit(
         log_size=log_size,
@@ -227,6 +253,8 @@ def fit_response_pod(
         reaches_90=bool(c1 > 0 and (_PROBIT.eta_from_pod(0.9) - c0) / c1 <= largest),
         repeats=repeats,
         warnings=tuple(notes),
+        p_line=p_line,
+        p_scatter=p_scatter,
     )
 
 
@@ -340,6 +368,32 @@ def _fit(x: Array, response: Array, box_cox: float, left: float | None, right: f
     start = np.array([beta[0] / scatter, beta[1] / scatter, 1 / scatter])
     q, value = line.maximise(start, np.eye(3), np.zeros(3))
     return replace(line, q=q, log_likelihood=value)
+
+
+def _tests_of_line(line: _Line, x: Array) -> tuple[float | None, float | None]:
+    """p-values of a likelihood-ratio test against a parabola, and of a score test against a scatter exp(x) times as wide.
+
+    Both heed censoring. The score test estimates its variance from the rows, so it needs no normal kurtosis.
+    None where there are too few rows or sizes. Source: Koenker, J. Econometrics 17 (1981) 107 (the test of the scatter).
+    """
+    from scipy.special import gammaincc
+
+    if line.exact.sum() < _FEWEST_TO_TEST or len(np.unique(x[line.exact])) < 3:
+        return None, None
+    u = (x - x.mean()) / x.std()
+    bent = replace(line, rows=np.column_stack((line.rows, -(u**2))))
+    try:
+        _, value = bent.maximise(np.append(line.q, 0.0), np.eye(4), np.zeros(4))
+    except (FitError, np.linalg.LinAlgError):
+        return None, None
+    p_line = float(gammaincc(0.5, max(value - line.log_likelihood, 0.0)))
+    _, first, _ = line.terms(line.q)
+    # d ln L / d ln tau of each row, times u
+    push = -u * (first * (line.rows @ line.q) + line.exact)
+    scores = line.score_rows(line.q)
+    rest = push - scores @ np.linalg.lstsq(scores, push, rcond=None)[0]
+    p_scatter = float(gammaincc(0.5, 0.5 * push.sum() ** 2 / max(float(rest @ rest), 1e-300)))
+    return p_line, p_scatter
 
 
 def _bound(line: _Line, threshold: float, x90: float, first: float, allowed: float) -> float | None:

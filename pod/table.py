@@ -31,6 +31,7 @@ SIZE_NAMES = ("contrast", "size", "size_mm", "a", "flaw_size", "flawsize", "dept
 HIT_NAMES = ("hit", "hits", "hit_miss", "hitmiss", "hit/miss", "detected", "detection")
 SITE_NAMES = ("site", "target", "target_id", "id")
 _MISSING = ("NaN", "nan", "NA", "NaT", "<NA>")  # an empty cell, as pandas and R write it
+_EXCEL_SEPARATOR = ("sep=,", "sep=;")
 _HIT_WORDS = {
     "0": 0.0,
     "1": 1.0,
@@ -168,6 +169,12 @@ def read_pod_table(
         texts = column(name, chosen)
         return np.array([_number(t, name, f"line {lines[i]}") for t, i in zip(texts, chosen, strict=True)])
 
+    sizes = numbers(size_name, with_object)
+    zeros = int((sizes == 0).sum())
+    if 1 < zeros < len(sizes) and not trials_name and np.all(sizes >= 0):
+        notes.append(
+            f"{zeros} rows of {size_name} 0 taken as foreign objects of that size; a product without one has an empty {size_name}"
+        )
     hits = None
     if hit_names:
         if trials_name:
@@ -196,7 +203,7 @@ def read_pod_table(
     own = {size_name, *hit_names, *(n for n in (trials_name, response_name) if n)}
     return PodTable(
         size_name=size_name,
-        size=numbers(size_name, with_object),
+        size=sizes,
         hits=hits,
         trials=numbers(trials_name, with_object) if trials_name else None,
         response=numbers(response_name, with_object) if response_name else None,
@@ -255,11 +262,19 @@ def _read_rows(path: Path) -> tuple[list[str], list[list[str]], list[int]]:
         )
     first = kept[0][1]
     separator = max(",;\t", key=first.count)
+    if (
+        first.strip().lower() in _EXCEL_SEPARATOR and len(kept) > 2
+    ):  # the line that tells Excel how columns are separated
+        separator = first.strip()[-1]
+        kept = kept[1:]
+        first = kept[0][1]
     reader = csv.reader(io.StringIO("\n".join(line for _, line in kept)), delimiter=separator, skipinitialspace=True)
     try:
         cells = [list(row) for row in reader]
     except csv.Error as error:
         raise FileFormatError("table", received=f"{path} ({error})", expected="comma-separated values") from None
+    while cells[0][-1:] == [""] and not any("".join(row[len(cells[0]) - 1 :]).strip() for row in cells):
+        cells = [row[: len(cells[0]) - 1] for row in cells]  # an empty column at the right edge of a sheet
     header = [name.strip() for name in cells[0]]
     numbers = [n for n, _ in kept][1:]
     if all(_is_number(name) for name in header):
@@ -293,9 +308,11 @@ def _is_number(text: str) -> bool:
 def _filtered(
     header: list[str], rows: list[list[str]], lines: list[int], where: Mapping[str, str]
 ) -> tuple[list[list[str]], list[int]]:
+    if not isinstance(where, Mapping):
+        raise InputError("where", received=repr(where), expected="column -> value, for example {'setting': '20ms'}")
     kept = list(range(len(rows)))
-    for name, value in where.items():
-        at = header.index(_chosen(name, header, "where"))
+    for name, wanted in where.items():
+        at, value = header.index(_chosen(name, header, "where")), str(wanted).strip()
         known = sorted({rows[i][at].strip() for i in kept})
         kept = [i for i in kept if rows[i][at].strip() == value]
         if not kept:

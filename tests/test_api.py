@@ -422,6 +422,16 @@ def closed():
         (lambda: rt.Setting(kV=60, exposure_ms=1, averaged="3"), "averaged: got '3'; expected a number"),
         (lambda: rt.compare("hits.csv", "other_hits.csv", margin="x"), "margin: got 'x'; expected a number"),
         (lambda: rt.fit_pod({}), "table: got a table without columns"),
+        (lambda: rt.fit_pod("hits.csv", where="setting=a"), "where: got 'setting=a'; expected column -> value"),
+        (lambda: rt.fit_pod("hits.csv", bootstrap="many"), "bootstrap: got many; expected 20 refits or more"),
+        (
+            lambda: rt.fit_pod({"a": [1, 2, 3], "y": [1, 2, 4]}, response="y", decision=2, bootstrap=100),
+            "bootstrap: got with a response",
+        ),
+        (
+            lambda: rt.fit_pod({"a": [1, 2, 3], "y": [1, 2, 4]}, response="y", decision="2"),
+            "decision: got '2'; expected a finite response",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_error_and_leaves_nothing(inside, call, message):

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from raytwin.errors import InputError
+from raytwin.errors import FitError, InputError
 from raytwin.pod import LINKS, check_trials, compare_models, curve_with_band, fit_batch, fit_many, fit_pod, joint_region
-from raytwin.pod.hit_miss import Z_ONE_SIDED, Z_TWO_SIDED
+from raytwin.pod.hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, trusted_bound
 from raytwin.pod.likelihood import profile, size_bound
+from raytwin.pod.models import over_links
 from raytwin.pod.separation import check_separation
 
 
@@ -193,6 +194,60 @@ def test_separated_data_fall_back_to_the_bias_reduced_fit_and_say_so():
     assert "AS_mean" in fit.variant
     assert any("do not overlap" in note for note in fit.warnings)
     assert 3 < fit.a90 < 6
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_where_data_separate_walds_upper_bound_alone_is_given_and_lies_above_a90(link):
+    size = np.random.default_rng(3).uniform(0.5, 4, 60)
+    fit = fit_pod(size, size > 2, link=link)
+    bound = trusted_bound(fit.a90_95, separated=fit.separated)
+    assert bound > fit.a90 * 1.01
+    assert bound == fit.a90_95.wald
+    for bounds in (fit.a90_95, fit.a90_95_two_sided, fit.a90_low_two_sided):
+        assert (bounds.likelihood_ratio, bounds.modified) == (None, None)
+    assert fit.a90_low_two_sided.wald is None
+    pod, low, high = curve_with_band(fit, np.array([bound * 1.001]))
+    assert low[0] <= pod[0] <= high[0]
+
+
+def test_bounds_of_few_trials_that_often_separate_cover_the_true_a90():
+    random = np.random.default_rng(8)
+    covered, apart = [], 0
+    for _ in range(60):
+        size = random.uniform(0.3, 4.5, 20)
+        fit = fit_pod(size, random.random(20) < 1 / (1 + np.exp(-6 * (size - 2))), link="logit")
+        bound = trusted_bound(fit.a90_95, separated=fit.separated)
+        apart += fit.separated
+        if bound is not None:
+            covered.append(bound >= 2 + math.log(9) / 6)
+    assert apart > 20
+    assert np.mean(covered) >= 0.9  # the likelihood ratio's covered 80 %
+
+
+def test_a_bias_reduced_fit_that_was_asked_for_has_the_likelihood_bounds_of_the_most_likely_curve():
+    size, hit = drawn(2, n=40)
+    firth, likely = (fit_pod(size, hit, link="logit", method=method) for method in ("firth", "ml"))
+    for name in ("a90_95", "a90_95_two_sided", "a90_low_two_sided"):
+        bounds = [getattr(fit, name).likelihood_ratio for fit in (firth, likely)]
+        assert bounds[0] == pytest.approx(bounds[1], rel=1e-6)
+
+
+def test_links_that_fit_alike_are_joined_and_bracket_each_of_them():
+    size, hit = drawn(4, n=80)
+    found = compare_models(check_trials(size, hit))
+    joined = over_links(found, link="cloglog", log_size=False)
+    best = found[0]
+    assert len(joined.curves) > 1
+    assert joined.a90_lowest <= best.a90 <= joined.a90_highest
+    assert joined.a90_low <= best.a90_low
+    assert joined.a90_high >= best.a90_high
+    assert joined.a90_95 >= best.a90_95
+
+
+def test_sizes_far_from_0_beside_their_differences_are_told():
+    size, hit = drawn(1)
+    with pytest.raises(FitError, match="subtract a constant"):
+        fit_pod(size + 1e9, hit, link="logit")
 
 
 def test_separated_data_under_maximum_likelihood_have_no_sizes():

@@ -127,6 +127,28 @@ def test_box_cox_finds_the_scale_that_made_the_data():
     assert fit.a90 == pytest.approx(same.a90, rel=0.03)
 
 
+def test_a_bent_response_and_a_scatter_that_grows_are_told_and_give_no_bounds():
+    random = np.random.default_rng(5)
+    size = random.uniform(0.5, 4, 100)
+    noise = random.normal(0, 1, 100)
+    cases = {
+        "": 1 + 2 * size + 0.6 * noise,
+        "bends": size**3 + 0.6 * noise,
+        "scatter changes": 1 + 2 * size + 0.8 * size * noise,
+    }
+    for words, response in cases.items():
+        for limits in ({}, {"left": 2.0, "right": 12.0}):
+            fit = fit_response_pod(size, np.clip(response, 2, 12) if limits else response, decision=5, **limits)
+            told = [note for note in fit.warnings if "no bounds on a90" in note]
+            if words:
+                assert words in told[0]
+                assert fit.a90_95.likelihood_ratio is fit.a90_95.wald is None
+            else:
+                assert not told
+                assert min(fit.p_line, fit.p_scatter) > 0.01
+                assert fit.a90_95.likelihood_ratio > fit.a90
+
+
 def test_repeated_responses_widen_the_bounds():
     random = np.random.default_rng(6)
     size = np.repeat(random.uniform(1, 10, 40), 6)
@@ -135,8 +157,8 @@ def test_repeated_responses_widen_the_bounds():
     naive = fit_response_pod(size, response, decision=10)
     robust = fit_response_pod(size, response, decision=10, image=image, repeats="cluster")
     assert robust.a90 == naive.a90
-    assert robust.a90_95.wald - robust.a90 > 1.7 * (naive.a90_95.wald - naive.a90)
-    assert robust.a90_95.likelihood_ratio > naive.a90_95.likelihood_ratio
+    assert robust.se0 > 1.7 * naive.se0
+    assert robust.a90_95.likelihood_ratio > robust.a90
 
 
 @pytest.mark.parametrize(

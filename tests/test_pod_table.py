@@ -171,3 +171,38 @@ def test_a_column_asked_for_as_numbers_must_hold_numbers(tmp_path):
         table.numbers("colour")
     with pytest.raises(InputError, match="column: got 'thickness'"):
         table.numbers("thickness")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sep=;\nsize_mm;hit\n1,5;0\n2,5;1\n",
+        "size_mm;hit;\n1,5;0;\n2,5;1;\n",
+        "size_mm;hit;;\n1,5;0;;\n2,5;1;;\n",
+    ],
+)
+def test_what_excel_adds_to_a_sheet_is_no_column(tmp_path, text):
+    path = tmp_path / "sheet.csv"
+    path.write_text(text, encoding="utf-8")
+    table = read_pod_table(path)
+    assert table.size.tolist() == [1.5, 2.5]
+    assert table.hits.tolist() == [0, 1]
+
+
+def test_a_column_without_a_name_that_holds_something_is_refused(tmp_path):
+    path = tmp_path / "sheet.csv"
+    path.write_text("size_mm;hit;\n1,5;0;\n2,5;1;7\n", encoding="utf-8")
+    with pytest.raises(InputError, match="non-empty column names"):
+        read_pod_table(path)
+
+
+def test_rows_may_be_chosen_by_numbers_and_by_columns_only():
+    table = {"size": [1, 2, 3], "hit": [0, 1, 1], "setting": [20, 20, 30]}
+    assert read_pod_table(table, where={"setting": 20}).size.tolist() == [1, 2]
+    with pytest.raises(InputError, match="where: got"):
+        read_pod_table(table, where="setting=20")
+
+
+def test_rows_of_size_0_are_told_to_be_objects():
+    table = read_pod_table({"size_mm": [0, 0, 1, 2], "hit": [0, 1, 0, 1]})
+    assert any("size_mm 0 taken as foreign objects" in note for note in table.notes)

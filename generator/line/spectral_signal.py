@@ -834,15 +834,13 @@ def gain_behind_object(
 
     The gain follows <E^2>/<E> of what is absorbed, which rises as the object hardens the beam.
     """
-    samples = parameters[None, :]
-    open_beam = model.signal(samples, beam)
-    mu = model.mu(material)
-    rates, gains = [], []
-    for thickness in thickness_mm:
-        behind = model.signal(samples, beam, through=np.exp(-mu * thickness))
-        rates.append(float(behind.rate_DN_per_mAs[0] / open_beam.rate_DN_per_mAs[0]))
-        gains.append(float(behind.gain_DN[0] / open_beam.gain_DN[0]))
-    return np.array(rates), np.array(gains)
+    weights = model.moment_weights(parameters, beam)[:2]
+    mu = model.mu(material)[: weights.shape[1]]
+    open_rate, open_variance = weights.sum(axis=1)
+    # one thickness at a time: sums of one order, however many are asked for
+    behind = np.array([weights @ np.exp(-mu * thickness) for thickness in thickness_mm])
+    rate = behind[:, 0] / open_rate
+    return rate, behind[:, 1] / behind[:, 0] / (open_variance / open_rate)
 
 
 def mean_signal_energy_keV(weights: NDArray[np.float64], energies_keV: NDArray[np.float64]) -> float:

@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import FitError, InputError
-from ..pod.answer import default_repeats, fit_answer, notes_on_table, response_answer, trials_from_table
+from ..pod.answer import (
+    default_repeats,
+    fit_answer,
+    notes_on_table,
+    response_answer,
+    trials_from_table,
+    trusted_from_answer,
+)
 from ..pod.table import HitError, PodTable, read_pod_table
 from ..results import Result, Table, axes_or_new, counted, frame, interval_text, number_text, plain
 from ._given import generator_of
@@ -18,7 +25,7 @@ if TYPE_CHECKING:
     import pandas
     from typing_extensions import TypeIs
 
-    from ..pod import Comparison, Plan, PodFit, Precision, ResponseFit, Roc, Trials
+    from ..pod import Alternative, Comparison, Plan, PodFit, Precision, ResponseFit, Roc, Trials
     from ..pod.planning import AssumedCurve
 
     TableLike: TypeAlias = (
@@ -26,6 +33,7 @@ if TYPE_CHECKING:
     )
 
 _FAR = 100.0  # ranges of the others: no study has a size so far away
+_CONTRADICTED = 6.0  # in AIC: a twentieth of the support (Burnham & Anderson 2002, 2.6)
 _NO_RESPONSES = "curves of a continuous response are not compared"
 
 
@@ -33,7 +41,7 @@ _NO_RESPONSES = "curves of a continuous response are not compared"
 class PodCurve(Result):
     """A POD curve with its bounds, and the table that it was fitted to.
 
-    Fields: fit; table (what was read); more (what was asked for beyond the curve, by name: `alternatives`, `false_alarms`,
+    Fields: fit; table (what was read); more (beyond the curve, by name: `alternatives`, `over_links`, `false_alarms`,
     `lapse`, `bootstrap`, `covariates`, `explanation`, `as_published`, `roc`); warnings; response_label (the response's
     column, None for hits) with its censoring limits.
     """
@@ -122,9 +130,12 @@ class PodCurve(Result):
         name = self.table.size_name
         rows = [(label, number_text(answer[key]), name) for label, key in (("a50", "a50"), ("a90", "a90"))]
         for label, key in (("a90/95, one-sided", "a90_95"), ("a90, upper of two-sided 95 %", "a90_95_two_sided")):
-            bound = answer[key]
-            best = bound["modified"] if bound["modified"] is not None else bound["likelihood_ratio"]
-            rows.append((label, number_text(best), name))
+            rows.append((label, number_text(trusted_from_answer(answer, key)), name))
+        joined = answer.get("over_links")
+        if joined and len(joined["curves"]) > 1:
+            rows.append(
+                (f"a90/95 over {len(joined['curves'])} links that fit alike", number_text(joined["a90_95"]), name)
+            )
         if "false_alarms" in answer:
             alarm = answer["false_alarms"]
             ends = f"{100 * alarm['low']:.3g} to {100 * alarm['high']:.3g} %"
@@ -398,6 +409,21 @@ def fit_pod(
         where=where,
     )
     if response is not None or read.response is not None:
+        of_hits = {
+            "method": method,
+            "ceiling": ceiling,
+            "floor": floor,
+            "bootstrap": bootstrap,
+            "by": by,
+            "covariates": covariates,
+            "explain": explain,
+            "as_published": as_published,
+        }
+        for name, asked in of_hits.items():
+            if asked:
+                raise InputError(
+                    name, received="with a response", expected="hits and misses, not a continuous response"
+                )
         curve = _response_curve(
             read,
             label=response or "response",
@@ -470,6 +496,7 @@ def _hit_curve(
 ) -> PodCurve:
     from ..pod import compare_models, fit_as_published
     from ..pod import fit_pod as fit_columns
+    from ..pod.models import over_links
 
     with _naming_far_sizes(table=table):
         fit = fit_columns(
@@ -488,7 +515,12 @@ def _hit_curve(
     if not log_size and (far := _far_size(table)):
         warnings.append(far)
     trials = trials_from_table(table, log_size=log_size)
-    more: dict[str, Any] = {"alternatives": [asdict(one) for one in compare_models(trials)]}
+    alternatives = compare_models(trials)
+    more: dict[str, Any] = {"alternatives": [asdict(one) for one in alternatives]}
+    if fit.repeats == "pooled" and not fit.separated:
+        joined = over_links(alternatives, link=link, log_size=log_size)
+        more["over_links"] = None if joined is None else asdict(joined)
+        warnings += _better_curve(alternatives, fit)
     asked: dict[str, Callable[[], Any]] = {}
     if ceiling or floor:
         asked["lapse"] = lambda: _lapse(trials, fit, ceiling=ceiling, floor=floor, warnings=warnings)
@@ -507,6 +539,21 @@ def _hit_curve(
     if as_published:
         more["as_published"] = asdict(fit_as_published(trials))
     return PodCurve(fit=fit, table=table, more=plain(more), warnings=tuple(warnings))
+
+
+def _better_curve(alternatives: "Sequence[Alternative]", fit: "PodFit") -> list[str]:
+    """A warning where hits contradict the chosen link and scale: another fits far better."""
+    best = next((one for one in alternatives if one.aic is not None), None)
+    if fit.aic is None or best is None or best.aic is None or fit.method != "ml":
+        return []
+    if fit.aic <= best.aic + _CONTRADICTED:
+        return []
+    told = "none" if best.a90 is None else f"{best.a90:.4g}"
+    return [
+        f"the hits contradict this curve: {best.link} on {'ln ' if best.log_size else ''}size fits better (AIC lower by"
+        f" {fit.aic - best.aic:.3g}, a90 {told}); see over_links and alternatives, and a ceiling or floor where large"
+        " objects are missed or small ones hit"
+    ]
 
 
 @contextmanager
@@ -565,7 +612,7 @@ def _bootstrap(
 ) -> dict[str, Any]:
     from ..pod import bootstrap_pod
 
-    if replicates < 20:
+    if isinstance(replicates, bool) or not isinstance(replicates, int) or replicates < 20:
         raise InputError("bootstrap", received=replicates, expected="20 refits or more (1000 is usual)")
     if by is None:
         known = table.network is not None, table.image is not None

@@ -57,6 +57,13 @@ def text_from_answer(result: dict[str, Any], size_name: str) -> str:
             f" ({100 * alarm['low']:.3g} to {100 * alarm['high']:.3g} %, 95 %)"
         )
     lines += _further_lines(result)
+    joined = result.get("over_links")
+    if joined:
+        lines.append(
+            f"over {', '.join(joined['curves'])} (AIC within 2 of the best, and the one chosen): a90 {shown(joined['a90_lowest'])} to"
+            f" {shown(joined['a90_highest'])}, a90/95 {shown(joined['a90_95'])}, two-sided 95 % {shown(joined['a90_low'])} to"
+            f" {shown(joined['a90_high'])}"
+        )
     if result.get("alternatives"):
         lines.append("other links and scales" + (", looks taken as independent:" if "naive" in result else ":"))
         lines.append(f"{'link':<9}{'size':>5}{'deviance':>11}{'AIC':>10}{'a90':>10}{'p(link)':>11}{'p(fit)':>11}")

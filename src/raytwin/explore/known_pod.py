@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FileFormatError, FitError, InputError
-
-_BOUNDS = ("modified", "likelihood_ratio", "wald")  # the first one that is known is taken
+from ..pod.answer import trusted_from_answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,8 +73,8 @@ def read_known_pod(path: str | os.PathLike[str]) -> KnownPod:
         name=file.name,
         size_name=str(answer["size"]),
         a90=_number(answer["a90"], file),
-        a90_low=_bound(answer.get("a90_low_two_sided"), file),
-        a90_high=_bound(answer["a90_95_two_sided"], file),
+        a90_low=_bound(answer, "a90_low_two_sided", file),
+        a90_high=_bound(answer, "a90_95_two_sided", file),
     )
 
 
@@ -88,16 +87,14 @@ def _of_table(file: Path) -> KnownPod:
         name=file.name,
         size_name=curve.table.size_name,
         a90=curve.a90,
-        a90_low=_bound(answer.get("a90_low_two_sided"), file),
-        a90_high=_bound(answer["a90_95_two_sided"], file),
+        a90_low=_bound(answer, "a90_low_two_sided", file),
+        a90_high=_bound(answer, "a90_95_two_sided", file),
         fit=curve.fit,
     )
 
 
-def _bound(bounds: Any, file: Path) -> float | None:
-    if not isinstance(bounds, Mapping):
-        return None
-    return next((_number(bounds[name], file) for name in _BOUNDS if bounds.get(name) is not None), None)
+def _bound(answer: Mapping[str, Any], name: str, file: Path) -> float | None:
+    return _number(trusted_from_answer(answer, name), file)
 
 
 def _number(value: Any, file: Path) -> float | None:

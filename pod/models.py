@@ -1,20 +1,20 @@
 """Model choice, shown: every link on size and on log size, by deviance, AIC and goodness of fit."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FitError
-from .hit_miss import PodFit, fit_pooled, trusted_bound
+from .hit_miss import Bounds, PodFit, fit_pooled, trusted_bound
 from .links import LINKS, Link
 from .solver import fit_batch
 from .trials import Trials
 
 Array = NDArray[np.float64]
 
-_ALIKE = 2.0  # in AIC
+_ALIKE = 2.0  # in AIC: substantial support (Burnham & Anderson 2002, 2.6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +82,29 @@ def over_links(found: tuple[Alternative, ...], *, link: str, log_size: bool) -> 
         a90_95=farthest(max, "a90_95"),
         a90_low=farthest(min, "a90_low"),
         a90_high=farthest(max, "a90_high"),
+    )
+
+
+def better_curve(found: tuple[Alternative, ...], fit: PodFit) -> Alternative | None:
+    """The best of the alternatives where a fit has another link or scale and is not among those that fit as well; else None."""
+    best = next((one for one in found if one.aic is not None), None)
+    if best is None or best.aic is None or fit.aic is None or fit.method != "ml":
+        return None
+    return best if fit.aic > best.aic + _ALIKE else None
+
+
+def widened(fit: PodFit, joined: OverLinks) -> PodFit:
+    """A fit whose bounds on a90 reach as far as those of all links and scales together; None where one of these has none."""
+
+    def farther(bounds: Bounds, end: float | None, pick: Callable[..., float]) -> Bounds:
+        own = {name: value for name, value in asdict(bounds).items() if value is not None}
+        return Bounds(**{name: None if end is None else pick(value, end) for name, value in own.items()})
+
+    return replace(
+        fit,
+        a90_95=farther(fit.a90_95, joined.a90_95, max),
+        a90_95_two_sided=farther(fit.a90_95_two_sided, joined.a90_high, max),
+        a90_low_two_sided=farther(fit.a90_low_two_sided, joined.a90_low, min),
     )
 
 

@@ -75,7 +75,7 @@ def test_a_turned_object_a_moved_table_and_a_shutter_are_other_scenes():
 
 @pytest.mark.parametrize("share", [0.08, 0.16, 0.3])
 def test_light_that_strays_into_a_shadow_without_noise_is_one_scene(share):
-    """Behind lead only the tail of the spread brings light: 0.7 % of the field's, averaged over so many pixels that it has no noise."""
+    """Behind lead only the tail of the spread brings light: 0.7 % of the field's, the mean of so many pixels that it has no noise."""
     rng = np.random.default_rng(6)
     y, x = np.mgrid[:80, :96]
     behind = np.hypot(y - 40, x - 48) < np.sqrt(share * y.size / np.pi)

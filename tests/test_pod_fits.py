@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import raytwin as rt
 from raytwin.errors import FitError, InputError
 from raytwin.pod import LINKS, check_trials, compare_models, curve_with_band, fit_batch, fit_many, fit_pod, joint_region
 from raytwin.pod.hit_miss import Z_ONE_SIDED, Z_TWO_SIDED, trusted_bound
 from raytwin.pod.likelihood import profile, size_bound
-from raytwin.pod.models import over_links
+from raytwin.pod.models import better_curve, over_links, widened
 from raytwin.pod.separation import check_separation
 
 
@@ -242,6 +243,28 @@ def test_links_that_fit_alike_are_joined_and_bracket_each_of_them():
     assert joined.a90_low <= best.a90_low
     assert joined.a90_high >= best.a90_high
     assert joined.a90_95 >= best.a90_95
+
+
+def test_bounds_of_a_curve_that_fits_worse_reach_as_far_as_those_of_curves_that_fit():
+    rng = np.random.default_rng(3)
+    size = rng.uniform(0.3, 4.5, 1500)
+    hit = rng.random(1500) < 1.0 / (1.0 + (2.0 / size) ** 5)
+    found = compare_models(check_trials(size, hit))
+    fit = fit_pod(size, hit, link="cloglog")
+    assert better_curve(found, fit) is found[0]
+    assert better_curve(found, fit_pod(size, hit, link="logit", log_size=True)) is None
+    joined = over_links(found, link="cloglog", log_size=False)
+    wide = widened(fit, joined)
+    true = 2.0 * 9.0**0.2
+    assert not fit.a90_low_two_sided.modified <= true <= fit.a90_95_two_sided.modified
+    assert wide.a90_low_two_sided.modified <= true <= wide.a90_95_two_sided.modified
+    assert wide.a90_95.modified == max(joined.a90_95, fit.a90_95.modified)
+    answer = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit")
+    assert answer.to_dict()["a90_95"]["modified"] == wide.a90_95.modified
+    assert any("another curve fits better" in text for text in answer.warnings)
+    named = rt.fit_pod({"size": size, "hit": hit}, size="size", hit="hit", link="cloglog")
+    assert named.fit == fit
+    assert any("another curve fits better" in text for text in named.warnings)
 
 
 def test_sizes_far_from_0_beside_their_differences_are_told():

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     )
 
 _FAR = 100.0  # ranges of the others: no study has a size so far away
-_CONTRADICTED = 6.0  # in AIC: a twentieth of the support (Burnham & Anderson 2002, 2.6)
 _NO_RESPONSES = "curves of a continuous response are not compared"
 
 
@@ -340,7 +339,7 @@ def fit_pod(
     size: str | None = None,
     hit: str | Sequence[str] | None = None,
     trials: str | None = None,
-    link: str = "cloglog",
+    link: str | None = None,
     log_size: bool = False,
     method: str | None = None,
     repeats: str | None = None,
@@ -370,7 +369,8 @@ def fit_pod(
     Args:
         table: a CSV file, a pandas data frame, column -> values, or what `detect` returned; a row a trial.
         size, hit, trials, site, network, image: names of the columns; None: the usual ones.
-        link: `cloglog`, `loglog`, `logit` or `probit`.
+        link: `cloglog`, `loglog`, `logit` or `probit`, whose bounds are given. None: `cloglog`; where another fits
+            better, the bounds reach as far as those of all links and scales that fit.
         log_size: the curve on the logarithm of the size.
         method: `ml` or `firth`; None: `ml`, and `firth` where hits and misses do not overlap.
         repeats: `crossed`, `scaled`, `cluster` or `pooled`; None: `crossed` where network and image are known, else `pooled`.
@@ -481,7 +481,7 @@ def _power(box_cox: float | str | None, *, log_response: bool) -> float | None:
 def _hit_curve(
     table: PodTable,
     *,
-    link: str,
+    link: str | None,
     log_size: bool,
     method: str,
     repeats: str,
@@ -496,14 +496,15 @@ def _hit_curve(
 ) -> PodCurve:
     from ..pod import compare_models, fit_as_published
     from ..pod import fit_pod as fit_columns
-    from ..pod.models import over_links
+    from ..pod.models import better_curve, over_links, widened
 
+    chosen = link or "cloglog"
     with _naming_far_sizes(table=table):
         fit = fit_columns(
             table.size,
             table.hits if table.hits is not None else [],
             trials=table.trials,
-            link=link,
+            link=chosen,
             log_size=log_size,
             method=method,
             repeats=repeats,
@@ -518,9 +519,13 @@ def _hit_curve(
     alternatives = compare_models(trials)
     more: dict[str, Any] = {"alternatives": [asdict(one) for one in alternatives]}
     if fit.repeats == "pooled" and not fit.separated:
-        joined = over_links(alternatives, link=link, log_size=log_size)
+        joined = over_links(alternatives, link=chosen, log_size=log_size)
         more["over_links"] = None if joined is None else asdict(joined)
-        warnings += _better_curve(alternatives, fit)
+        best = better_curve(alternatives, fit)
+        if best is not None and joined is not None:
+            warnings.append(_better_told(fit, best, widened=link is None))
+            if link is None:
+                fit = widened(fit, joined)
     asked: dict[str, Callable[[], Any]] = {}
     if ceiling or floor:
         asked["lapse"] = lambda: _lapse(trials, fit, ceiling=ceiling, floor=floor, warnings=warnings)
@@ -529,7 +534,7 @@ def _hit_curve(
     if covariates:
         asked["covariates"] = lambda: _covariates(table, fit, covariates, method=method, warnings=warnings)
     if explain:
-        asked["explanation"] = lambda: _explanation(table, explain, link=link, repeats=repeats, seed=seed)
+        asked["explanation"] = lambda: _explanation(table, explain, link=chosen, repeats=repeats, seed=seed)
     for name, make in asked.items():
         try:
             more[name] = make()
@@ -541,19 +546,17 @@ def _hit_curve(
     return PodCurve(fit=fit, table=table, more=plain(more), warnings=tuple(warnings))
 
 
-def _better_curve(alternatives: "Sequence[Alternative]", fit: "PodFit") -> list[str]:
-    """A warning where hits contradict the chosen link and scale: another fits far better."""
-    best = next((one for one in alternatives if one.aic is not None), None)
-    if fit.aic is None or best is None or best.aic is None or fit.method != "ml":
-        return []
-    if fit.aic <= best.aic + _CONTRADICTED:
-        return []
+def _better_told(fit: "PodFit", best: "Alternative", *, widened: bool) -> str:
+    """A warning that another link or scale fits far better; widened: bounds are those of all that fit."""
     told = "none" if best.a90 is None else f"{best.a90:.4g}"
-    return [
-        f"the hits contradict this curve: {best.link} on {'ln ' if best.log_size else ''}size fits better (AIC lower by"
-        f" {fit.aic - best.aic:.3g}, a90 {told}); see over_links and alternatives, and a ceiling or floor where large"
-        " objects are missed or small ones hit"
-    ]
+    bounds = (
+        "bounds are those of all curves that fit" if widened else "bounds of all curves that fit stand in over_links"
+    )
+    return (
+        f"another curve fits better: {best.link} on {'ln ' if best.log_size else ''}size (AIC lower by"
+        f" {(fit.aic or 0.0) - (best.aic or 0.0):.3g}, a90 {told}); {bounds}; try a ceiling or floor where large objects are missed"
+        " or small ones hit"
+    )
 
 
 @contextmanager

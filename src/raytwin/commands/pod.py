@@ -33,7 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--size", metavar="COLUMN", help="default: contrast, size, size_mm, ... the first there")
     add("--hit", metavar="COLUMN", help="0 or 1; A,B,C = one inspection each; default: hit")
     add("--trials", metavar="COLUMN", help="number of trials of each row (grouped data)")
-    add("--link", default="cloglog", choices=("cloglog", "loglog", "logit", "probit"))
+    add(
+        "--link",
+        choices=("cloglog", "loglog", "logit", "probit"),
+        help="default: cloglog, with the bounds of all links that fit where another fits better",
+    )
     add("--log-size", action="store_true", help="curve on the logarithm of the size")
     add("--method", choices=("ml", "firth"), help="default: ml, and firth where hits and misses do not overlap")
     add(

@@ -449,6 +449,7 @@ def test_lines_are_not_pictures(diagnosed):
     assert "frames of 4 x 48; expected at least 16 rows and columns" in lines[0]
 
 
+@pytest.mark.slow
 def test_wrong_label_is_said_first_and_no_effect_is_named(diagnosed, tmp_path):
     def change(file):
         one, other = (file["series"][name].attrs for name in (FLAT_40, FLAT_90))

@@ -390,10 +390,11 @@ def test_where_beams_differ_attenuation_may_change_with_the_depth(monkeypatch):
     )
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._read_texture", lambda *_: np.zeros(4))
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns._of_scene", lambda *_, **__: {})
+    monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns.declared_spot_px", lambda *_: 0.0)
     monkeypatch.setattr("raytwin.diagnosis.problem.nuisance_columns.gradient", lambda image: (image, image))
 
     def columns(beams_differ):
-        model = SimpleNamespace(sharp=False, beams_differ=beams_differ)
+        model = SimpleNamespace(sharp=False, beams_differ=beams_differ, base=None)
         session = SimpleNamespace(model=model, maps=SimpleNamespace(shares={}))
         return nuisances_of_series(session, probes, signal, Redrawn(thicker={"Al": (thinner, {})}, straight=None))
 

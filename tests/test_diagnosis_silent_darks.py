@@ -46,7 +46,7 @@ def test_darks_of_exact_zeros_are_compared_and_show_no_gap(diagnosed):
 @pytest.mark.parametrize(
     ("effect", "low", "high"),
     [
-        ("image_lag=1", 0.7, 1.4),
+        pytest.param("image_lag=1", 0.7, 1.4, marks=pytest.mark.slow),
         pytest.param("output_drift=1", 0.5, 2.0, marks=pytest.mark.slow),
         pytest.param("kv_error=2", 1.7, 2.3, marks=pytest.mark.slow),
     ],

@@ -32,7 +32,7 @@ NONLINEARITY = Effect(
             low=0.3,
             high=5.0,
             default=1.0,
-            source="departure from the initial line at half of the highest level",
+            source="departure from the initial line at half of `highest_signal_DN`, full scale of the ADC where that is 0",
             log=False,
             signed=True,
         ),

@@ -147,7 +147,7 @@ OFF_FOCAL = Effect(
     grid=Grid(
         shares=(0.8,),
         variants=(
-            *({"width_mm": width, "peakedness": 0.5, "down_mm": 0.0, "right_mm": 0.0} for width in (2.7, 8.3)),
+            {"width_mm": 4.7, "peakedness": 0.5, "down_mm": 0.0, "right_mm": 0.0},
             # from the spot to one side, falling exponentially: from a source about the spot no small step leads there
             *({"width_mm": 1.0, "peakedness": 1.0, "down_mm": down, "right_mm": right} for down, right in _SIDES),
         ),

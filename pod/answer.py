@@ -1,10 +1,10 @@
 """POD fits as plain numbers, and what a table of trials asks of a fit."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
-from .hit_miss import PodFit
+from .hit_miss import Bounds, PodFit, trusted_bound
 from .response import ResponseFit
 from .table import PodTable
 from .trials import Trials, check_trials
@@ -92,8 +92,8 @@ def trusted_from_answer(answer: Mapping[str, Any], name: str) -> Any:
     bounds = answer.get(name)
     if not isinstance(bounds, Mapping):
         return None
-    kinds = ("wald",) if answer.get("separated") else ("modified", "likelihood_ratio")
-    return next((bounds[kind] for kind in kinds if bounds.get(kind) is not None), None)
+    known = Bounds(**{field.name: bounds.get(field.name) for field in fields(Bounds)})
+    return trusted_bound(known, separated=bool(answer.get("separated")))
 
 
 def response_answer(fit: ResponseFit) -> dict[str, Any]:

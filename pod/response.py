@@ -28,9 +28,10 @@ from .trials import codes_from_labels
 Array = NDArray[np.float64]
 
 _PROBIT = LINKS["probit"]
-_DOUBTED = 0.01  # 1 to 5 of 100 straight lines with one scatter are doubted, of 20 rows 7
+# p-values: a warning for one straight line in a hundred, no bounds for one in a thousand, as readings of a tube are left out
+_DOUBTED = 0.01
 _REJECTED = 0.001
-_FEWEST_TO_TEST = 12
+_FEWEST_TO_TEST = 12  # rows: with fewer, p-values that hold for large samples say little
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,7 +6,6 @@ computed on the quietened picture and added, so that the reference's own noise s
 are drawn with all effects in either case.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -23,12 +22,13 @@ from ..frames.light import Charge, charge_of, of_quanta
 from ..frames.response import light_of, responded
 from ..frames.stages import Chain, Clock, Exposure, LineMemory, Panel, Quanta, TubeOutput, chain_of
 from ..kernels.projection import project_polychromatic
-from ..line.line_state import FinePicture, FloatArray, LineContext, LineState, Transfer
+from ..line.line_state import FinePicture, FloatArray, LineContext, LineState
 from ..line.series_request import SeriesRequest
 from ..line.spectral_signal import OpenBeam, SpectralModel
 from ..line.twin import Twin
 from ..line.twin_spectrum import spectral_model_of
 from ..spread._fine_picture import FineCells, pixel_means, sampled_picture
+from ..spread.spot import gaussian_transfer
 
 _PICTURE = ("arrivals", "object_blur", "optics")
 
@@ -239,7 +239,7 @@ class ImageEffects:
         later = [item for item in self.effects if effect_of(item).stage != "beam"]
         state = replace(self._through(state, later, thickness_mm), shift_px=(0.0, 0.0))  # masks stay with the picture
         if focal_blur_px > 0:
-            state = replace(state, object_transfers=(*state.object_transfers, _gaussian(focal_blur_px)))
+            state = replace(state, object_transfers=(*state.object_transfers, gaussian_transfer(focal_blur_px)))
         charge = self._charge(state)
         ratio = np.maximum(responded(state, charge.mean), 1e-30) / np.maximum(self.flat_DN, 1e-30)
         return AffectedImage(state=state, charge=charge, log_image=-np.log(ratio))
@@ -330,11 +330,3 @@ class ImageEffects:
         interval_s = (self.setting.exposure_ms + (twin.instrument.readout_ms or 0.0)) / 1000.0
         clock = Clock(start_s=0.0, interval_s=interval_s, frames=1, averaged=averaged)
         return chain_of(self._end, panel, clock, mean_of=mean_of, noisy=noisy)
-
-
-def _gaussian(sigma_px: float) -> Transfer:
-    def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:
-        rows, columns = (np.exp(-2.0 * (math.pi * sigma_px * f) ** 2) for f in (f_row, f_column))
-        return np.asarray(rows * columns)
-
-    return transfer

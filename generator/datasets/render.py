@@ -24,12 +24,12 @@ from ..scenes.describe import Scene
 from ..scenes.shapes import Rays
 from ..spread.noise import digitise, sample_frame_noise
 from ..spread.psf import Spread, sampled_gaussian_1d
+from ..spread.spot import spot_image_px
 
 Array = NDArray[np.float64]
 
 SUPERSAMPLING = 3
 _TILE_PX = 16
-_FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ class Geometry:
     @property
     def focal_blur_px(self) -> float:
         """Standard deviation of the focal spot's image on the detector, pixels (the spot taken as a Gaussian of its FWHM)."""
-        return self.focal_spot_mm * (self.magnification - 1.0) / _FWHM / self.pixel_mm
+        return spot_image_px(self.focal_spot_mm, magnification=self.magnification, pixel_mm=self.pixel_mm)
 
     def rays(self, supersampling: int = 1) -> Rays:
         """Rays to the middles of pixels, or of sub-pixels."""

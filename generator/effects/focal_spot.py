@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..line.line_state import FloatArray, LineContext, LineState, needed
+from ..spread.spot import spot_image_px
 from .effect import Effect, Grid, Parameter, Shows
-
-_SIGMA_OF_FWHM = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 
 def _transfer_of_spot(f: FloatArray, flatness: float) -> FloatArray:
@@ -37,7 +36,7 @@ def _blur_by_focal_spot(state: LineState, parameters: Mapping[str, float], conte
         context.source_object_mm, "source_object_mm", name
     )
     flatness = parameters.get("flatness", 0.0)
-    sigma_px = _SIGMA_OF_FWHM * parameters["strength"] * (magnification - 1.0) / pitch
+    sigma_px = spot_image_px(parameters["strength"], magnification=magnification, pixel_mm=pitch)
     along_row, along_column = sigma_px * math.sqrt(parameters["aspect"]), sigma_px / math.sqrt(parameters["aspect"])
 
     def transfer(f_row: FloatArray, f_column: FloatArray) -> FloatArray:

@@ -4,8 +4,8 @@ Seen from the object it is a second, wide source; its picture of an edge is as m
 
 H(f) = 1 - w + w P,    h = 2 (pi s_d f)^2,    u = 2 pi f a_d,    s_d = s (M - 1),    a_d = a (M - 1)
 
-s is the standard deviation of its profile along a line, p its peakedness: a third of the excess kurtosis along a line. a is where its
-middle lies beside the spot: an anode goes on to one side of it, and so do the electrons that strike it again.
+a is where the mean of its profile lies beside the spot: an anode goes on to one side of it, and so do the electrons that strike it
+again. Where a is 0, s is the standard deviation of the profile along a line and p its peakedness, a third of the excess kurtosis.
 
 p > 0: P = (1 + p (h + i u))^(-1 / p). Gaussians whose variances and places are in proportion to a number of a gamma law of relative
 variance p. Without a the profile falls exponentially from the middle at p = 2/3, and has a peak and a long tail beyond; without s it
@@ -32,9 +32,10 @@ from ..line.line_state import FloatArray, LineContext, LineState, needed
 from .effect import Effect, Grid, Parameter, Shows
 
 _NEAR_GAUSSIAN = (
-    0.02  # how far below 0 peakedness has the first order of a Gaussian: the transfer is off by less than 3e-4
+    0.02  # so little below 0 the first order of peakedness is enough: the transfer is off by less than 3e-4
 )
-_SIDES = ((-5.0, 0.0), (5.0, 0.0), (0.0, -5.0), (0.0, 5.0))  # mm: as far as these electrons spread
+# mm, to each side of the panel: a third of the plausible range
+_SIDES = ((-5.0, 0.0), (5.0, 0.0), (0.0, -5.0), (0.0, 5.0))
 _RING = -0.5  # peakedness of a source that is its rim alone; no even profile is flatter
 
 
@@ -147,6 +148,7 @@ OFF_FOCAL = Effect(
     grid=Grid(
         shares=(0.8,),
         variants=(
+            # about the spot: in the middle of widths from 1.5 to 15 mm, in the logarithm
             {"width_mm": 4.7, "peakedness": 0.5, "down_mm": 0.0, "right_mm": 0.0},
             # from the spot to one side, falling exponentially: from a source about the spot no small step leads there
             *({"width_mm": 1.0, "peakedness": 1.0, "down_mm": down, "right_mm": right} for down, right in _SIDES),

@@ -9,7 +9,7 @@ from ..acquisition.setting import text_from_filters
 from ..calibration.validate import Validation, compared
 from ..generator.line.twin import Estimate, Level, Twin
 from ..generator.predictions.tube_twin import TubeTwin
-from ..generator.twins.twin_answer import calibration_answer
+from ..generator.twins.twin_answer import BEYOND, calibration_answer
 from ..reports import Chart, Figure, KeyFigure, Line, Picture, Points, ResultPage, Rule, Section, SortedTable, Step
 from ..reports.chart import AFTER, BEFORE, MEASURED, QUIET, SERIES_COLOURS, SHAPES, Shape, rows_px
 
@@ -129,7 +129,7 @@ def _parameters(twin: Twin | TubeTwin, answer: Mapping[str, Any]) -> SortedTable
         "dark": ("dark_DN", "DN"),
         "read noise": ("read_noise_DN", "DN"),
         "optical spread, Gaussian width": ("psf_sigma_px", "px"),
-        "further filtration": ("inherent_filtration_mm_Al", "mm Al"),
+        "inherent filtration": ("inherent_filtration_mm_Al", BEYOND),
         "flux over the spectrum model's": ("flux_scale", ""),
     }
     rows = [(name, _interval(answer[key], unit)) for name, (key, unit) in units.items() if key in answer]

@@ -12,6 +12,7 @@ from ..line.twin import BAD_PIXEL_MAP, Estimate, SpectralPosterior, SpreadEstima
 from ..predictions.tube_twin import TubeTwin
 
 _EQUIVALENT_KEV = 30.0
+BEYOND = "mm Al beyond the declared"  # unit of the inherent filtration
 
 
 def spread_answer(spread: SpreadEstimate) -> dict[str, Any]:
@@ -100,7 +101,7 @@ def twin_table(twin: Twin) -> Table:
             ("dark", "dark_DN", "DN"),
             ("read noise", "read_noise_DN", "DN"),
             ("optical spread (sigma)", "psf_sigma_px", "px"),
-            ("further filtration", "inherent_filtration_mm_Al", "mm Al"),
+            ("inherent filtration", "inherent_filtration_mm_Al", BEYOND),
             ("flux scale", "flux_scale", "x model"),
         )
     ]
@@ -186,7 +187,7 @@ def tube_table(twin: TubeTwin) -> Table:
     rows = tuple(
         (name, *interval_text(answer[key]), unit)
         for name, key, unit in (
-            ("further filtration", "inherent_filtration_mm_Al", "mm Al"),
+            ("inherent filtration", "inherent_filtration_mm_Al", BEYOND),
             ("output", "flux_scale", "x model"),
         )
     )

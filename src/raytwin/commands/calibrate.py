@@ -186,6 +186,7 @@ def _table_lines(evidence: dict[str, Any]) -> list[str]:
 
 def _text(result: dict[str, Any], path: Path) -> str:
     from ..generator.line.twin import BAD_PIXEL_MAP
+    from ..generator.twins.twin_answer import BEYOND
 
     lines = []
     bad_pixels = result[BAD_PIXEL_MAP]
@@ -196,7 +197,7 @@ def _text(result: dict[str, Any], path: Path) -> str:
             f"optical spread      {_spread(result)}",
         ]
     lines += [
-        f"further filtration  {_interval(result['inherent_filtration_mm_Al'], ' mm Al')}",
+        f"inherent filtration {_interval(result['inherent_filtration_mm_Al'], f' {BEYOND}')}",
         f"flux scale          {_interval(result['flux_scale'], ' x the spectrum model')}",
     ]
     if bad_pixels is not None:

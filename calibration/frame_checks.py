@@ -284,7 +284,7 @@ def _change(
 
     `noise_growth` is how much more noise a mean over many blocks may have than white noise of the blocks' variance has.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri  # of chi-square's upper tail; scipy.stats takes a second to import
 
     difference = later - earlier
     signal = float(np.mean(earlier))
@@ -314,7 +314,7 @@ def _change(
         smooth = surface * earlier + solution[count]
         # what noise alone gives to the coefficients, so that only more than that is a change
         spread = 1.4826 * float(np.median(np.abs(left))) * noise_growth / math.sqrt(left.size)
-        by_noise = spread**2 * float(chi2.isf(FALSE_ALARM, len(design)))
+        by_noise = spread**2 * float(chdtri(len(design), FALSE_ALARM))
         shape = math.sqrt(max(float(np.var(smooth - level * earlier)) - by_noise, 0.0)) / signal
         level = math.copysign(max(abs(level) - _two_sided_limit(FALSE_ALARM) * spread / signal, 0.0), level)
     lines = max(float(np.max(np.abs(np.median(left, axis=axis)))) for axis in (0, 1))

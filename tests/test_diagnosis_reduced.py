@@ -715,6 +715,36 @@ def test_nuisances_act_on_what_is_there_once_an_effect_is_found(line):
     assert seen
 
 
+def test_what_stands_beyond_the_borders_is_a_random_part_of_the_effect_that_brings_it_in(line):
+    """Of a glare one number a placement of a scene, in its series' pictures alone; a twin's glare has it, too."""
+    variants = [item for item in catalogue_variants() if item.effect == "veiling_glare" and item.since == "always"]
+    twin = read_twin(line / "twin.h5")
+    with open_acquisition(line / "session.h5") as acquisition:
+        problem = build_problem(acquisition, twin, variants=variants)
+        farther = replace(variants[0], parameters={**variants[0].parameters, "length_mm": 15.0}, strengths=(2.0,))
+        problem = problem.with_variants([(farther, problem.respond([farther])[0])])
+        glare = AppliedEffect(
+            id="veiling_glare", parameters={**variants[0].parameters, "strength": 2.0}, since="always"
+        )
+        (point,) = build_problem(acquisition, replace(twin, effects=(glare,)), variants=()).given
+    places = [
+        None
+        if view.session.series.kind != "object"
+        else (view.session.series.scene, view.session.request.source_object_mm)
+        for view in problem.views
+    ]
+    first, *_, last = problem.curves
+    assert first.spread.shape[1] == len({place for place in places if place is not None})
+    of_maps = np.array([name.statistic == "mean frame" for name in problem.names])
+    assert not np.any(first.spread[~of_maps])
+    for column in first.spread.T:
+        there = {places[number] for number in problem.series_of[np.flatnonzero(column)]}
+        assert len(there) == 1 and None not in there
+    # farther light has farther surroundings
+    assert last.variant is farther and np.abs(last.spread).sum() > 1.5 * np.abs(first.spread).sum()
+    assert np.linalg.norm(point.curve.spread) == pytest.approx(np.linalg.norm(first.spread), rel=0.05)
+
+
 def test_what_calibration_takes_in_divides_later_frames(line):
     """A response that bends by a fifth was there when the gain map was made, at the level of its flats."""
     variant = next(

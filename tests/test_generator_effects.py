@@ -1553,11 +1553,7 @@ def test_light_from_beyond_a_border_is_that_of_a_field_that_goes_on_there(series
     assert np.abs(wanted).max() > 0.004 * state.signal_DN.max()
     # in the outermost pixels a border as sharp as pixels rings
     inner = np.s_[3:-3, 3:-3]
-    np.testing.assert_allclose(found.sum(axis=0)[inner], wanted[inner], atol=0.04 * np.abs(wanted).max())
-    # each border's part lies beside it
-    beside = np.s_[:8, :], np.s_[32:, :], np.s_[:, :8], np.s_[:, 32:]
-    for part, there in zip(found, beside, strict=True):
-        assert np.abs(part).max() == np.abs(part[there]).max()
+    np.testing.assert_allclose(found[inner], wanted[inner], atol=0.04 * np.abs(wanted).max())
     assert not LineModel(series_line).from_beyond(asked).any()
 
 

@@ -1,7 +1,7 @@
 """Diagnoses of sessions of two lines whose simulator draws every deposit of energy: one planted effect, two, and none.
 
 Nothing in the simulation is raytwin's; h5py writes the file format. It shares xraylib's cross sections with the twin, and SpekPy,
-of which it takes another model (`kqp`). Deposits are Poisson numbers in ten bins of light and three by three samples a pixel: K
+of which it takes another model (`kqp`). Deposits are Poisson numbers in ten bins of light and seven by seven samples a pixel: K
 photons escape, light depends on depth, two values stand for its spread (Swank). A sample is the mean of twelve rays, a thickness map
 the mean over each pixel. Light has a tail from the start. Gains, darks and series wander a little; attenuation is off by 0.5 %,
 thickness by 0.3 % (sd). The declarations are not quite true: line `A` (CsI, 0.139 mm) has a film of tungsten in the beam, packing of
@@ -36,7 +36,9 @@ from raytwin.errors import InputError
 
 ENERGY_keV = np.arange(5, 121) + 0.5  # middles of bins of 1 keV
 BINS = 10  # of deposited light
-SAMPLES = 3  # along each side of a pixel
+SAMPLES = (
+    7  # along each side of a pixel: light of a deposit starts at the middle of its sample, which noise does not see
+)
 MARGIN_px, WIDE_px = 5, 64  # around the panel: of the picture, of what glare and scatter reach in from
 PADDING = 24  # samples around the picture in a Fourier transform
 # at room temperature: NIST X-ray mass attenuation coefficients, tables 1 and 2; Gd2O2S as a crystal

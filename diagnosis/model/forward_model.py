@@ -115,7 +115,7 @@ class ForwardModel:
         return line.expect(shown)
 
     def from_beyond(self, change: Change, request: SeriesRequest) -> NDArray[np.float64]:
-        """What each border would let into the field of a series under a change, see `LineModel.from_beyond`.
+        """What the surroundings would let into the field of a series under a change, see `LineModel.from_beyond`.
 
         Raises:
             InputError: the twin knows too little for it.

@@ -251,9 +251,9 @@ class SessionModel:
         moved = np.asarray(np.asarray(changed.mean_DN) - np.asarray(one.expected.mean_DN), dtype=np.float32)
         return moved / asked.absorbed.divides, expected_scalars(changed, one.context)
 
-    def from_beyond(self, one: SeriesModel, asked: Asked) -> NDArray[np.float64]:
-        """What each border would let into the picture of a series (4, row, column), DN, see `LineModel.from_beyond`."""
-        return self.model.from_beyond(*self._found(one, asked.change))
+    def from_beyond(self, one: SeriesModel, change: Change) -> NDArray[np.float64]:
+        """What the surroundings would let into the picture of a series (row, column), DN, see `LineModel.from_beyond`."""
+        return self.model.from_beyond(*self._found(one, change))
 
     def _alone(self, one: SeriesModel, change: Change, known: Known) -> tuple[ExpectedSeries, Map, Mapping[str, float]]:
         """A series under a change, its mean frame's change (DN) and its scalar probes, dark and gain map left as they were.

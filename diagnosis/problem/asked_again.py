@@ -11,9 +11,10 @@ from ..model.changes import Change, Variant
 from ..model.forward_model import strength_rows
 from ..model.responses import Asked, SessionModel
 from ..session.even_maps import full_size
-from .nuisance_columns import Columns, light_from_beyond, nuisances_of_series
+from .nuisance_columns import Columns, nuisances_of_series
 from .other_scenes import OtherScenes
 from .series_probes import SeriesProbes
+from .surroundings import light_let_in
 
 _LEAST_FACTOR = 1e-3  # standard deviations of a probe, below which a nuisance is none
 
@@ -83,6 +84,10 @@ class AskedAgain:
             if not any(asked[row].failed for row in (*rows, *range(len(changes), len(asked))))
         }
 
+    def let_in(self, effect: AppliedEffect) -> NDArray[np.float64]:
+        """What borders may let in of an effect by chance, see `light_let_in`."""
+        return light_let_in(self.session, [one.probes for one in self.series], effect)
+
     def factors_with(self, effects: Sequence[AppliedEffect]) -> Columns:
         """Responses (probe,) to nuisances by name where effects have been found; the base's where they change nothing.
 
@@ -117,8 +122,6 @@ class AskedAgain:
         here = replace(one.probes, series=self.session.under(one.probes.series, found))
         signal = np.asarray(one.signal_DN, np.float64) + full_size(at[0], one.signal_DN.shape)
         redrawn = one.scenes.drawn(self.session, here.series, found)
-        if here.series.session.series.kind == "object":
-            columns |= light_from_beyond(here, self.session.from_beyond(one.probes.series, found))
         return columns | nuisances_of_series(self.session, here, signal, redrawn)
 
 

@@ -45,6 +45,7 @@ from .other_scenes import NO_SCENES, OtherScenes, other_scenes
 from .problem import Problem, SeriesView, read_exactly
 from .series_block import SeriesBlock, by_chance, jitter_of, series_block
 from .series_probes import MeanFrame, mean_frame, series_probes
+from .surroundings import light_let_in
 
 _OWN_NOISE = "the flats are single frames: how much noise there is, is known only from these same series"
 # step in spectral parameters, over the posterior's standard deviation, about a point that the session wants
@@ -345,7 +346,7 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
     factors = _factors(blocks, responses, compared)
     first_less = len(responses) - len(compared.had)
     done = {effect: -response for effect, response in zip(compared.had, responses[first_less:], strict=True)}
-    curves, missing = _curves(blocks, responses, names, compared, done)
+    curves, missing = _curves(parts, responses, names, compared, done)
     of_probes = [(name.axis, blocks[number].session.series) for number, name in zip(series_of, names, strict=True)]
     groups, _ = _numbered(
         [
@@ -382,11 +383,11 @@ def _joined(parts: Sequence[_Part], compared: _Compared) -> Problem:
             factors=factors,
         ),
         side=compared.side,
-        given=tuple(_as_given(item, done[effect]) for effect, item in compared.had.items()),
+        given=tuple(_as_given(item, done[effect], session, parts) for effect, item in compared.had.items()),
     )
 
 
-def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
+def _as_given(effect: AppliedEffect, done: NDArray[np.float64], session: SessionModel, parts: Sequence[_Part]) -> Point:
     """An effect that the twin has, as it has it; done (probe,): what it does there."""
     inner = {name: value for name, value in effect.parameters.items() if name != "strength"}
     strength = abs(effect.parameters["strength"])
@@ -400,6 +401,8 @@ def _as_given(effect: AppliedEffect, done: NDArray[np.float64]) -> Point:
         strengths=(strength,),
     )
     curve = Curve(variant=variant, responses=done[None, :])
+    if EFFECTS[effect.id].variation.random == "surroundings":
+        curve = replace(curve, spread=light_let_in(session, [part.probed.probes for part in parts], effect))
     level = USUAL_LEVEL if effect.law_sd is None else min(effect.law_sd, FARTHEST_LEVEL)
     # found without an interval, or stated by hand: as intervals of strengths are widened for real laws
     sd = EFFECTS[effect.id].reading.law_sd if effect.strength_sd is None else effect.strength_sd
@@ -456,16 +459,18 @@ def _of_quanta() -> dict[str, str]:
 
 
 def _curves(
-    blocks: Sequence[SeriesBlock],
+    parts: Sequence[_Part],
     responses: NDArray[np.float64],
     names: Sequence[ProbeName],
     compared: _Compared,
     done: Mapping[str, NDArray[np.float64]],
 ) -> tuple[list[Curve], dict[str, str]]:
     """Curves, and why each effect without one cannot be judged; done (probe,): by the base's own effects."""
+    blocks, probes = [part.block for part in parts], [part.probed.probes for part in parts]
+    session = compared.measured.expected
     curves: list[Curve] = []
     missing: dict[str, str] = {}
-    base = compared.measured.expected.model.base
+    base = session.model.base
     readout_ms, read_noise_DN = base.instrument.readout_ms, base.noise.read_noise_DN.value
     for variant, rows in zip(compared.variants, strength_rows(compared.variants), strict=True):
         effect = EFFECTS[variant.effect]
@@ -475,6 +480,8 @@ def _curves(
             continue
         own = responses[list(rows)] + done.get(variant.effect, 0.0)
         spread = by_chance(variant, blocks, rows[0], readout_ms)
+        if effect.variation.random == "surroundings":
+            spread = light_let_in(session, probes, variant.applied(variant.strengths[0]))
         # a wandering output shifts levels by chance even where too few frames show its noise
         wanders = effect.variation.random == "output" and spread is not None and bool(np.any(spread))
         if not (wanders or float(np.max(np.abs(own))) > LEAST_RESPONSE):

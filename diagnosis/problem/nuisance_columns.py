@@ -327,19 +327,6 @@ def _of_thickness(
     return columns
 
 
-def light_from_beyond(probes: SeriesProbes, images_DN: NDArray[np.float64]) -> Columns:
-    """What effects blur into the field from beyond its borders, where nobody knows the scene, shrunk.
-
-    images_DN (border, row, column): what a border lets in if the picture goes on there as it ends, less what it lets in if it
-    mirrors. An edge that crosses the border runs on as straight as it came by twice that.
-    """
-    if not images_DN.any():
-        return {}
-    place = _place(probes.series.session)
-    found = probes.of_maps(scales.BEYOND_SD * images_DN) * probes.shrink
-    return {f"beyond border {number} of {place}": column for number, column in enumerate(found)}
-
-
 def _gain_map_noise(session: SessionModel, probes: SeriesProbes, signal: NDArray[np.float64]) -> Columns:
     """Smooth noise of the gain map by shape: what few calibrating frames leave of it is the same in every series.
 

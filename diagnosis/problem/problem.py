@@ -202,7 +202,10 @@ class Problem:
             onset = variant.effect, variant.since
             alike = [item for item in self.curves if (item.effect, item.variant.since) == onset]
             like = next((item for item in alike if item.variant.name == variant.refined_from), alike[0])
-            curves.append(replace(like, variant=variant, responses=responses))
+            curve = replace(like, variant=variant, responses=responses)
+            if EFFECTS[variant.effect].variation.random == "surroundings":
+                curve = replace(curve, spread=self._open.let_in(variant.applied(variant.strengths[-1])))
+            curves.append(curve)
         return replace(self, curves=(*self.curves, *curves))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import InputError
 from ..line.line_state import FloatArray, LineContext, LineState, needed
 from ._light_spread import order_parameter, spread_transfer
-from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows
+from .effect import LIT_SERIES, Effect, Grid, Parameter, Shows, Variation
 
 _USUAL_ORDER = 0.5
 
@@ -104,5 +104,6 @@ VEILING_GLARE = Effect(
     shows=Shows(series=LIT_SERIES, axis="sharpness"),
     either_onset=True,
     absorbed="noise",
+    variation=Variation(random="surroundings"),
     grid=Grid(shares=(0.8,), variants=({"length_mm": 2.1}, {"length_mm": 9.5}, {"length_mm": 4.5, "even_share": 0.5})),
 )

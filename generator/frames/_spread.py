@@ -289,14 +289,13 @@ def blurred_object(state: LineState) -> tuple[FloatArray, FloatArray]:
 
 
 def from_beyond(state: LineState, spread: Spread) -> FloatArray:
-    """What pixels would get more (4, row, column), DN, if the picture went on as it ends beyond a border, and did not mirror there.
+    """What pixels would get more (row, column), DN, if the picture went on as it ends beyond its borders, and did not mirror there.
 
-    The borders: above, below, left, right. What effects blur alone: the calibrated spread ends within some pixels.
+    What effects blur alone: the calibrated spread ends within some pixels.
     """
     rows, columns = state.signal_DN.shape
-    result = np.zeros((4, rows, columns))
     if not (state.object_transfers or state.optical_transfers or state.tails):
-        return result
+        return np.zeros((rows, columns))
     from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 
     around = ((rows, rows), (columns, columns))
@@ -307,15 +306,5 @@ def from_beyond(state: LineState, spread: Spread) -> FloatArray:
     if blur is not None:
         transfer = transfer * (blur[0] if np.iscomplexobj(blur) else blur)
     transfer = transfer - spread.transfer(f_row, f_column)
-    inside = np.s_[rows : 2 * rows, columns : 2 * columns]
-    sides = (
-        np.s_[:rows, :],
-        np.s_[2 * rows :, :],
-        np.s_[rows : 2 * rows, :columns],
-        np.s_[rows : 2 * rows, 2 * columns :],
-    )
-    for image, side in zip(result, sides, strict=True):
-        there = np.zeros_like(more)
-        there[side] = more[side]
-        image[...] = irfft2(transfer * rfft2(there), s=more.shape)[inside]
-    return result
+    found = irfft2(transfer * rfft2(more), s=more.shape)
+    return np.asarray(found[rows : 2 * rows, columns : 2 * columns])

@@ -118,10 +118,10 @@ class LineModel:
         return self._light(request, self._acting(request))
 
     def from_beyond(self, request: SeriesRequest) -> FloatArray:
-        """What pixels would get more (4, row, column), DN, if a picture did not mirror at a border (above, below, left, right).
+        """What pixels would get more (row, column), DN, if a picture did not mirror at its borders, but went on as it ends there.
 
-        It would go on there as it ends. A model knows no more than the field; what effects blur into it from outside is a guess.
-        (4, 1, 1), zeros, where all pixels are alike.
+        A model knows no more than the field; what effects blur into it from outside is a guess. (1, 1), zero, where all pixels are
+        alike.
 
         Raises:
             InputError: as `light`.

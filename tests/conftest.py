@@ -250,6 +250,25 @@ def make_model_twin():
 
 
 @pytest.fixture(scope="session")
+def make_tiny_session():
+    """Called with a path: writes a session of the lab there, of 24 x 24 pixels, darks and a few flats of 3 frames."""
+    import h5py
+
+    from raytwin import lab_session
+
+    kept = ("dark_20ms", "dark_50ms", "40kV_5W_20ms", "40kV_40W_20ms_Cu", "40kV_40W_50ms_Cu0.05", "90kV_5W_20ms")
+    kept = (*kept, "90kV_45W_20ms_Cu0.05", "90kV_45W_50ms", "60kV_40W_20ms")
+
+    def make(path):
+        lab_session(path, protocol="calibration", seed=1, size=24, frames=3, families=())
+        with h5py.File(path, "r+") as file:
+            for name in [name for name in file["series"] if not any(word in name for word in kept)]:
+                del file[f"series/{name}"]
+
+    return make
+
+
+@pytest.fixture(scope="session")
 def make_sweep_line(make_model_twin):
     """Called with a folder: writes into it twin.h5, of 64 x 64 pixels and 90 W, products.toml that describes small fillets
     with ribs, and references.h5, 20 images of such that the line itself would show in 1 s, not dealt out. Returns the folder.

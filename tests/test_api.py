@@ -14,7 +14,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -30,8 +29,6 @@ ROOT = Path(__file__).parents[1]
 LOW = "kv=40,power_w=40,exposure_ms=20,filter=Cu:0.05"
 HIGH = "kv=90,power_w=45,exposure_ms=20,filter=Cu:0.05"
 HITS = {"size_mm": [1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4], "hit": [0, 0, 0, 0, 1, 0, 1, 0, 1, 1, 1, 1]}
-KEPT = ("dark_20ms", "dark_50ms", "40kV_5W_20ms", "40kV_40W_20ms_Cu", "40kV_40W_50ms_Cu0.05", "90kV_5W_20ms")
-KEPT = (*KEPT, "90kV_45W_20ms_Cu0.05", "90kV_45W_50ms", "60kV_40W_20ms")
 CAMPAIGN = """
 twin = "twin.h5"
 references = "references.h5"
@@ -78,13 +75,10 @@ def write_hits(path, hits):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, make_sweep_line):
+def folder(tmp_path_factory, make_sweep_line, make_tiny_session):
     """A lab session of 24 x 24 pixels with its twin; a line of 64 x 64 pixels with references and a campaign; hit tables."""
     place = make_sweep_line(tmp_path_factory.mktemp("api"))
-    rt.lab_session(place / "session.h5", protocol="calibration", seed=1, size=24, frames=3, families=())
-    with h5py.File(place / "session.h5", "r+") as file:  # a few of its series, to be quick
-        for name in [name for name in file["series"] if not any(word in name for word in KEPT)]:
-            del file[f"series/{name}"]
+    make_tiny_session(place / "session.h5")
     rt.calibrate(place / "session.h5", seed=0).save(place / "session_twin.h5")
     (place / "campaign.toml").write_text(CAMPAIGN)
     write_hits(place / "hits.csv", HITS["hit"])
@@ -227,7 +221,14 @@ def test_a_result_is_short_equal_by_value_pickled_and_plain(inside, capsys, name
     assert (printed.out, printed.err) == ("", "")
 
 
-@pytest.mark.parametrize("name", [name for name, (_, words) in RESULTS.items() if words is not None])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "diagnosis" else name
+        for name, (_, words) in RESULTS.items()
+        if words is not None
+    ],
+)
 def test_to_dict_is_what_the_command_prints(inside, capsys, name):
     found = made(name, capsys)
     assert main([*RESULTS[name][1], "--json"]) == 0

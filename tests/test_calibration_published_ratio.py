@@ -97,7 +97,7 @@ def test_published_constants_give_the_ratio_of_levels_that_the_paper_saw():
     [DECLARED_CSI, (Filter(material="Gd2O2S@7.32", thickness_mm=0.1),)],
     ids=["CsI", "Gd2O2S"],
 )
-@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("declared", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_published_ratio_lies_inside_the_interval_predicted_before_calibration(scintillator, declared):
     model = model_of(scintillator)
     predicted = np.exp(log_ratio(model, prior_draws(model, scintillator_declared=declared)))
@@ -127,6 +127,7 @@ def test_published_ratio_narrows_the_filtration_as_far_as_kV_and_scintillator_al
     assert widths["both"] < widths["nothing"]
 
 
+@pytest.mark.slow
 def test_fit_of_the_published_levels_finds_the_same_filtration_as_weighted_prior_draws():
     # gains at the two voltages are not published: they enter with no weight
     unknown_gain = Estimate(value=2.0, low=-40.0, high=44.0)

@@ -192,6 +192,7 @@ def test_without_any_repeated_frame_one_line_says_what_is_missing(tmp_path, word
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_wide_spread_is_found_or_no_gain_is_given(tmp_path, monkeypatch):
     """Quanta spread over most of an open field are seen as slow changes: the interval holds the gain, or there is none."""
     for sigma_px, share in ((1.2, 0.4), (2.2, 0.75)):
@@ -347,6 +348,7 @@ def test_pixels_that_jump_from_one_averaged_dark_to_the_next_are_noisy(tmp_path)
     assert found.noise.read_noise_DN.value == pytest.approx(READ_DN, rel=0.05)
 
 
+@pytest.mark.slow
 def test_pixels_between_two_codes_of_an_averaged_dark_are_not_noisy(tmp_path):
     """Means that are stored as whole numbers, their noise far below a code: most pixels never change, some do by one code."""
     rng = np.random.default_rng(4)

@@ -77,7 +77,12 @@ FAMILIES = {
 }
 
 
-@pytest.mark.parametrize("name", SPREADS)
+SLOW = ("two widths", "Lorentzian tail", "tail of a layer that absorbs")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SPREADS]
+)
 def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(name):
     spread = SPREADS[name]
     fit = fit_spread(powers(spread, seed=7), group=GROUPS)
@@ -94,6 +99,7 @@ def test_gains_slopes_and_read_noise_lie_within_their_own_standard_deviations(na
     FAMILIES.get(name, lambda fit: None)(fit)
 
 
+@pytest.mark.slow
 def test_a_series_with_the_noise_of_averages_widens_what_it_spoils():
     """One flat of three holds means of three exposures: no frequency shows it, the series do, and the interval holds the gain."""
     spread, gain = SPREADS["narrow"], 8.0
@@ -234,6 +240,7 @@ def pairs_of_flats(spread, *, change, seed, told):
     return found
 
 
+@pytest.mark.slow
 def test_bright_pairs_tell_how_much_of_dim_ones_is_a_change_of_the_beam():
     """Changes are relative to the level: dim pairs then show the tail that free changes of each pair would hide."""
     spread = SPREADS["exponential tail"]

@@ -680,6 +680,7 @@ def test_baselines_that_learn_beat_the_commonest_and_are_not_the_diagnosis(many)
     assert baselines["classifier"]["leading_hypothesis"]["brier"] < 0.25
 
 
+@pytest.mark.slow
 def test_the_table_and_the_page_hold_every_case_and_nothing_from_outside(many, tmp_path):
     check, result = many
     rows = case_rows(check, result.outcomes)

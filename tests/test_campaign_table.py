@@ -408,6 +408,7 @@ def test_a_line_with_an_effect_stands_beside_the_table_before_and_after(line_wit
         run_table(SHORT_PLAN, tmp_path / "t", **{**words, "effects": dataclasses.replace(plan, networks=4)})
 
 
+@pytest.mark.slow
 def test_an_effect_that_was_not_named_is_said_to_be(line_with_effect, tmp_path, monkeypatch):
     monkeypatch.setitem(DIAGNOSIS, "verdict", "no_gap")
     monkeypatch.setitem(DIAGNOSIS, "causes", [])

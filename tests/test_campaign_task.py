@@ -260,6 +260,7 @@ def test_too_few_measured_images_to_learn_from_leave_the_improved_twins_networks
     assert "measured_on_measured" not in found["curves"]
 
 
+@pytest.mark.slow
 def test_a_stopped_task_goes_on_and_another_one_is_refused(line, twin, tmp_path, stand_in):
     brought = TaskInput(measured=line / "products.h5")
     first = run_task(twin, twin, brought, tmp_path / "task", plan=TaskPlan())

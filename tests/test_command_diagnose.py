@@ -65,7 +65,13 @@ def test_planted_noise_is_named_with_its_strength_and_written_into_the_twin(sess
     page = (sessions / "noisy" / "report.html").read_text(encoding="utf-8")
     assert "excess_noise" in page
     assert page.count("data:image/png;base64,") >= 5 and "gap_before_" in page
-    # against the improved twin nothing is left, and nothing is added a second time
+
+
+@pytest.mark.slow
+def test_against_the_improved_twin_nothing_is_left_and_nothing_is_added_a_second_time(sessions, capsys):
+    from raytwin.generator.twins.twin_io import read_twin
+
+    found = diagnose(sessions, capsys, "noisy")
     words = ["diagnose", str(sessions / "noisy.h5"), "-o", str(sessions / "again"), "--json"]
     assert main([*words, "--twin", str(sessions / "noisy" / "twin.h5")]) == 0
     left = json.loads(capsys.readouterr().out)
@@ -175,8 +181,9 @@ def passed(wanted, run):
     return found
 
 
-def test_frames_take_the_walks_of_the_architecture_page(sessions):
-    session, twin = str(sessions / "null.h5"), str(sessions / "walked.h5")
+def test_frames_take_the_walks_of_the_architecture_page(tmp_path, make_tiny_session):
+    session, twin = str(tmp_path / "session.h5"), str(tmp_path / "walked.h5")
+    make_tiny_session(session)
     walk = stations("## From a frame to `predict`'s number")
     assert passed(walk[:7], lambda: rt.calibrate(session, seed=0).save(twin)) == walk[:7]
     setting = "kv=60,power_w=30,exposure_ms=20,filter=Cu:0.1"

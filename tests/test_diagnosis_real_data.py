@@ -55,12 +55,14 @@ def test_k11_flats_after_the_scan_are_brighter_and_the_tomogram_itself_cannot_be
     assert any(line.startswith("002_object: ") for line in answer["warnings"])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not K11.is_dir(), reason="the K11 tomography scan is not here (shared/realdata/k11)")
 def test_k11_one_level_that_rose_names_no_effect_with_confidence(tmp_path, capsys):
     _, answer = diagnosed(K11 / "k11-18014.nxs", "nxtomo", tmp_path, capsys)
     assert answer["verdict"] in ("unknown_effect", "ambiguous")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CCD.is_dir(), reason="the EMVA 1288 camera set is not here (shared/realdata/emva_ccd)")
 def test_ccd_camera_shows_lines_of_its_readout(tmp_path, capsys):
     # a corner of the sensor says the same in a twentieth of the time

@@ -187,6 +187,7 @@ def test_darks_alone_test_only_what_darks_can_show(diagnosed, line):
     assert all(cause["probability"] < 0.5 for cause in answer["causes"])
 
 
+@pytest.mark.slow
 def test_single_frames_with_a_twin_are_judged_and_lines_seen_as_they_stand_in_one(diagnosed, line):
     code, answer, _ = diagnosed(single_frames, "--twin", str(line / "twin.h5"))
     assert code == 0
@@ -238,6 +239,7 @@ def test_one_dark_of_zeros_among_others_is_a_failure_to_read_it(diagnosed):
     assert answer["warnings"] == ["dark_25ms: every pixel of every frame is 0 DN"]
 
 
+@pytest.mark.slow
 def test_objects_and_darks_without_flats_are_judged_with_a_twin(diagnosed, line):
     code, answer, _ = diagnosed(only("dark", "object"), "--twin", str(line / "twin.h5"))
     assert code == 0

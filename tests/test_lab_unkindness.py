@@ -155,6 +155,7 @@ def test_light_dips_behind_the_k_edge_for_photons_alone():
         assert relative_yield(scintillator, np.array([60.0]), of_photon=False) == pytest.approx([1.0])
 
 
+@pytest.mark.slow
 def test_tube_models_ripple_and_roughness_change_the_beam_as_they_should():
     def mean_keV(**more):
         light = beam(kV=60.0, anode_angle_deg=12.0, filters=COPPER, **more)

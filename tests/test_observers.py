@@ -143,6 +143,7 @@ def test_the_threshold_keeps_the_rate_of_false_alarms_on_drawn_noise(line, radiu
     assert 0 < float(independent_places(threshold, rate)) < cells**2
 
 
+@pytest.mark.slow
 def test_matched_filters_on_drawn_noise_find_what_the_curve_says(line):
     pair = pair_at(20)
     objects = rods(line)

@@ -407,6 +407,7 @@ def test_models_are_shown_best_first_and_the_true_link_is_not_refuted():
     assert by_name["cloglog", False].p_link < 1e-3
 
 
+@pytest.mark.slow
 def test_goodness_of_fit_is_even_under_the_true_model():
     # p-values of the right link: mean 1/2, standard error 0.29 / sqrt(60)
     values = []
@@ -417,6 +418,7 @@ def test_goodness_of_fit_is_even_under_the_true_model():
     assert abs(np.mean(values) - 0.5) < 4 * 0.289 / math.sqrt(60)
 
 
+@pytest.mark.slow
 def test_modified_bound_covers_as_stated_for_few_trials():
     # 95 % of 300: 4.2 standard errors of 1.26 % either way; the plain bound covers some 91 % here
     covered = 0

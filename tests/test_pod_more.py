@@ -104,6 +104,7 @@ def test_censoring_takes_nothing_away_on_average():
     assert np.std(errors) < 0.1
 
 
+@pytest.mark.slow
 def test_response_bounds_cover_as_stated():
     # 95 % of 150 within 4 standard errors (2.7); likelihood ratio
     covered = 0
@@ -387,6 +388,7 @@ def test_equivalence_at_a_margin_in_the_sizes_unit_is_that_of_the_90_percent_int
             compare_pod(one, two, size_margin=margin, **words)
 
 
+@pytest.mark.slow
 def test_difference_interval_covers_nothing_where_there_is_none():
     # independent tables of one curve: 95 % of 100 within 4 standard errors (2.2)
     inside = 0

@@ -225,6 +225,7 @@ def test_a_cluster_with_far_more_weight_than_the_others_leaves_few_degrees_of_fr
     assert 1 <= float(found.variance(np.array([1.0, 0.2]))[1]) < 3
 
 
+@pytest.mark.slow
 def test_bounds_of_three_networks_cover_as_often_as_they_say():
     """Looks that follow one curve and share luck by network and image (a Gaussian copula)."""
     from scipy.special import ndtr
